@@ -33,7 +33,8 @@ SCENES = """\
   images, by default 160x120 and 60, on white 100x100 and 150; &path=pass|sweeps|jump moves the camera once over its
   arc, to and fro, or to a random place at each instant)
   teacher:PATH       images rendered from explicit Gaussians: a folder of .ply or .spz files, one per frame, one such
-                     file, a .4dgs file, a gsplat checkpoint, or module:function (time -> Gaussians)
+                     file, a .4dgs file, a gsplat checkpoint, a run of 4DGaussians or Deformable-3DGS, or
+                     module:function (time -> Gaussians)
   (teacher:PATH?cameras=SOURCE takes the cameras, times and held-out images of another source;
   otherwise ?views=N&size=WxH&fps=F&background=white&up=X,Y,Z)"""
 

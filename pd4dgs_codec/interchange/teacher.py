@@ -1,13 +1,13 @@
 """Pictures of other programs' Gaussians over time as a dataset: the source `teacher:PATH[?key=value&...]`.
 
 PATH is a folder of PLY or SPZ files, one per frame, in the order of the last number in their names, or one such file; a
-`.4dgs` file; a static gsplat checkpoint (`.pt`, `.ckpt`); or `module:function`, called with t in 0..1. The function
-returns means, quats (wxyz), scales, opacities and either colors or sh, as a mapping or as attributes, numpy arrays or
-tensors.
+`.4dgs` file; a static gsplat checkpoint (`.pt`, `.ckpt`); a run of 4DGaussians or Deformable-3DGS or one of its
+`point_cloud/iteration_N`; or `module:function`, called with t in 0..1. The function returns means, quats (wxyz),
+scales, opacities and either colors or sh, as a mapping or as attributes, numpy arrays or tensors.
 
 Keys: cameras=SOURCE takes the training cameras of a dataset and their times; otherwise views=N cameras (200) of
 size=WxH (400x400) stand around the Gaussians, or as a `cameras.json` beside them says. fps=F (30) is the frame rate of
-a folder, background=black|white|R,G,B the background, up=X,Y,Z (0,-1,0) the direction up.
+a folder, background=black|white|R,G,B the background (that of a run, else black), up=X,Y,Z (0,-1,0) the direction up.
 """
 
 from __future__ import annotations
@@ -31,8 +31,9 @@ from pd4dgs_codec.data.files import read_file, split_options
 from pd4dgs_codec.data.posed import depth_range, held_out, points_box
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError, one_line
+from pd4dgs_codec.interchange.deformed import read_deformed
 from pd4dgs_codec.interchange.formats import SH_SPAN, checked, library, read_gsplat, read_splats
-from pd4dgs_codec.interchange.scaffold_gs import read_cameras
+from pd4dgs_codec.interchange.runs import read_cameras
 from pd4dgs_codec.interchange.splats import SH_C0, Splats, looking, picture, sphere, spread
 from pd4dgs_codec.quality.frames import shrunk
 from pd4dgs_codec.scene import Camera
@@ -67,7 +68,7 @@ class Options:
     views: int = 200
     size: tuple[int, int] = (400, 400)
     fps: float = 30.0
-    background: Triple = (0.0, 0.0, 0.0)
+    background: Triple | None = None
     up: Triple = (0.0, -1.0, 0.0)
 
 
@@ -101,11 +102,12 @@ def _around(source: str, place: Path, teacher: Teacher, options: Options, downsc
     everywhere = np.concatenate([teacher.splats(t).means[_solid(source, teacher, t)] for t in some])
     box = points_box(everywhere)
     near, far = depth_range([c.viewmat.astype(np.float64) for c in cameras], box, everywhere)
-    views = _pictures(teacher, poses, options.background, near)
+    background = options.background or teacher.background
+    views = _pictures(teacher, poses, background, near)
     train, test = held_out(views, holdout)
     return Dataset(
         name=source, train=tuple(train), test=tuple(test),
-        box=box, near=near, far=far, background=options.background,
+        box=box, near=near, far=far, background=background,
         time_range=(0.0, teacher.seconds), up=up, unit=0.0, masked=False,
         **_points(teacher, solid),
     )  # fmt: skip
@@ -165,7 +167,7 @@ def _value(key: str, text: str) -> Any:
 
 def _cameras(place: Path, points: np.ndarray, options: Options, downscale: int) -> tuple[list[Camera], Triple]:
     """The cameras of a cameras.json beside the Gaussians, else cameras around them, and the direction up."""
-    beside = next((p / "cameras.json" for p in (place, place.parent) if (p / "cameras.json").is_file()), None)
+    beside = next((p / "cameras.json" for p in (place, *place.parents[:2]) if (p / "cameras.json").is_file()), None)
     if beside is not None:
         cameras, up = read_cameras(beside)
         some = spread(cameras, options.views)
@@ -191,12 +193,13 @@ class Teacher:
     """A model that gives Gaussians at a time.
 
     splats: normalised time -> Gaussians. times: the times that it knows, None for all. seconds: from the first to the
-    last.
+    last. background: the one that it was trained with.
     """
 
     splats: Callable[[float], Splats]
     times: tuple[float, ...] | None
     seconds: float
+    background: Triple = (0.0, 0.0, 0.0)
 
     def nearest(self, t: float) -> float:
         """The known time next to t."""
@@ -207,7 +210,8 @@ def read_model(place: str, fps: float) -> Teacher:
     """The teacher at a path, or `module:function`. fps: frames per second of a folder. Raises DataError."""
     path = Path(place)
     if path.is_dir():
-        return _folder(path, fps)
+        run = read_deformed(path)
+        return Teacher(run.splats, None, 1.0, run.background) if run else _folder(path, fps)
     if path.is_file():
         name = path.name.lower()
         if name.endswith(".4dgs"):
@@ -217,7 +221,7 @@ def read_model(place: str, fps: float) -> Teacher:
         return Teacher(lambda t: splats, (0.0,), 1.0)
     if match := re.fullmatch(r"([A-Za-z_][\w.]*):([A-Za-z_]\w*)", place):
         return Teacher(_function(*match.groups()), None, 1.0)
-    raise DataError(f"{place}: found nothing, expected a folder of PLY or SPZ files, a file, or module:function")
+    raise DataError(f"{place}: found nothing, expected a folder of PLY or SPZ files, a run, a file, or module:function")
 
 
 def _folder(folder: Path, fps: float) -> Teacher:

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from teachers import Deformable, FourD
 from test_formats import make_splats
 
-from pd4dgs_codec.archives import read_tensors
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.formats import ply_bytes, read_splats
-from pd4dgs_codec.interchange.scaffold_gs import read_cameras
+from pd4dgs_codec.interchange.runs import read_cameras, read_torch
 from pd4dgs_codec.interchange.teacher import read_model
 
 CASES = 150
@@ -52,6 +52,20 @@ def _ply(path: Path) -> None:
     path.write_bytes(ply_bytes(make_splats(4, 1)))
 
 
+def _run(kind: type[FourD | Deformable]) -> Callable[[Path], None]:
+    """Makes the run that a network belongs to."""
+
+    def make(path: Path) -> None:
+        splats = make_splats(4, 1)
+        kind(splats).save(path.parents[2], splats)
+
+    return make
+
+
+def _moved(path: Path) -> object:
+    return read_model(str(path.parents[2]), 30).splats(0.5)
+
+
 def _cameras(path: Path) -> None:
     row = (
         '{"position": [0, 0, -4], "rotation": [[1,0,0],[0,1,0],[0,0,1]], "width": 80, "height": 60, "fx": 70, "fy": 7}'
@@ -63,13 +77,24 @@ def _cameras(path: Path) -> None:
     "name, make, read",
     [
         ("ckpt.pt", _gsplat, lambda path: read_model(str(path), 30).splats(0)),
-        ("mlp.pt", _script, lambda path: read_tensors(path.read_bytes(), str(path))),
+        ("mlp.pt", _script, read_torch),
+        (
+            "run/point_cloud/iteration_7/deformation.pth",
+            _run(FourD),
+            _moved,
+        ),
+        (
+            "run/deform/iteration_7/deform.pth",
+            _run(Deformable),
+            _moved,
+        ),
         ("a.ply", _ply, read_splats),
         ("cameras.json", _cameras, read_cameras),
     ],
 )
 def test_damaged_files(tmp_path, name: str, make: Callable[[Path], None], read: Callable[[Path], object]):
     path = tmp_path / name
+    path.parent.mkdir(parents=True, exist_ok=True)
     make(path)
     whole = path.read_bytes()
     read(path)

@@ -1,0 +1,266 @@
+"""Runs in the layouts of 4DGaussians and Deformable-3DGS, made from their published formulas, and what teaching loses.
+
+The modules stand on their own: plain torch layers and `grid_sample`, so that tests compare the package's readers with
+them. `python benchmarks/teachers.py` bends a ball of Gaussians with each, teaches a model from each run, and prints
+bytes, quality of the packed file against the run's own pictures from held-out cameras and times, and processor minutes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+import torch
+from common import command
+from torch import Tensor, nn
+from torch.nn import functional
+
+from pd4dgs_codec.interchange.formats import ply_bytes
+from pd4dgs_codec.interchange.splats import SH_C0, Splats, sphere
+
+OPTIONS = {
+    "no_dx": False, "no_ds": False, "no_dr": False, "no_do": True, "no_dshs": True, "no_grid": False, "grid_pe": 0,
+    "static_mlp": False, "empty_voxel": False, "apply_rotation": False,
+}  # fmt: skip
+FIT_STEPS = 300
+
+
+def parameters(splats: Splats) -> dict[str, Tensor]:
+    """What a PLY file of these Gaussians holds: logarithms of scales, logits of opacities."""
+    p = torch.from_numpy(splats.opacities)
+    return {
+        "means": torch.from_numpy(splats.means), "quats": torch.from_numpy(splats.quats),
+        "scales": torch.from_numpy(splats.scales).log(), "opacities": (p / (1 - p)).log(),
+        "sh": torch.from_numpy(splats.sh),
+    }  # fmt: skip
+
+
+def save(run: Path, splats: Splats, network: nn.Module, file: str, options: dict[str, object]) -> Path:
+    """A run with one iteration. file: the place of the network in the run."""
+    for path in (run / "point_cloud/iteration_7/point_cloud.ply", run / file):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    (run / "point_cloud/iteration_7/point_cloud.ply").write_bytes(ply_bytes(splats))
+    torch.save(network.state_dict(), run / file)
+    (run / "cfg_args").write_text(f"Namespace({', '.join(f'{k}={v!r}' for k, v in options.items())})")
+    return run
+
+
+def head(width: int, outputs: int) -> nn.Sequential:
+    """A head of 4DGaussians."""
+    return nn.Sequential(nn.ReLU(), nn.Linear(width, width), nn.ReLU(), nn.Linear(width, outputs))
+
+
+def hamilton(a: Tensor, b: Tensor) -> Tensor:
+    """Products of quaternions wxyz by 4 x 4 matrices."""
+    w, x, y, z = a.unbind(1)
+    rows = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
+    return torch.einsum("ijn,nj->ni", torch.stack([torch.stack(row) for row in rows]), b)
+
+
+class Planes(nn.Module):
+    """The grid of 4DGaussians. resolution: cells of x, y, z and t; scales multiply those of space."""
+
+    def __init__(self, resolution: tuple[int, ...], features: int, scales: tuple[int, ...], box: Tensor):
+        super().__init__()
+        self.aabb = nn.Parameter(box, requires_grad=False)  # the largest coordinates, then the least
+        self.grids = nn.ModuleList()
+        for scale in scales:
+            cells = [*(scale * n for n in resolution[:3]), resolution[3]]
+            pairs = itertools.combinations(range(4), 2)
+            planes = [torch.rand(1, features, cells[b], cells[a]) + 0.5 for a, b in pairs]
+            self.grids.append(nn.ParameterList(planes))
+
+    def forward(self, means: Tensor, t: float) -> Tensor:
+        """[n, features times scales]."""
+        inside = (means - self.aabb[0]) * (2 / (self.aabb[1] - self.aabb[0])) - 1
+        at = torch.cat([inside, torch.full_like(means[:, :1], t)], dim=1)
+        features = []
+        for planes in self.grids:
+            product: Tensor | float = 1.0
+            for plane, pair in zip(planes, itertools.combinations(range(4), 2), strict=True):
+                where = at[None, None, :, list(pair)]
+                product = product * functional.grid_sample(plane, where, align_corners=True, padding_mode="border")
+            features.append(product[0, :, 0].T)
+        return torch.cat(features, dim=1)
+
+
+class FourD(nn.Module):
+    """4DGaussians. options: those of its cfg_args that differ from OPTIONS. depth: its defor_depth."""
+
+    def __init__(self, splats: Splats, depth: int = 1, width: int = 32, **options: object):
+        super().__init__()
+        self.rest, self.options = parameters(splats), OPTIONS | options
+        net = nn.Module()
+        low, high = self.rest["means"].amin(0), self.rest["means"].amax(0)
+        net.grid = Planes((12, 10, 8, 14), 16, (1, 2), torch.stack([high * 0.9, low * 0.9]))  # some lie outside
+        layers: list[nn.Module] = [nn.Linear(32, width)]
+        for _ in range(depth - 1):
+            layers += [nn.ReLU(), nn.Linear(width, width)]
+        net.feature_out = nn.Sequential(*layers)
+        coefficients = self.rest["sh"].shape[1]
+        outputs = dict(pos_deform=3, scales_deform=3, rotations_deform=4, opacity_deform=1, shs_deform=3 * coefficients)
+        for name, count in outputs.items():
+            setattr(net, name, head(width, count))
+        if self.options["static_mlp"]:
+            net.static_mlp = head(width, 1)
+        self.timenet = nn.Linear(9, 8)  # theirs has one too, and does not use it
+        self.register_buffer("time_poc", 2.0 ** torch.arange(4))
+        self.deformation_net = net
+
+    def forward(self, t: float) -> dict[str, Tensor]:
+        """The Gaussians at a time 0..1."""
+        net, rest, off = self.deformation_net, self.rest, self.options
+        hidden = net.feature_out(net.grid(rest["means"], t))
+        keep = net.static_mlp(hidden) if off["static_mlp"] else torch.ones(len(hidden), 1)
+        out = dict(rest)
+        if not off["no_dx"]:
+            out["means"] = rest["means"] * keep + net.pos_deform(hidden)
+        if not off["no_ds"]:
+            out["scales"] = rest["scales"] * keep + net.scales_deform(hidden)
+        if not off["no_dr"]:
+            turn = net.rotations_deform(hidden)
+            out["quats"] = hamilton(rest["quats"], turn) if off["apply_rotation"] else rest["quats"] + turn
+        if not off["no_do"]:
+            out["opacities"] = rest["opacities"] * keep[:, 0] + net.opacity_deform(hidden)[:, 0]
+        if not off["no_dshs"]:
+            out["sh"] = rest["sh"] * keep[:, :, None] + net.shs_deform(hidden).reshape(rest["sh"].shape)
+        out["quats"] = functional.normalize(out["quats"])
+        return out | {"scales": out["scales"].exp(), "opacities": out["opacities"].sigmoid()}
+
+    def save(self, run: Path, splats: Splats) -> Path:
+        """A run of it."""
+        place = "point_cloud/iteration_7/"
+        save(run, splats, self, place + "deformation.pth", self.options | {"kplanes_config": {"resolution": [12, 10]}})
+        torch.save(torch.ones(len(splats.means), dtype=torch.bool), run / place / "deformation_table.pth")
+        torch.save(torch.zeros(len(splats.means), 3), run / place / "deformation_accum.pth")
+        return run
+
+
+def encoded(values: Tensor, octaves: int) -> Tensor:
+    """The positional encoding of NeRF, with its input."""
+    waves = [f(values * 2.0**i) for i in range(octaves) for f in (torch.sin, torch.cos)]
+    return torch.cat([values, *waves], dim=1)
+
+
+class Deformable(nn.Module):
+    """Deformable-3DGS."""
+
+    def __init__(self, splats: Splats, is_blender: bool = False, is_6dof: bool = False):
+        super().__init__()
+        self.rest, self.is_blender, self.is_6dof = parameters(splats), is_blender, is_6dof
+        depth, width = 8, 64  # theirs are 8 and 256
+        inputs = 63 + (30 if is_blender else 21)
+        if is_blender:
+            self.timenet = nn.Sequential(nn.Linear(13, 256), nn.ReLU(), nn.Linear(256, 30))
+        wide = [inputs, *(width + inputs * (i == depth // 2) for i in range(depth - 1))]
+        self.linear = nn.ModuleList([nn.Linear(n, width) for n in wide])
+        if is_6dof:
+            self.branch_w, self.branch_v = nn.Linear(width, 3), nn.Linear(width, 3)
+        else:
+            self.gaussian_warp = nn.Linear(width, 3)
+        self.gaussian_rotation, self.gaussian_scaling = nn.Linear(width, 4), nn.Linear(width, 3)
+
+    def forward(self, t: float) -> dict[str, Tensor]:
+        """The Gaussians at a time 0..1; quaternions of any length, which enter the matrix's formula as they are."""
+        rest = self.rest
+        times = encoded(torch.full_like(rest["means"][:, :1], t), 6 if self.is_blender else 10)
+        if self.is_blender:
+            times = self.timenet(times)
+        given = hidden = torch.cat([encoded(rest["means"], 10), times], dim=1)
+        for i, layer in enumerate(self.linear):
+            hidden = torch.relu(layer(hidden))
+            if i == len(self.linear) // 2:
+                hidden = torch.cat([given, hidden], dim=1)
+        means = rest["means"]
+        if self.is_6dof:
+            means = self._screw(self.branch_w(hidden), self.branch_v(hidden))
+        else:
+            means = means + self.gaussian_warp(hidden)
+        return rest | {
+            "means": means,
+            "quats": functional.normalize(rest["quats"]) + self.gaussian_rotation(hidden),
+            "scales": rest["scales"].exp() + self.gaussian_scaling(hidden),
+            "opacities": rest["opacities"].sigmoid(),
+        }
+
+    def _screw(self, w: Tensor, v: Tensor) -> Tensor:
+        """Means by the matrices of a screw (Modern Robotics, 3.51 and 3.88)."""
+        angle = w.norm(dim=1, keepdim=True)
+        (x, y, z), v = (w / angle + 1e-5).unbind(1), v / angle + 1e-5
+        zero, a, one = torch.zeros_like(x), angle[:, :, None], torch.eye(3)
+        cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).reshape(-1, 3, 3)
+        turn = one + a.sin() * cross + (1 - a.cos()) * cross @ cross
+        shift = (a * one + (1 - a.cos()) * cross + (a - a.sin()) * cross @ cross) @ v[:, :, None]
+        return (turn @ self.rest["means"][:, :, None] + shift)[:, :, 0]
+
+    def save(self, run: Path, splats: Splats) -> Path:
+        """A run of it."""
+        options = {"is_blender": self.is_blender, "is_6dof": self.is_6dof, "white_background": True}
+        return save(run, splats, self, "deform/iteration_7/deform.pth", options)
+
+
+# -- what teaching loses -----------------------------------------------------------------------------------------------
+
+
+def ball(count: int = 1500) -> Splats:
+    """A striped ball of Gaussians."""
+    means = sphere(count).astype(np.float32)
+    bands = (np.sin(9 * means[:, 2:]) > 0) * np.float32([0.8, 0.3, -0.6]) + means * 0.25
+    sh = ((bands + 0.1) / SH_C0)[:, None].astype(np.float32) * np.float32(0.5)
+    quats = np.tile(np.float32([1, 0, 0, 0]), (count, 1))
+    wide = np.full((count, 3), 2.2 / np.sqrt(count), np.float32)
+    sh = np.concatenate([sh, np.zeros((count, 15, 3), np.float32)], axis=1)
+    return Splats(means, quats, wide, np.full(count, 0.95, np.float32), sh)
+
+
+def bent(means: Tensor, t: float) -> Tensor:
+    """The goal of the motion: the ball leans and turns more at its top."""
+    angle = torch.sin(torch.tensor(2 * np.pi * t)) * 0.7 * means[:, 2]
+    x, y, z = means.unbind(1)
+    return torch.stack([x * angle.cos() - y * angle.sin() + 0.4 * t * z, x * angle.sin() + y * angle.cos(), z], dim=1)
+
+
+def fit(model: FourD | Deformable, steps: int = FIT_STEPS) -> None:
+    """Trains a network to bend the ball, with scales and rotations that stay about the same."""
+    optimiser = torch.optim.Adam(model.parameters(), 2e-3)
+    rng, scales = np.random.default_rng(0), model.rest["scales"].exp()
+    for _ in range(steps):
+        t = float(rng.uniform())
+        found = model(t)
+        goals = {"means": bent(model.rest["means"], t), "quats": model.rest["quats"], "scales": scales}
+        loss = sum((found[name] - goal).square().mean() for name, goal in goals.items())
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+
+
+def main() -> None:
+    """The table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--iterations", type=int, default=1500, help="training steps of each (default: 1500)")
+    options = parser.parse_args()
+    torch.manual_seed(0)
+    print("| run | Gaussians | run bytes | motion error | .pd4 bytes | PSNR | processor minutes |\n" + "| - " * 7 + "|")
+    for name, model in (("4DGaussians", FourD(ball())), ("Deformable-3DGS", Deformable(ball(), is_blender=True))):
+        fit(model)
+        with tempfile.TemporaryDirectory() as folder:
+            run, made, packed = Path(folder) / "run", Path(folder) / "model.pt", Path(folder) / "scene.pd4"
+            model.save(run, ball())
+            size = sum(path.stat().st_size for path in run.rglob("*") if path.is_file())
+            start = time.process_time()
+            source = f"teacher:{run}?views=64&size=120x120&background=white"
+            command("train", source, "-o", made, "--preset", "tiny", "--iterations", options.iterations)
+            command("encode", made, "-o", packed)
+            level = command("eval", packed, source)["levels"][-1]
+            minutes = (time.process_time() - start) / 60
+            error = float((model(0.25)["means"] - bent(model.rest["means"], 0.25)).norm(dim=1).mean())
+            row = (name, len(ball().means), size, f"{error:.3f}", level["cumulative_bytes"], f"{level['mpsnr']:.2f} dB")
+            print("|", " | ".join(map(str, (*row, f"{minutes:.1f}"))), "|", flush=True)
+
+
+if __name__ == "__main__":
+    main()

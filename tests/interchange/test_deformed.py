@@ -1,0 +1,233 @@
+"""Runs of 4DGaussians and Deformable-3DGS: synthetic ones in their layouts, evaluated with the plain torch modules of
+`benchmarks/teachers.py`, which follow the published formulas."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from teachers import Deformable, FourD, ball, fit
+from test_formats import make_splats
+from torch import nn
+
+from pd4dgs_codec.data.cameras import rotation_matrix
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.interchange import deformed
+from pd4dgs_codec.interchange.teacher import load_source, read_model
+
+DEFORMATION, PLY = "point_cloud/iteration_7/deformation.pth", "point_cloud/iteration_7/point_cloud.ply"
+TIMES = (0.0, 0.37, 1.0)
+
+
+def _covariances(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    factor = rotation_matrix(quats) * scales[:, None].astype(np.float64)
+    return factor @ factor.transpose(0, 2, 1)
+
+
+def _same(place: Path, model: FourD | Deformable) -> None:
+    teacher = read_model(str(place), 30)
+    assert teacher.times is None and teacher.seconds == 1
+    moved = []
+    for t in TIMES:
+        with torch.no_grad():
+            expected = {name: values.numpy() for name, values in model(t).items()}
+        found = teacher.splats(t)
+        for name in ("means", "opacities", "sh"):
+            np.testing.assert_allclose(getattr(found, name), expected[name], atol=1e-4, err_msg=name)
+        theirs = _covariances(expected["quats"], expected["scales"])
+        np.testing.assert_allclose(_covariances(found.quats, found.scales), theirs, atol=1e-4)
+        moved.append(found)
+    assert max(np.ptp([getattr(splats, name) for splats in moved], axis=0).max() for name in vars(found)) > 0.01
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"no_do": False, "no_dshs": False, "depth": 0},
+        {"no_dx": True, "depth": 3},
+        {"no_ds": True, "no_dr": True},
+        {"static_mlp": True, "no_do": False, "no_dshs": False},
+        {"apply_rotation": True},
+        {"no_dx": True, "no_ds": True, "no_dr": True, "no_do": False},
+    ],
+    ids=lambda options: ",".join(options) or "usual",
+)
+def test_4dgaussians_follows_the_published_formulas(tmp_path, options, monkeypatch):
+    monkeypatch.setattr(deformed, "ROWS", 16)  # of 40
+    torch.manual_seed(1)
+    model = FourD(splats := make_splats(), **options)
+    _same(model.save(tmp_path / "run", splats), model)
+
+
+@pytest.mark.parametrize("is_blender", [False, True])
+@pytest.mark.parametrize("is_6dof", [False, True])
+def test_deformable_3dgs_follows_the_published_formulas(tmp_path, is_blender, is_6dof):
+    torch.manual_seed(2)
+    model = Deformable(splats := make_splats(), is_blender, is_6dof)
+    _same(model.save(tmp_path / "run", splats), model)
+    _same(tmp_path / "run" / "point_cloud" / "iteration_7", model)
+
+
+def test_the_last_iteration_and_the_background_of_the_run(tmp_path):
+    model = Deformable(splats := make_splats(degree=1))
+    run = model.save(tmp_path / "run", splats)
+    for number in (9, 30):
+        for kind, file in (("point_cloud", "point_cloud.ply"), ("deform", "deform.pth")):
+            (run / kind / f"iteration_{number}").mkdir()
+            (run / kind / f"iteration_{number}" / file).write_bytes((run / kind / "iteration_7" / file).read_bytes())
+    (run / "deform" / "iteration_9" / "deform.pth").write_bytes(b"")
+    row = {"rotation": np.eye(3).tolist(), "width": 40, "height": 30, "fx": 30, "fy": 30, "position": [0, 0, -4]}
+    (run / "cameras.json").write_text(json.dumps([row, row]))
+    for place in (run, run / "point_cloud" / "iteration_7"):
+        data = load_source(f"teacher:{place}", holdout=0)
+        assert data.background == (1.0, 1.0, 1.0) and len(data.train) == 2
+    assert load_source(f"teacher:{run}?background=black", holdout=0).background == (0.0, 0.0, 0.0)
+    with pytest.raises(DataError, match="iteration_9/deform.pth: not a zip archive"):
+        read_model(str(run / "point_cloud" / "iteration_9"), 30)
+
+
+def test_gaussians_that_are_not_finite_are_left_out(tmp_path):
+    splats = make_splats()
+    model = FourD(splats)
+    run = model.save(tmp_path / "run", splats)
+    splats.means[3, 1] = np.nan
+    model.save(run, splats)
+    state = torch.load(run / DEFORMATION)
+    assert len(read_model(str(run), 30).splats(0.5).means) == 39
+    state["deformation_net.pos_deform.3.bias"][:] = 1e9
+    state["deformation_net.pos_deform.3.weight"][:] = 1e9
+    torch.save(state, run / DEFORMATION)
+    with pytest.raises(DataError, match="at 0.5: none of 39 Gaussians is finite"):
+        read_model(str(run), 30).splats(0.5)
+
+
+def _without(name: str):
+    return lambda state: state.pop(name)
+
+
+def _as(name: str, value: torch.Tensor):
+    return lambda state: state.update({name: value})
+
+
+NET = "deformation_net."
+OFF = b"Namespace(no_ds=True, no_dr=True, no_do=True"
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (_without(NET + "grid.grids.1.0"), r"feature_out.0.weight has shape \(32, 32\), expected \(any, 16\)"),
+        (_without(NET + "grid.grids.1.4"), "has no tensor deformation_net.grid.grids.1.4"),
+        (_as(NET + "grid.grids.1.4", torch.ones(1, 15, 3, 3)), r"\(1, 15, 3, 3\), expected \(1, 16, any, any\)"),
+        (_as(NET + "grid.grids.0.0", torch.ones(1, 16, 0, 3)), "grids.0.0 has shape"),
+        (_as(NET + "grid.grids.0.0", torch.ones(1, 2000, 1, 1)), "has 2000 features, expected 1024 at most"),
+        (_as(NET + "grid.aabb", torch.ones(2, 3)), "aabb is flat"),
+        (_as(NET + "grid.aabb", torch.tensor([[1, 1, np.nan], [0, 0, 0]])), "aabb holds a NaN"),
+        (_as(NET + "feature_out.0.weight", torch.ones(32, 33)), r"has shape \(32, 33\), expected \(any, 32\)"),
+        (_as(NET + "feature_out.0.weight", torch.ones(1025, 32)), "expected 1024 at most"),
+        (_without(NET + "pos_deform.1.bias"), "has no tensor deformation_net.pos_deform.1.bias"),
+        (_as(NET + "pos_deform.3.weight", torch.ones(4, 32)), r"expected \(3, 32\)"),
+        (_as(NET + "scales_deform.3.bias", "bell \x07\u202e"), "has no tensor deformation_net.scales_deform.3.bias"),
+    ],
+)  # fmt: skip
+def test_broken_networks_of_4dgaussians_are_one_line(tmp_path, change, message):
+    model = FourD(make_splats())
+    run = model.save(tmp_path / "run", make_splats())
+    state = model.state_dict()
+    change(state)
+    torch.save(state, run / DEFORMATION)
+    with pytest.raises(DataError, match=message) as error:
+        read_model(str(run), 30)
+    assert "deformation.pth" in str(error.value) and str(error.value).isprintable()
+
+
+@pytest.mark.parametrize(
+    "change, message",
+    [
+        (_without("linear.0.weight"), "has no tensor linear.0.weight"),
+        (_without("linear.7.weight"), "linear.4.weight has shape"),  # seven layers have their skip earlier
+        (_as("linear.0.weight", torch.ones(64, 93)), r"expected \(any, 84\)"),
+        (_as("timenet.0.weight", torch.ones(256, 21)), r"timenet.0.weight has shape \(256, 21\), expected \(any, 13\)"),
+        (_without("gaussian_warp.weight"), "has no tensor gaussian_warp.weight"),
+        (_as("branch_w.weight", torch.ones(3, 64)), "has no tensor branch_w.bias"),
+        (_as("gaussian_rotation.bias", torch.full((4,), np.inf)), "gaussian_rotation.bias holds a NaN or"),
+    ],
+)  # fmt: skip
+def test_broken_networks_of_deformable_3dgs_are_one_line(tmp_path, change, message):
+    model = Deformable(make_splats())
+    run = model.save(tmp_path / "run", make_splats())
+    state = model.state_dict()
+    change(state)
+    torch.save(state, run / "deform/iteration_7/deform.pth")
+    with pytest.raises(DataError, match=message):
+        read_model(str(run), 30)
+
+
+@pytest.mark.parametrize(
+    "file, content, message",
+    [
+        ("cfg_args", None, "cfg_args: no_ds is missing, expected True or False"),
+        ("cfg_args", b"Namespace(no_ds=maybe, no_dr=True)", "no_ds is maybe, expected True or False"),
+        ("cfg_args", b"Namespace(grid_pe=2, no_ds=True)", "has grid_pe=2, expected a model without"),
+        ("cfg_args", b"Namespace(empty_voxel=True)", "has empty_voxel=True"),
+        ("cfg_args", OFF + b", static_mlp=True)", "has no tensor deformation_net.static_mlp.1.weight"),
+        ("cfg_args", OFF + b", no_dshs=False)", r"shs_deform.3.weight has shape \(48, 32\), expected \(12, 32\)"),
+        (DEFORMATION, None, "deformation.pth: cannot be read"),
+        (DEFORMATION, b"PK\x03\x04", "not a zip archive of tensors"),
+        (PLY, b"ply\n", "point_cloud.ply"),
+    ],
+)  # fmt: skip
+def test_broken_runs_are_one_line(tmp_path, file, content, message):
+    run = FourD(make_splats()).save(tmp_path / "run", make_splats(degree=1))
+    (run / file).unlink()
+    if content is not None:
+        (run / file).write_bytes(content)
+    with pytest.raises(DataError, match=message):
+        read_model(str(run), 30)
+
+
+def test_options_of_older_runs(tmp_path):
+    """They have neither no_dx nor no_dshs, and a static_mlp that only their first stage uses."""
+    model = FourD(splats := make_splats())
+    run = model.save(tmp_path / "run", splats)
+    model.deformation_net.static_mlp = nn.Sequential(nn.ReLU(), nn.Linear(32, 1))
+    torch.save(model.state_dict(), run / DEFORMATION)
+    (run / "cfg_args").write_text("Namespace(no_ds=False, no_dr=False, no_do=True, no_grid=False)")
+    _same(run, model)
+
+
+def test_code_in_a_network_is_not_run(tmp_path, capfd):
+    class Evil:
+        def __reduce__(self):
+            return print, ("this must not run",)
+
+    run = FourD(make_splats()).save(tmp_path / "run", make_splats())
+    torch.save({"deformation_net.grid.aabb": Evil()}, run / DEFORMATION)
+    with pytest.raises(DataError, match="refused: the pickle asks for"):
+        read_model(str(run), 30)
+    assert capfd.readouterr().out == ""
+
+
+@pytest.mark.parametrize("kind", [FourD, Deformable])
+def test_import_says_how_to_learn_from_them(tmp_path, cli, kind):
+    run = kind(make_splats()).save(tmp_path / "run", make_splats())
+    result = cli("import_model", run, "-o", tmp_path / "model.pt")
+    assert result.code == 1 and len(result.error_lines) == 1 and not (tmp_path / "model.pt").exists()
+    assert f"pd4dgs-train teacher:{run} learns from it" in result.err
+
+
+@pytest.mark.parametrize("kind", [FourD, Deformable])
+def test_teaching(tmp_path, cli, kind):
+    torch.manual_seed(0)
+    model = kind(ball(300))
+    fit(model, 60)
+    source = f"teacher:{model.save(tmp_path / 'run', ball(300))}?views=12&size=40x40"
+    made, packed = tmp_path / "model.pt", tmp_path / "scene.pd4"
+    assert cli("train", source, "-o", made, "--preset", "tiny", "--iterations", 60).code == 0
+    assert cli("encode", made, "-o", packed).code == 0
+    levels = cli("eval", packed, source, "--json").json["levels"]
+    assert levels[-1]["mpsnr"] > 20
