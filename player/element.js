@@ -8,6 +8,7 @@
 
 import { Orbit } from "./render/orbit.js";
 import { Player } from "./render/player.js";
+import { enterVr, hasHeadset } from "./render/xr.js";
 
 export { Player } from "./render/player.js";
 
@@ -97,6 +98,7 @@ const BODY = `
   <span class="clock" aria-hidden="true"></span>
   <select aria-label="Highest level"></select>
   <button class="home" type="button" aria-label="Reset the view" title="Reset the view">${HOME}</button>
+  <button class="vr" type="button" aria-label="Show in the headset" title="Show in the headset" hidden>VR</button>
   <button class="full" type="button" aria-label="Full screen" title="Full screen">${FULL}</button>
 </div>
 `;
@@ -135,6 +137,8 @@ export class Pd4Player extends HTMLElement {
     this._slider.addEventListener("input", () => this.seek(Number(this._slider.value)));
     this._select.addEventListener("change", () => (this.level = number(this._select.value)));
     part(".home").addEventListener("click", () => this._orbit?.reset());
+    part(".vr").addEventListener("click", () => this._enterVr());
+    hasHeadset().then((there) => (part(".vr").hidden = !there));
     part(".full").addEventListener("click", () => this._toggleFullScreen());
     root.addEventListener("keydown", (event) => this._key(/** @type {KeyboardEvent} */ (event)));
     this._showState();
@@ -342,6 +346,11 @@ export class Pd4Player extends HTMLElement {
     else if (event.key === "," || event.key === ".") this.seek(this.time + (event.key === "." ? FRAME : -FRAME));
     else if (!this._orbit?.key(event)) return;
     event.preventDefault();
+  }
+
+  _enterVr() {
+    const player = this._player;
+    if (player) enterVr(player).catch(({ message }) => this._react("error", { message }));
   }
 
   _toggleFullScreen() {

@@ -13,7 +13,7 @@ import {
   Vec3,
 } from "playcanvas";
 
-import { defaultCamera } from "./render/camera.js";
+import { defaultCamera, fitted } from "./render/camera.js";
 import { Playback, poseOf } from "./render/playback.js";
 /** @import { AppBase, Asset, CameraComponent, Entity, Texture } from "playcanvas" */
 /** @import { Camera } from "./decode/scene.js" */
@@ -164,9 +164,7 @@ export class Pd4 extends Script {
     camera.farClip = info.far * scale;
     camera.clearColor = new Color(...info.background);
     const { width, height } = this.app.graphicsDevice;
-    camera.horizontalFov = width * seen.height < height * seen.width;
-    const half = camera.horizontalFov ? seen.width / 2 / seen.K[0] : seen.height / 2 / seen.K[4];
-    camera.fov = (360 / Math.PI) * Math.atan(half);
+    camera.fov = (360 / Math.PI) * Math.atan(height / 2 / fitted(seen, width, height).K[4]);
   }
 
   /** @param {number} dt seconds */

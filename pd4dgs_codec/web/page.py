@@ -28,7 +28,7 @@ WORKERS = ("loader-worker.js", "sort-worker.js", "evaluate-worker.js")
 EFFORT = 1
 
 _WORKER_URL = re.compile(r'new URL\("\./([\w-]+-worker\.js)", import\.meta\.url\)')
-_COMMENTS = re.compile(r"/\*\*.*?\*/[ \t]*|^[ \t]*//[^\n]*", re.DOTALL | re.MULTILINE)
+_COMMENTS = re.compile(r"/\*\*.*?\*/[ \t]*|^[ \t]*//[^\n]*|[ \t]+//[^\n\"`]*$", re.DOTALL | re.MULTILINE)
 _SPACE = re.compile(r"\s*\n\s*")
 _IMPORT = re.compile(r'^import \{([^}]*)\} from "([^"]+)";$', re.MULTILINE)
 _REEXPORT = re.compile(r'^export \{([^}]*)\} from "([^"]+)";$', re.MULTILINE)
@@ -74,7 +74,7 @@ def _module(path: Path, imported: Callable[[str], str]) -> str:
 
 
 def packed(path: Path) -> str:
-    """A script without its JSDoc, comment lines and indentation, of which the player's strings hold none."""
+    """A script without indentation, and without comments but those that hold a quote and stand behind code."""
     return _SPACE.sub("\n", _COMMENTS.sub("", path.read_text(encoding="utf-8"))).strip() + "\n"
 
 

@@ -5,6 +5,9 @@ import { MIN_OPACITY } from "./level.js";
 /** @import { Splats } from "./evaluator.js" */
 /** @import { Field, Gpu } from "./gl.js" */
 
+/** A picture of several views, as an XRWebGLLayer describes it. @typedef {{framebuffer: WebGLFramebuffer | null,
+ * framebufferWidth: number, framebufferHeight: number}} Target */
+
 /** Variance added to every Gaussian, pixels squared. */
 const BLUR = 0.3;
 /** Share of the picture beyond its sides to which the projection's slope is clamped. */
@@ -117,7 +120,7 @@ export class Painter {
     const nothing = gpu.field(1, 1, 4);
     this.setOrder(new Uint32Array(1));
     const K = new Float32Array([1, 0, 1, 0, 1, 1, 0, 0, 1]);
-    this.draw({ field: nothing, texels: 1 }, { viewmat: new Float32Array(16), K, width: 2, height: 2 }, [0, 0, 0], 1);
+    this.draw({ field: nothing, texels: 1 }, [{ viewmat: new Float32Array(16), K, width: 2, height: 2 }], [0, 0, 0], 1);
     this.count = 0;
     gpu.free(nothing);
     gl.flush();
@@ -145,14 +148,17 @@ export class Painter {
   }
 
   /**
-   * Draws onto the canvas, which has the camera's size.
+   * Draws onto the canvas, which has the camera's size, or for the eyes of a headset.
    *
-   * @param {Splats | null} splats @param {Camera} camera @param {ArrayLike<number>} background RGB
-   * @param {number} near scene units
+   * @param {Splats | null} splats @param {(Camera & {x?: number, y?: number})[]} views and where in the picture they are,
+   * pixels @param {ArrayLike<number>} background RGB @param {number} near scene units @param {Target} [target]
    */
-  draw(splats, { viewmat, K, width, height }, background, near) {
+  draw(splats, views, background, near, target) {
     const gpu = this._gpu;
     const { gl } = gpu;
+    const width = target?.framebufferWidth ?? views[0].width;
+    const height = target?.framebufferHeight ?? views[0].height;
+    const framebuffer = target?.framebuffer ?? null;
     if (gpu.pictureFormat) {
       if (this._picture?.width !== width || this._picture.height !== height) {
         gpu.free(this._picture);
@@ -160,40 +166,46 @@ export class Painter {
       }
       gpu.bindTarget(this._picture, 0, 1);
     } else {
-      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
     }
-    gl.viewport(0, 0, width, height);
     gl.clearColor(background[0], background[1], background[2], 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    if (splats && this._order && this.count) {
-      const program = gpu.program(FRAGMENT, VERTEX);
-      gpu.use(program, { splats: splats.field, order: this._order });
-      gl.uniform1i(program.uniform("count"), this.count);
-      gl.uniform4fv(program.uniform("view"), viewmat.subarray(0, 12));
-      gl.uniform4f(program.uniform("lens"), K[0], K[4], K[2], K[5]);
-      gl.uniform4f(
-        program.uniform("slopes"),
-        (-K[2] - MARGIN * width) / K[0],
-        (width - K[2] + MARGIN * width) / K[0],
-        (-K[5] - MARGIN * height) / K[4],
-        (height - K[5] + MARGIN * height) / K[4],
-      );
-      gl.uniform2f(program.uniform("size"), width, height);
-      gl.uniform1f(program.uniform("near"), Math.max(near, 1e-6));
-      gl.enable(gl.BLEND);
-      gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
-      gl.bindVertexArray(this._array);
-      gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(this.count / BATCH));
-      gl.bindVertexArray(null);
-      gl.disable(gl.BLEND);
-    }
+    for (const view of views) this._drawView(splats, view, near);
     if (this._picture) {
       const program = gpu.program(SHOW);
-      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
       gpu.use(program, { picture: this._picture });
       gl.viewport(0, 0, width, height);
       gl.drawArrays(gl.TRIANGLES, 0, 3);
     }
+  }
+
+  /** @param {Splats | null} splats @param {Camera & {x?: number, y?: number}} view @param {number} near */
+  _drawView(splats, { viewmat, K, width, height, x = 0, y = 0 }, near) {
+    if (!splats || !this._order || !this.count) return;
+    const gpu = this._gpu;
+    const { gl } = gpu;
+    gl.viewport(x, y, width, height);
+    const program = gpu.program(FRAGMENT, VERTEX);
+    gpu.use(program, { splats: splats.field, order: this._order });
+    gl.uniform1i(program.uniform("count"), this.count);
+    gl.uniform4fv(program.uniform("view"), viewmat.subarray(0, 12));
+    gl.uniform4f(program.uniform("lens"), K[0], K[4], K[2], K[5]);
+    gl.uniform4f(
+      program.uniform("slopes"),
+      (-K[2] - MARGIN * width) / K[0],
+      (width - K[2] + MARGIN * width) / K[0],
+      (-K[5] - MARGIN * height) / K[4],
+      (height - K[5] + MARGIN * height) / K[4],
+    );
+    gl.uniform2f(program.uniform("size"), width, height);
+    gl.uniform1f(program.uniform("near"), Math.max(near, 1e-6));
+    gl.enable(gl.BLEND);
+    gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+    gl.bindVertexArray(this._array);
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(this.count / BATCH));
+    gl.bindVertexArray(null);
+    gl.disable(gl.BLEND);
   }
 
   free() {

@@ -65,6 +65,8 @@ export class Player extends Emitter {
     this._scene = null;
     /** @type {Camera | null} */
     this._camera = null;
+    /** The camera of a headset, which draws meanwhile. @type {Camera | null} */
+    this._head = null;
     /** @type {number | null} */
     this._level = options.level ?? null;
     /** Seconds of the scene's time, null: its start. @type {number | null} */
@@ -267,7 +269,7 @@ export class Player extends Emitter {
 
   /** The camera in use; assign null for the scene's own. @returns {Camera | null} */
   get camera() {
-    return this._camera ?? (this._scene && defaultCamera(this._scene.info));
+    return this._head ?? this._camera ?? (this._scene && defaultCamera(this._scene.info));
   }
 
   set camera(camera) {
@@ -315,6 +317,30 @@ export class Player extends Emitter {
       picture.data.set(pixels.subarray(4 * width * (height - 1 - y), 4 * width * (height - y)), 4 * width * y);
     }
     return picture;
+  }
+
+  /**
+   * Draws a frame of a headset, which takes the place of the canvas until `release`.
+   *
+   * @param {number} now milliseconds @param {Camera} head that Gaussians are evaluated and sorted for
+   * @param {(Camera & {x: number, y: number})[]} eyes @param {import("./painter.js").Target} target
+   */
+  present(now, head, eyes, target) {
+    this._head = head;
+    if (!this._gpu || !this._scene) return;
+    this._step(now);
+    if (this._draw(eyes, target)) this._shown(/** @type {{state: State}} */ (this._front).state, now);
+  }
+
+  /** Draws on the canvas again. */
+  release() {
+    this._head = null;
+    this._lastFrame = 0;
+    this._touch();
+  }
+
+  get closed() {
+    return this._closed;
   }
 
   /** Frees everything; the player cannot be used again. */
@@ -394,7 +420,7 @@ export class Player extends Emitter {
   }
 
   _wake() {
-    if (this._frameRequest || this._closed) return;
+    if (this._frameRequest || this._closed || this._head) return;
     this._frameRequest = requestAnimationFrame((now) => {
       this._frameRequest = 0;
       this._frame(now);
@@ -412,18 +438,24 @@ export class Player extends Emitter {
 
   /** @param {number} now */
   _frame(now) {
+    if (this._head) return;
     if (!this._visible || !this._gpu || !this._scene) {
       this._lastFrame = 0;
       return;
     }
-    if (this._playing) this._advance(now);
-    const undrawn = this._front && this._shownLevel === null; // the first picture does not wait for the second
-    if (!this._evaluating && !undrawn && !this._isEvaluated()) this._evaluate();
-    this._sort();
+    this._step(now);
     const size = this._size(now);
     const sized = size[0] === this.canvas.width && size[1] === this.canvas.height;
     if (this._front && !this._drawing && (this._dirty || !sized)) this._show(size);
     if (this._playing || !this._isSettled()) this._wake();
+  }
+
+  /** Brings time, Gaussians and their order on. @param {number} now */
+  _step(now) {
+    if (this._playing) this._advance(now);
+    const undrawn = this._front && this._shownLevel === null; // the first picture does not wait for the second
+    if (!this._evaluating && !undrawn && !this._isEvaluated()) this._evaluate();
+    this._sort();
   }
 
   /** @param {number} now */
@@ -603,12 +635,14 @@ export class Player extends Emitter {
     }
   }
 
-  /** Draws immediately. @returns {boolean} whether there were Gaussians */
-  _draw() {
+  /** Draws immediately. @param {(Camera & {x: number, y: number})[]} [eyes]
+   * @param {import("./painter.js").Target} [target] @returns {boolean} whether there were Gaussians */
+  _draw(eyes, target) {
     const { camera, _painter: painter, _front: front } = this;
     if (!camera || !painter || !front) return false;
     const { info } = front.state.scene;
-    painter.draw(front.splats, fitted(camera, this.canvas.width, this.canvas.height), info.background, info.near);
+    const views = eyes ?? [fitted(camera, this.canvas.width, this.canvas.height)];
+    painter.draw(front.splats, views, info.background, info.near, target);
     return true;
   }
 

@@ -24,7 +24,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from browser import PATIENCE_MS, launched
-from pictures import PLAYER, call, cameras, decibels, pixels, resized, shots
+from pictures import PLAYER, Rasterised, call, cameras, decibels, pixels, resized, shots
 from strategies import make_scene
 
 from pd4dgs_codec import decode, encode, show
@@ -660,6 +660,78 @@ def test_every_control_has_a_name_and_is_reached_by_key(page, server):
     status = player.locator("[part=status]").inner_text()
     assert status.startswith("level 2 of 2 · ")
     assert status.endswith(" · no GPU: the CPU draws, fewer pixels while the picture moves")
+
+
+#: Of the headset of test-browser/headset.js: the head, then of each eye metres to the right and tangents of its sides.
+TURN, PLACE = 0.2, (0.1, 0.05, -0.3)
+EYES = ((-0.03, -0.7, 0.5, -0.4, 0.5), (0.03, -0.5, 0.7, -0.4, 0.5))
+
+
+def eye_camera(scene: Scene, eye: tuple[float, ...]) -> Camera:
+    """What an eye of the headset sees, whose head was at the scene's camera when it came on."""
+    right, left_side, right_side, low, high = eye
+    assert scene.info.camera and scene.info.unit
+    head = np.eye(4)
+    head[:3, :3] = [[np.cos(TURN), 0, np.sin(TURN)], [0, 1, 0], [-np.sin(TURN), 0, np.cos(TURN)]]
+    head[:3, 3] = PLACE
+    moved = np.eye(4)
+    moved[0, 3] = right
+    axes, metres = np.diag([1.0, -1, -1, 1]), np.diag([*3 * [scene.info.unit], 1])
+    viewmat = np.linalg.inv(metres) @ axes @ np.linalg.inv(head @ moved) @ axes @ metres @ scene.info.camera.viewmat
+    fx, fy = WIDTH / (right_side - left_side), HEIGHT / (high - low)
+    K = np.array([[fx, 0, -left_side * fx], [0, fy, high * fy], [0, 0, 1]], np.float32)
+    return Camera(viewmat.astype(np.float32), K, WIDTH, HEIGHT)
+
+
+def test_a_headset_shows_each_eye_its_picture(page, server, folder):
+    pytest.importorskip("numba")
+    scene = lively_scene()
+    scene = replace(scene, info=replace(scene.info, unit=0.5))
+    data = encode(scene, layers=2, effort=1)
+    (folder / "vr.pd4").write_bytes(data)
+    page.add_init_script(path=PLAYER / "test-browser" / "headset.js")
+    player = element(page, server, f'controls time="2" src="{server.url_of("vr.pd4")}"')
+    wait_for_level(page, 2)
+    before = page.evaluate(f"[...{ELEMENT}.camera.viewmat]")
+    player.get_by_role("button", name="Show in the headset").click()
+    page.wait_for_function(f"headset.frames && {ELEMENT}.player._isEvaluated() && {ELEMENT}.player._isSorted()")
+    drawn = page.evaluate("headset.frames")
+    page.wait_for_function("(drawn) => headset.frames > drawn + 1", arg=drawn)
+    got = pixels(page.evaluate("headset.read()"), 2 * WIDTH, HEIGHT)
+    eyes = np.split(got, 2, axis=1)
+    for eye, picture in zip(EYES, eyes, strict=True):
+        expected = Rasterised(decode(data)).picture(eye_camera(scene, eye), 0.5)
+        assert decibels(picture, expected) > LEAST_DB
+    assert decibels(*eyes) < 40
+    on_canvas = page.evaluate(f"{ELEMENT}.player.counts.drawn")
+    page.evaluate("headset.session.dispatchEvent(new Event('select'))")
+    page.wait_for_function(f"{ELEMENT}.time > 2.02 && !{ELEMENT}.paused")
+    page.evaluate("headset.session.dispatchEvent(new Event('select'))")
+    assert page.evaluate(f"{ELEMENT}.player.counts.drawn") == on_canvas  # which stands still meanwhile
+    page.evaluate("headset.session.end()")
+    page.wait_for_function(f"(drawn) => {ELEMENT}.player.counts.drawn > drawn", arg=on_canvas)
+    assert page.evaluate(f"[...{ELEMENT}.camera.viewmat]") == before
+    player.get_by_role("button", name="Show in the headset").click()
+    page.evaluate(f"{ELEMENT}.remove()")
+    page.wait_for_function("headset.session.ended")  # with the element
+
+
+def test_a_headset_that_fails_is_one_line(page, server):
+    page.add_init_script(path=PLAYER / "test-browser" / "headset.js")
+    player = element(page, server, f'controls src="{server.url_of("scene.pd4")}"')
+    wait_for_level(page, 2)
+    page.evaluate("void (XRWebGLLayer = class { constructor() { throw Error('no') } })")
+    player.get_by_role("button", name="Show in the headset").click()
+    page.wait_for_function("headset.session?.ended")
+    assert player.get_by_role("alert").inner_text() == "no"
+
+
+def test_there_is_no_headset_button_without_a_headset(page, server):
+    player = element(page, server, f'controls src="{server.url_of("scene.pd4")}"')
+    wait_for_level(page, 0)
+    assert page.evaluate("navigator.xr.isSessionSupported('immersive-vr')") is False
+    assert player.get_by_role("button", name="Full screen").is_visible()
+    assert player.get_by_role("button", name="Show in the headset").count() == 0
 
 
 def test_attributes_and_removal(page, server):
