@@ -14,7 +14,6 @@ the formula of the rotation matrix, which then stretches as well: https://github
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import combinations
 from pathlib import Path
@@ -22,13 +21,13 @@ from pathlib import Path
 import numpy as np
 
 from pd4dgs_codec.data.cameras import rotation_matrix
-from pd4dgs_codec.data.files import LARGEST
+from pd4dgs_codec.data.files import Color
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.interchange.formats import activated, checked, read_parameters
+from pd4dgs_codec.interchange.formats import activated, checked, finite_rows, read_parameters
 from pd4dgs_codec.interchange.runs import MAX_WIDTH, PLY, Config, Layer, State, iteration, network_of, run_of
 from pd4dgs_codec.interchange.splats import Splats, principal_axes, quaternions, unit
 
-ROWS = 1 << 14  #: Gaussians moved at once: the widest layer of so many takes 64 MiB
+ROWS = 1 << 13  #: Gaussians moved at once: the outputs of the widest layer take 32 MiB
 MOST_LAYERS = 16  #: layers of a network, or resolutions of planes
 #: The heads of 4DGaussians by what they change, and the option that switches each off with its value in older runs,
 #: which lack it.
@@ -49,25 +48,16 @@ Parts = dict[str, np.ndarray]  #: Gaussians: rows of means, quats, scales, opaci
 Move = Callable[[Parts, float], Parts]
 
 
-@dataclass(frozen=True)
-class Deformed:
-    """A run. splats: time 0..1 -> Gaussians. background: RGB 0..1."""
-
-    splats: Callable[[float], Splats]
-    background: tuple[float, float, float]
-
-
-def read_deformed(folder: Path) -> Deformed | None:
-    """The last iteration of a run, or the iteration at `folder`; None if it holds neither. Raises DataError."""
+def read_deformed(folder: Path) -> tuple[Callable[[float], Splats], Color] | None:
+    """(time 0..1 -> Gaussians, background) of a run's last iteration, or of the iteration at `folder`; None for other
+    folders. Raises DataError."""
     place = iteration(folder)
     network = network_of(place) if place else None
     if place is None or network is None:
         return None
     config = Config.of(run_of(place))
     rest = read_parameters(place / PLY)
-    good = np.ones(len(rest["means"]), bool)
-    for values in rest.values():
-        good &= (np.abs(values) <= LARGEST).all(axis=tuple(range(1, values.ndim)))  # also false of NaN
+    good = finite_rows(rest)
     rest = {name: values[good] for name, values in rest.items()}
     state = State.read(network)
     if network.parent == place:
@@ -75,7 +65,7 @@ def read_deformed(folder: Path) -> Deformed | None:
     else:
         rest = activated(rest) | {"quats": unit(rest["quats"])}
         move = _positional_move(state)
-    return Deformed(lru_cache(maxsize=2)(partial(_moved, str(folder), rest, move)), config.background)
+    return lru_cache(maxsize=2)(partial(_moved, str(folder), rest, move)), config.background
 
 
 def _moved(where: str, rest: Parts, move: Move, t: float) -> Splats:

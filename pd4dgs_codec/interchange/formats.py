@@ -59,14 +59,18 @@ def checked(
     if sh.shape[1] - 1 not in REST:
         expected = ", ".join(str(k + 1) for k in REST)
         raise DataError(f"{where}: {sh.shape[1]} coefficients per colour, expected {expected}")
-    good = np.ones(n, bool)
-    for array in parts.values():
-        good &= (np.abs(array) <= LARGEST).all(axis=tuple(range(1, array.ndim)))  # also false of NaN
+    good = finite_rows(parts)
     good &= (np.linalg.norm(quats, axis=1) > 0) & (scales >= 0).all(axis=1) & (opacities >= 0) & (opacities <= 1)
     if not good.any():
         raise DataError(f"{where}: none of {n} Gaussians is finite with a rotation, expected one at least")
     kept = {name: np.ascontiguousarray(array[good], np.float32) for name, array in parts.items()}
     return Splats(**kept | {"quats": unit(kept["quats"])})
+
+
+def finite_rows(parts: dict[str, np.ndarray]) -> np.ndarray:
+    """bool [n]: the rows of arrays [n, ...] that hold numbers up to LARGEST alone."""
+    found = [(np.abs(array) <= LARGEST).all(axis=tuple(range(1, array.ndim))) for array in parts.values()]  # not NaN
+    return np.asarray(np.logical_and.reduce(found))
 
 
 def library(name: str, what: str) -> Any:

@@ -17,7 +17,7 @@ import numpy as np
 
 from pd4dgs_codec.archives import read_tensors
 from pd4dgs_codec.data.cameras import ROTATION_TOLERANCE, world_to_camera
-from pd4dgs_codec.data.files import LARGEST, read_file
+from pd4dgs_codec.data.files import LARGEST, WHITE, Color, read_file
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.scene import Camera
 
@@ -80,9 +80,9 @@ class Config:
         return found == "True"
 
     @property
-    def background(self) -> tuple[float, float, float]:
+    def background(self) -> Color:
         """White or black."""
-        return (1.0, 1.0, 1.0) if self.get("white_background") == "True" else (0.0, 0.0, 0.0)
+        return WHITE if self.get("white_background") == "True" else (0.0, 0.0, 0.0)
 
 
 def read_torch(path: Path) -> Any:

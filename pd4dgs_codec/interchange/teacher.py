@@ -211,7 +211,7 @@ def read_model(place: str, fps: float) -> Teacher:
     path = Path(place)
     if path.is_dir():
         run = read_deformed(path)
-        return Teacher(run.splats, None, 1.0, run.background) if run else _folder(path, fps)
+        return Teacher(run[0], None, 1.0, run[1]) if run else _folder(path, fps)
     if path.is_file():
         name = path.name.lower()
         if name.endswith(".4dgs"):
