@@ -55,7 +55,8 @@ def whole_file(path: str | Path, overwrite: bool) -> Iterator[Path]:
     """
     check_output(path, overwrite)
     if is_device(Path(path)):  # renaming a file to /dev/null or a pipe would destroy it
-        yield Path(path)
+        with _naming(path):
+            yield Path(path)
         return
     target = Path(os.path.realpath(path))
     with _temporary_folder(target.parent, path) as folder:
@@ -116,16 +117,24 @@ def finite(value: Any) -> Any:
 
 
 @contextlib.contextmanager
-def _temporary_folder(parent: Path, path: str | Path) -> Iterator[Path]:
-    """A folder on the same disk as the output, so that the rename is one step. Errors name the output, not a folder."""
-    folder = None
+def _naming(path: str | Path) -> Iterator[None]:
+    """Errors name the output, not where it is written meanwhile, or nothing."""
     try:
-        with held():
-            folder = Path(tempfile.mkdtemp(dir=parent, prefix=PREFIX))
-            _FOLDERS.add(folder)
-        yield folder
+        yield
     except OSError as error:
         raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(path)) from None
+
+
+@contextlib.contextmanager
+def _temporary_folder(parent: Path, path: str | Path) -> Iterator[Path]:
+    """A folder on the same disk as the output, so that the rename is one step."""
+    folder = None
+    try:
+        with _naming(path):
+            with held():
+                folder = Path(tempfile.mkdtemp(dir=parent, prefix=PREFIX))
+                _FOLDERS.add(folder)
+            yield folder
     finally:
         if folder is not None:
             shutil.rmtree(folder, ignore_errors=True)

@@ -52,6 +52,10 @@ def test_a_link_stays_one_and_a_device_is_written_to(tmp_path):
     assert (tmp_path / "link").is_symlink() and (tmp_path / "x.bin").read_bytes() == b"new"
     io.write_bytes("/dev/null", b"gone", overwrite=False)
     assert not os.path.isfile("/dev/null")
+    if os.path.exists("/dev/full"):
+        with pytest.raises(OSError) as caught:
+            io.write_bytes("/dev/full", b"new", overwrite=False)
+        assert caught.value.filename == "/dev/full"
 
 
 @pytest.mark.skipif(os.name != "posix", reason="modes")

@@ -34,11 +34,16 @@ ORIENTATION, UPRIGHT = 0x0112, 1  #: EXIF's orientation tag, and its value for p
 GAMMA = (0.40, 0.51)  #: exponents that PNG files give for sRGB: 1/2.2 as encoders round it
 
 
+def check_regular(path: Path) -> None:
+    """Raises DataError for pipes and devices, whose end may never come, and OSError or ValueError for odd names."""
+    if path.exists() and not path.is_file():
+        raise DataError(f"{path}: is not a regular file")
+
+
 def read_file(path: Path) -> bytes:
-    """All bytes of a regular file. Raises DataError; also for pipes and devices, whose end may never come."""
+    """All bytes of a regular file. Raises DataError."""
     try:
-        if path.exists() and not path.is_file():
-            raise DataError(f"{path}: is not a regular file")
+        check_regular(path)
         return path.read_bytes()
     except (OSError, ValueError) as error:  # ValueError: a NUL or half a surrogate in the name
         raise DataError(f"{path}: cannot be read: {getattr(error, 'strerror', error)}") from None
@@ -162,11 +167,14 @@ def _open(path: Path, what: str = "image", size: tuple[int, int] | None = None) 
     from PIL import Image  # of the extra `train`
 
     try:
+        check_regular(path)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of Pillow, about sizes
             picture = Image.open(path, formats=FORMATS)
     except FileNotFoundError:
         raise DataError(f"{path}: image is missing") from None
+    except DataError:
+        raise
     except Exception:  # Pillow raises many kinds
         raise DataError(f"{path}: not an image that can be read, expected {', '.join(FORMATS)}") from None
     check_pixels(picture.width * picture.height, [path], str(path))
@@ -189,9 +197,8 @@ def _has_alpha(image: Picture) -> bool:
 def _check_readable(image: Picture, where: str) -> None:
     """Refuses pictures that Pillow would not show as their makers saw them."""
     found = None
-    frames = getattr(image, "n_frames", 1)
-    if frames > 1:
-        found = f"holds {frames} pictures, expected one"
+    if getattr(image, "is_animated", False):  # Pillow takes quadratic time to count the pictures of a TIFF file
+        found = "holds several pictures, expected one"
     elif image.mode not in READABLE_MODES:
         found = f"has pixels of kind {image.mode}, expected grey of 8 or 16 bits, a palette, RGB or RGBA"
     elif image.mode in GREY16_MODES and _has_alpha(image):

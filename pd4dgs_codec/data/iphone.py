@@ -220,8 +220,8 @@ def read_record3d(folder: Path, downscale: int, holdout: int, background: Color 
     rows qx qy qz qw x y z, camera to world with ARKit's axes: x right, y up, z backwards. `frameTimestamps` or `fps`
     give the times.
     """
-    path = next(folder / name for name in META if (folder / name).is_file())
-    pictures = next(folder / name for name in PICTURES if (folder / name).is_dir())
+    path = next(folder / name for name in META if (folder / name).exists())
+    pictures = next(folder / name for name in PICTURES if (folder / name).exists())
     meta = read_json(path)
     size = tuple(whole_number(meta.get(key), f"{path}: {key}", low=1) for key in ("w", "h"))
     rows = meta.get("poses")

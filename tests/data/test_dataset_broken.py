@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import json
+import os
+import stat
 import struct
 import zipfile
 from collections.abc import Callable
@@ -18,6 +20,7 @@ from PIL import Image
 
 NAN = float("nan")
 FRAMES = [{"file_path": f"r_{i}", "time": i / 10, "transform_matrix": pose(0.2 * i)} for i in range(3)]
+SOCKET = object()  #: a change of a file: it is none, as a pipe would be, for which a reader could wait
 XYZ = "property float x\nproperty float y\nproperty float z\n"
 
 
@@ -166,6 +169,7 @@ CASES: list[tuple[str, str, Any, str]] = [
     ("iphone", CAMERA, {"position": [0, 0]}, "position has shape (2,), expected (3,)"),
     ("iphone", CAMERA, {"image_size": [1, 1]}, "expected at least 2x2"),
     ("iphone", CAMERA, {"image_size": [14, 8]}, "image is 12x8, expected 14x8"),
+    ("iphone", "rgb/1x/0_00000.png", SOCKET, "0_00000.png: is not a regular file"),
     ("iphone", "metadata.json", b"{}", "no entry for frame '0_00000'"),
     ("iphone", "metadata.json", {"0_00000": {}}, "warp_id is None"),
     ("iphone", "splits/train.json", {"frame_names": []}, "0 training frames, expected at least 1"),
@@ -196,6 +200,7 @@ CASES: list[tuple[str, str, Any, str]] = [
     ("iphone", "splits/train.json", {"frame_names": ["../camera/0_00000"]}, "no entry for frame"),
     ("iphone", "splits/train.json", {"frame_names": ["0_00000"] * 2}, "names a frame twice"),
     ("iphone", "metadata.json", {"0_00000": {"warp_id": [1]}}, "warp_id is [1]"),
+    ("record3d", "metadata", SOCKET, "metadata: is not a regular file"),
     ("record3d", "metadata", {"poses": []}, "found no poses"),
     ("record3d", "metadata", lambda m: m | {"poses": [row[:6] for row in m["poses"]]}, "expected (12, 7)"),
     ("record3d", "metadata", {"poses": [[0, 0, 0, 2, 0, 0, 0]] * COUNT}, "pose 0: quaternion of length 2, expected 1"),
@@ -279,6 +284,9 @@ def changed(path: Path, change: Any) -> None:
     """Applies a change of CASES."""
     if change is None:
         path.unlink()
+    elif change is SOCKET:
+        path.unlink()
+        os.mknod(path, stat.S_IFSOCK)
     elif isinstance(change, bytes):
         path.write_bytes(change)
     elif path.suffix == ".npy":

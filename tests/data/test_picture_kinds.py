@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import zlib
 from pathlib import Path
 
@@ -106,6 +107,13 @@ def gamma_one() -> PngInfo:
     return info
 
 
+def several_cut(path: Path) -> None:
+    """A TIFF file of pictures whose second is not there."""
+    stream = io.BytesIO()
+    Image.fromarray(COLOUR).save(stream, "tiff", save_all=True, append_images=[Image.fromarray(COLOUR)] * 3)
+    path.write_bytes(stream.getvalue()[: len(stream.getvalue()) // 4 + 100])
+
+
 REFUSED = {
     "turned.jpg": (lambda p: Image.fromarray(COLOUR).save(p, exif=oriented(6)), "orientation flag 6"),
     "turned.png": (lambda p: Image.fromarray(COLOUR).save(p, exif=oriented(3)), "orientation flag 3"),
@@ -115,8 +123,9 @@ REFUSED = {
     "int.tif": (lambda p: Image.fromarray(RAMP.astype(np.int32)).save(p), "pixels of kind I,"),
     "moving.png": (
         lambda p: Image.fromarray(COLOUR).save(p, save_all=True, append_images=[Image.fromarray(255 - COLOUR)]),
-        "holds 2 pictures",
+        "holds several pictures",
     ),
+    "many-cut.tif": (several_cut, "holds several pictures"),  # not counted: that took the square of their number
     "gamma.png": (lambda p: Image.fromarray(COLOUR).save(p, pnginfo=gamma_one()), "gamma of 1"),
     "broken-profile.png": (lambda p: Image.fromarray(COLOUR).save(p, icc_profile=b"no profile"), "colour profile"),
     "key-16.png": (
