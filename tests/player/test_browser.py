@@ -9,6 +9,8 @@ from __future__ import annotations
 import functools
 import gzip
 import http.server
+import io
+import math
 import os
 import shutil
 import subprocess
@@ -25,12 +27,15 @@ import numpy as np
 import pytest
 from browser import PATIENCE_MS, launched
 from pictures import PLAYER, Rasterised, call, cameras, decibels, pixels, resized, shots
+from PIL import Image
 from strategies import make_scene
 
 from pd4dgs_codec import decode, encode, show
 from pd4dgs_codec import scene as scene_module
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.format.info import info
+from pd4dgs_codec.interchange.formats import ply_bytes
+from pd4dgs_codec.interchange.splats import Splats
 from pd4dgs_codec.scene import PLANES, Camera, Deformation, Network, Scene, SceneInfo, Steps, Widths
 from pd4dgs_codec.web.page import page as packed_page
 from pd4dgs_codec.web.server import Link, Server
@@ -300,6 +305,13 @@ SPARK_FILES = (
     "@sparkjsdev/spark/dist/spark.module.js",
 )
 PLAYCANVAS_FILES = ("playcanvas/build/playcanvas.mjs",)
+SUPERSPLAT_FILES = (
+    *PLAYCANVAS_FILES,
+    "playcanvas/scripts/esm/xr/xr-controllers.mjs",
+    "playcanvas/scripts/esm/xr/xr-navigation.mjs",
+    "@playcanvas/supersplat-viewer/dist/viewer.js",
+    "@playcanvas/supersplat-viewer/dist/settings.js",
+)
 
 
 def viewer(page: Any, server: Server, folder: Path, name: str, files: Sequence[str]) -> None:
@@ -349,6 +361,30 @@ def test_pictures_through_playcanvas_are_those_of_the_rasteriser(page, server, f
         assert np.abs(shot.expected - scene.info.background).max() > 0.2
         seen.append(shot.player)
     assert decibels(seen[0], seen[1]) < 60 and decibels(seen[1], seen[3]) < 60  # levels and times differ
+    call(page, "harness.close")
+
+
+def test_supersplat_shows_the_script_in_place_of_a_still(page, server, folder, lively):
+    pytest.importorskip("numba")
+    viewer(page, server, folder, "supersplat", SUPERSPLAT_FILES)
+    scene = decode(lively)
+    corners = scene.info.box.astype(np.float32)
+    white = np.ones((2, 1, 3), np.float32)
+    still = Splats(corners, np.eye(4, dtype=np.float32)[[0, 0]], 0 * corners + 0.3, np.float32([1, 1]), white)
+    (folder / "still.ply").write_bytes(ply_bytes(still))
+    fov = math.degrees(2 * math.atan(WIDTH / 2 / 80))
+    look = dict(still=server.url_of("still.ply"), fov=fov, background=scene.info.background, position=[0.3, 0.2, -4])
+    opened(page, server.url_of("scene.pd4"), **look)
+    seen = []
+    for level, t in ((0, 0.0), (1, 0.5)):
+        state = call(page, "harness.show", dict(level=level, seconds=1 + 2 * t))
+        picture = np.asarray(Image.open(io.BytesIO(page.screenshot(clip=dict(x=0, y=0, width=WIDTH, height=HEIGHT)))))
+        seen.append(picture[..., :3] / 255)
+        viewmat = np.diag([1.0, -1, -1, 1]) @ np.linalg.inv(np.reshape(state["pose"], (4, 4)).T)
+        K = np.array([[state["focal"], 0, WIDTH / 2], [0, state["focal"], HEIGHT / 2], [0, 0, 1]], np.float32)
+        camera = Camera(viewmat.astype(np.float32), K, WIDTH, HEIGHT)
+        assert decibels(seen[-1], Rasterised(decode(lively, max_layer=level)).picture(camera, t)) > SPARK_DB
+    assert decibels(*seen) < 60
     call(page, "harness.close")
 
 

@@ -1,0 +1,94 @@
+// What the test of SuperSplat's viewer calls: `window.harness`. It and its engine come from the page's import map.
+
+import { Entity, Mat4 } from "playcanvas";
+
+import { Pd4 } from "../playcanvas.js";
+
+/** @param {string} name */
+const load = (name) => import(name); // without a type: TypeScript need not find the package
+const [{ createViewer }, { defaultSettings }] = await Promise.all(
+  ["viewer", "settings"].map((name) => load(`@playcanvas/supersplat-viewer/${name}.js`)),
+);
+
+/** @type {any} */
+let shown = null;
+
+/**
+ * A scene in the viewer, in place of a still one. Time stands still.
+ *
+ * @param {string} url @param {number} width @param {number} height
+ * @param {{still: string, fov: number, background: number[], position: number[]}} options fov: degrees, of the longer
+ * side
+ */
+async function open(url, width, height, { still, fov, background, position }) {
+  const container = document.createElement("div");
+  Object.assign(container.style, { width: `${width}px`, height: `${height}px` });
+  document.body.append(container);
+  const settings = defaultSettings("object");
+  Object.assign(settings, { tonemapping: "none", background: { color: background } });
+  settings.cameras = [{ initial: { position, target: [0, 0, 0], fov } }];
+  const viewer = await createViewer({
+    ...{ container, settings, contentUrl: still, renderer: "webgl", ui: false, noanim: true, nofx: true },
+  });
+  const { app, events, state } = viewer;
+  if (!state.loaded) await new Promise((resolve) => events.once("loaded:changed", resolve));
+  state.cameraMode = "orbit"; // else it flies around
+  viewer.resetCamera();
+  const entity = new Entity("moving", app);
+  entity.setLocalEulerAngles(0, 0, 180); // as the viewer's own
+  app.root.addChild(entity);
+  entity.addComponent("script");
+  const properties = { src: url, autoplay: false, exact: true };
+  const script = /** @type {Pd4} */ (entity.script?.create(Pd4, { properties }));
+  script.once("upgrade", () => (app.root.findByName("gsplat").enabled = false));
+  shown = { viewer, script, container };
+  await new Promise((resolve, reject) => {
+    script.on("loaded", resolve);
+    script.on("error", reject);
+  });
+}
+
+/**
+ * Shows a state, until the viewer has nothing more to draw.
+ *
+ * @param {{level: number, seconds: number}} state
+ * @returns {Promise<{pose: number[], focal: number}>} camera to scene, column-major; focal length, pixels
+ */
+async function show({ level, seconds }) {
+  const { viewer, script } = shown;
+  script.maxLayer = level;
+  script.playback.time = seconds;
+  let drawn = 0;
+  const handle = viewer.app.on("postrender", () => drawn++);
+  for (let before = -1; before !== drawn || !script.playback.settled; ) {
+    before = drawn;
+    await new Promise((resolve) => setTimeout(resolve, 200));
+  }
+  handle.off();
+  const { entity, projectionMatrix } = viewer.app.systems.camera.cameras[0];
+  const toScene = new Mat4().copy(script.entity.getWorldTransform()).invert();
+  return {
+    pose: [...toScene.mul(entity.getWorldTransform()).data],
+    focal: (projectionMatrix.data[5] * viewer.app.graphicsDevice.height) / 2,
+  };
+}
+
+function close() {
+  shown?.viewer.destroy();
+  shown?.container.remove();
+  shown = null;
+}
+
+Object.assign(window, {
+  harness: {
+    open,
+    show,
+    close,
+    get viewer() {
+      return shown?.viewer;
+    },
+    get script() {
+      return shown?.script;
+    },
+  },
+});
