@@ -14,7 +14,7 @@ the formula of the rotation matrix, which then stretches as well: https://github
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import lru_cache, partial
+from functools import lru_cache, partial, reduce
 from itertools import combinations
 from pathlib import Path
 
@@ -100,12 +100,7 @@ def _hexplane_move(state: State, config: Config, rest: Parts) -> Move:
         if (value := config.get(name)) not in (None, "False", "0"):
             raise DataError(f"{config.path}: has {name}={value}, expected a model without")
     net = "deformation_net"
-    count = sum(f"{net}.grid.grids.{i}.0" in state.tensors for i in range(MOST_LAYERS))
-    levels = [_planes(state, f"{net}.grid.grids.{i}") for i in range(max(count, 1))]
-    corner, other = state.take(f"{net}.grid.aabb", 2, 3)
-    if not (np.abs(corner - other) > THINNEST).all():
-        raise DataError(f"{state.path}: {net}.grid.aabb is flat, expected sides over {THINNEST:g}")
-    features = sum(planes[0].shape[2] for planes in levels)
+    field, features = _field(state, f"{net}.grid")
     trunk = state.chain(f"{net}.feature_out", _places(state, f"{net}.feature_out"), features)
     width = len(trunk[-1][1])
     heads = {
@@ -117,9 +112,7 @@ def _hexplane_move(state: State, config: Config, rest: Parts) -> Move:
     turns = config.flag("apply_rotation", "False")
 
     def move(parts: Parts, t: float) -> Parts:
-        # the first corner is at -1; times are 0..1 on an axis from -1 to 1
-        places = (parts["means"] - corner) * (2 / (other - corner)) - 1
-        hidden = np.maximum(_through(trunk, _sampled(levels, places, t)), 0)
+        hidden = np.maximum(_through(trunk, field(parts["means"], t)), 0)
         keep = _through(static, hidden) if static else np.ones((len(hidden), 1), np.float32)
         moved = dict(parts)
         for name, head in heads.items():
@@ -134,6 +127,27 @@ def _hexplane_move(state: State, config: Config, rest: Parts) -> Move:
     return move
 
 
+def _field(state: State, name: str) -> tuple[Callable[[np.ndarray, float], np.ndarray], int]:
+    """(means [n, 3] and a time -> features [n, F], those of each resolution side by side; F)."""
+    count = sum(f"{name}.grids.{i}.0" in state.tensors for i in range(MOST_LAYERS))
+    levels = [_planes(state, f"{name}.grids.{i}") for i in range(max(count, 1))]
+    corner, other = state.take(f"{name}.aabb", 2, 3)
+    if not (np.abs(corner - other) > THINNEST).all():
+        raise DataError(f"{state.path}: {name}.aabb is flat, expected sides over {THINNEST:g}")
+
+    def field(means: np.ndarray, t: float) -> np.ndarray:
+        # the first corner is at -1; times are 0..1 on an axis from -1 to 1
+        places = (means - corner) * (2 / (other - corner)) - 1
+        axes = [*places.T, np.full(len(means), t, np.float32)]
+        features = []
+        for planes in levels:
+            samples = (_bilinear(plane, *pair) for plane, pair in zip(planes, combinations(axes, 2), strict=True))
+            features.append(reduce(np.multiply, samples))
+        return np.concatenate(features, axis=1)
+
+    return field, sum(planes[0].shape[2] for planes in levels)
+
+
 def _planes(state: State, name: str) -> list[np.ndarray]:
     """The planes [rows, columns, features] of a resolution, over xy, xz, xt, yz, yt and zt; the first is the column."""
     planes = [state.take(f"{name}.0", 1, None, None, None)]
@@ -142,18 +156,6 @@ def _planes(state: State, name: str) -> list[np.ndarray]:
         raise DataError(f"{state.path}: {name}.0 has {features} features, expected {MAX_WIDTH} at most")
     planes += [state.take(f"{name}.{i}", 1, features, None, None) for i in range(1, 6)]
     return [np.ascontiguousarray(plane[0].transpose(1, 2, 0)) for plane in planes]
-
-
-def _sampled(levels: list[list[np.ndarray]], places: np.ndarray, t: float) -> np.ndarray:
-    """Features [n, F] of places [n, 3], -1..1 within the box, at a time: those of each resolution side by side."""
-    axes = [*places.T, np.full(len(places), t, np.float32)]
-    features = []
-    for planes in levels:
-        product = np.float32(1)
-        for plane, (across, down) in zip(planes, combinations(axes, 2), strict=True):
-            product = product * _bilinear(plane, across, down)
-        features.append(product)
-    return np.concatenate(features, axis=1)
 
 
 def _bilinear(plane: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarray:
@@ -199,9 +201,9 @@ def _positional_move(state: State) -> Move:
         time = _through(timenet, _waves(np.full((1, 1), t, np.float32), octaves))
         given = np.concatenate([_waves(means, MEAN_OCTAVES), np.repeat(time, len(means), axis=0)], axis=1)
         hidden = given
-        for i, (weight, bias) in enumerate(layers):
+        for i, layer in enumerate(layers):
             taken = np.concatenate([given, hidden], axis=1) if i == count // 2 + 1 else hidden
-            hidden = np.maximum(taken @ weight.T + bias, 0)
+            hidden = np.maximum(_through([layer], taken), 0)
         shift, *more = (_through([layer], hidden) for layer in shifts)
         factors = rotation_matrix(parts["quats"] + _through([turn], hidden))
         factors = factors * (parts["scales"] + _through([grow], hidden))[:, None, :]
