@@ -241,10 +241,11 @@ class _Handler(BaseHTTPRequestHandler):
             self.close_connection = True
         # what the parser could not read as header fields may announce a body, as may a line that goes on
         broken = head.defects or head.get_payload() or any("\n" in value or "\r" in value for value in head.values())
-        if broken or len(head.get_all("Host", [])) > 1:
+        if broken or any(len(head.get_all(name, [])) > 1 for name in ("Host", "Origin")):
             self.send_error(HTTPStatus.BAD_REQUEST)
             return False
-        if self.server.private and not self.server.is_own(head.get("Host"), head.get("Origin")):
+        named = self.path.startswith("/") and self.server.is_own(head.get("Host"), head.get("Origin"))
+        if self.server.private and not named:  # a target may name another host, too
             self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
             return False
         return True

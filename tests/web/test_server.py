@@ -204,6 +204,18 @@ def test_a_private_server_answers_no_other_site(private, method, headers):
     assert answer.headers["Access-Control-Allow-Origin"] is None
 
 
+@pytest.mark.parametrize(
+    ("target", "field"),
+    [("/bytes.bin", "Origin: http://{}\r\nOrigin: http://evil.example"), ("http://x/bytes.bin", "A: b")],
+)
+def test_a_private_server_takes_no_request_that_names_two_sites(private, target, field):
+    own = "{}:{}".format(*private.server_address[:2])
+    with socket.create_connection(private.server_address[:2], timeout=10) as raw:
+        fields = f"Host: {own}\r\n{field.format(own)}\r\nConnection: close"
+        raw.sendall(f"GET {target} HTTP/1.1\r\n{fields}\r\n\r\n".encode())
+        assert raw.makefile("rb").read().startswith(b"HTTP/1.1 4")
+
+
 def test_a_file_that_shrinks_while_it_is_sent_cuts_the_answer(folder, monkeypatch):
     link, changed, blocks = Link(1e6), threading.Event(), []
 
