@@ -137,26 +137,32 @@ class Model(nn.Module):
         return self._visible(self.masks(level), self.anchor, camera)
 
     @torch.no_grad()
-    def _visible(self, masks: Tensor, position: Tensor, camera: Camera) -> Tensor:
+    def _visible(self, masks: Tensor, position: Tensor, camera: Camera, only: Tensor | None = None) -> Tensor:
         offsets, sizes = (part.amax(1).exp() for part in torch.split(self.scaling_log, 3, dim=1))
         radius = OFFSET_REACH * offsets + SIGMA_REACH * sizes
         seen = in_view(camera, self._viewmat(camera), position, radius, self.info.near) & (masks > MASK_THRESHOLD)
-        visible: Tensor = seen.nonzero()[:, 0]
+        visible: Tensor = (seen if only is None else seen & only).nonzero()[:, 0]
         return visible
 
-    def gaussians(self, level: int, t: float, camera: Camera, rounding: Rounding = EXACT) -> Gaussians:
-        """The Gaussians of `level` at normalised time t in 0..1 as the camera meets them. By the kernels where they
-        take the model, else as `gaussians_reference`."""
-        return self._gaussians(level, t, camera, rounding, self._fusible())
+    def gaussians(
+        self, level: int, t: float, camera: Camera, rounding: Rounding = EXACT, only: Tensor | None = None
+    ) -> Gaussians:
+        """The Gaussians of `level` at normalised time t in 0..1 as the camera meets them; only of the anchors `only`
+        (bool [N]) if given. By the kernels where they take the model, else as `gaussians_reference`."""
+        return self._gaussians(level, t, camera, rounding, only, self._fusible())
 
-    def gaussians_reference(self, level: int, t: float, camera: Camera, rounding: Rounding = EXACT) -> Gaussians:
+    def gaussians_reference(
+        self, level: int, t: float, camera: Camera, rounding: Rounding = EXACT, only: Tensor | None = None
+    ) -> Gaussians:
         """The plain torch form of `gaussians`, for any device and any networks."""
-        return self._gaussians(level, t, camera, rounding, False)
+        return self._gaussians(level, t, camera, rounding, only, False)
 
-    def _gaussians(self, level: int, t: float, camera: Camera, rounding: Rounding, kernels: bool) -> Gaussians:
+    def _gaussians(
+        self, level: int, t: float, camera: Camera, rounding: Rounding, only: Tensor | None, kernels: bool
+    ) -> Gaussians:
         stages: Any = fused if kernels else reference
         masks, slots = self.masks(level), self.widths.slots
-        rows, viewmat = self._visible(masks, self.anchor, camera), self._viewmat(camera)
+        rows, viewmat = self._visible(masks, self.anchor, camera, only), self._viewmat(camera)
         anchors = self._picked(rows, rounding, kernels)
         if level >= 1:
             anchors = self._moved(1, anchors, self.widths.global_heads, t, rounding, kernels)

@@ -44,10 +44,12 @@ class Picture:
     meta: dict[str, Any]
 
 
-def render(model: Model, level: int, t: float, camera: Camera, rounding: Rounding = EXACT) -> Picture:
-    """Render_level at normalised time t in 0..1."""
+def render(
+    model: Model, level: int, t: float, camera: Camera, rounding: Rounding = EXACT, only: Tensor | None = None
+) -> Picture:
+    """Render_level at normalised time t in 0..1, of the anchors `only` (bool [N]) if given."""
     check_time(t)
-    gaussians = model.gaussians(level, t, camera, rounding)
+    gaussians = model.gaussians(level, t, camera, rounding, only)
     if torch.is_grad_enabled():
         return draw(model.info, gaussians, camera)
     # a colour that overflowed hides its Gaussian; training refuses the step instead

@@ -148,7 +148,9 @@ SIDE = 128
 STAY, FEW = 0.8, 64
 
 
-def utility(scene: Scene, places: Sequence[Place], step: Callable[[], None] = lambda: None) -> np.ndarray:
+def utility(
+    scene: Scene, places: Sequence[Place], step: Callable[[], None] = lambda: None, fewest: int = 0
+) -> np.ndarray:
     """float64 [N]: the order in which the anchors of each layer should come, the highest first: by the gain of the
     pictures at `places` (times 0..1) per byte, at the layer's level with all earlier layers present. Anchors that reach
     no picture have 0, the least. step is called after each round.
@@ -163,13 +165,19 @@ def utility(scene: Scene, places: Sequence[Place], step: Callable[[], None] = la
     rank, first = np.zeros(len(scene.anchor_q)), 0
     for index, (layer, end) in enumerate(zip(scene.layers, scene.rows, strict=True)):
         bits = layer_symbols(scene, index).bits_per_row()
-        rank[first:end] = _layer_utility(scene.prefix(layer), layer, first, bits, places, step)
+        rank[first:end] = _layer_utility(scene.prefix(layer), layer, first, bits, places, step, fewest)
         first = end
     return rank
 
 
 def _layer_utility(
-    scene: Scene, level: int, first: int, bits: np.ndarray, places: Sequence[Place], step: Callable[[], None]
+    scene: Scene,
+    level: int,
+    first: int,
+    bits: np.ndarray,
+    places: Sequence[Place],
+    step: Callable[[], None],
+    fewest: int,
 ) -> np.ndarray:
     """float64 [rows of the highest layer]: the round in which each anchor leaves, and its rank within the round."""
     own = scene.rows[-1] - first
@@ -177,7 +185,7 @@ def _layer_utility(
     whole = from_scene(scene)
     references = [torch.from_numpy(render_image(whole, level, time, camera)) for camera, time in places]
     generator, rounds = torch.Generator().manual_seed(0), 0
-    while alive.any():
+    while alive.sum() > fewest:
         rows = np.flatnonzero(alive)
         model = from_scene(without(scene, first + np.flatnonzero(~alive)))
         gain, met = np.zeros(len(rows)), np.zeros(len(rows), bool)
@@ -192,6 +200,7 @@ def _layer_utility(
         out = rows[order[:leaving]]
         rank[out] = np.where(met[order[:leaving]], rounds + np.arange(leaving) / leaving, 0.0)
         alive[out] = False
+    rank[alive] = rounds + 1
     return rank
 
 

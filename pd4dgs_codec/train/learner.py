@@ -21,6 +21,7 @@ from pd4dgs_codec.train.losses import ModelLoss
 from pd4dgs_codec.train.phases import Phase
 from pd4dgs_codec.train.phases.grow import Grow
 from pd4dgs_codec.train.phases.levels import SelectLevels
+from pd4dgs_codec.train.phases.prefixes import Prefixes
 from pd4dgs_codec.train.phases.prune import Prune
 from pd4dgs_codec.train.phases.quantisation import FitQuantisation
 from pd4dgs_codec.train.rollout import as_taught, draw_levels, next_view
@@ -49,9 +50,9 @@ class Learner(TrainState):
             torch.backends.cudnn.allow_tf32 = False
         super().__init__(config, dataset, schedule, device, size)
         self.model_loss = ModelLoss(config, self.generator)
-        self.levels, self.grow = SelectLevels(), Grow()
+        self.levels, self.prefixes, self.grow = SelectLevels(), Prefixes(), Grow()
         pruning = (Prune(turn) for turn in range(PRUNING_ROUNDS))
-        self.before_step: list[Phase] = [self.levels, FitQuantisation(), *pruning]
+        self.before_step: list[Phase] = [self.levels, FitQuantisation(), *pruning, self.prefixes]
 
     def step(self) -> dict[str, Any]:
         """One training step; returns its log record with every term unweighted."""
@@ -59,8 +60,10 @@ class Learner(TrainState):
         self._apply(self.before_step, record)
         levels, record["pi"] = draw_levels(self)
         record["level"] = levels[-1]
+        if (only := self.prefixes.draw(self, levels[-1])) is not None:
+            record["prefix"] = int(only.sum())
         drawn = [(next_view(self, level), level) for level in levels for _ in range(self.config.views_per_step)]
-        if not self._learn(drawn, record):
+        if not self._learn(drawn, record, only):
             self.skipped += 1
             record["skipped"] = self.skipped
         self.optimiser.zero_grad()
@@ -77,10 +80,11 @@ class Learner(TrainState):
 
     # -- loss and update -------------------------------------------------------------------------------------------
 
-    def _learn(self, drawn: list[tuple[int, int]], record: dict[str, Any]) -> bool:
+    def _learn(self, drawn: list[tuple[int, int]], record: dict[str, Any], only: Tensor | None) -> bool:
         """Losses of (view, level) pairs, gradients, update; False, with nothing changed, if any of it is not finite.
-        The record is that of the last pair of this worker, which takes every Nth of N workers."""
-        pictures = self._pictures(drawn, record)
+        The record is that of the last pair of this worker, which takes every Nth of N workers. only: bool [N], the
+        anchors to render, if not all."""
+        pictures = self._pictures(drawn, record, only)
         if workers.count() > 1:
             pictures = self._shared_gradients(pictures)
         if pictures is None:
@@ -93,7 +97,9 @@ class Learner(TrainState):
         self._apply([self.grow], record)
         return True
 
-    def _pictures(self, drawn: list[tuple[int, int]], record: dict[str, Any]) -> list[Picture] | None:
+    def _pictures(
+        self, drawn: list[tuple[int, int]], record: dict[str, Any], only: Tensor | None
+    ) -> list[Picture] | None:
         """The pictures of this worker's share of the pairs, their gradients summed; None if one is not finite."""
         pictures = []
         seeds: list[int | None] = [None] * len(drawn)
@@ -106,7 +112,7 @@ class Learner(TrainState):
                 self.generator.manual_seed(seed)
                 self.noise.generator.manual_seed(seed + 1)
             try:
-                pictures.append(self._gather(index, level, record))
+                pictures.append(self._gather(index, level, only, record))
             except NotFinite as error:  # a diverged step can be skipped; any other error would come again
                 record["refused"] = str(error)
                 return None
@@ -118,13 +124,13 @@ class Learner(TrainState):
                 return None
         return pictures
 
-    def _gather(self, index: int, level: int, record: dict[str, Any]) -> Picture:
+    def _gather(self, index: int, level: int, only: Tensor | None, record: dict[str, Any]) -> Picture:
         """The picture of training view `index` at `level`, the gradients of its loss summed and its terms in the
         record. Raises NotFinite where the model has diverged."""
         share = 1 / self.config.views_per_step
         finish = self.model_loss.begin(self.model, level, self.schedule, self.position)
         try:
-            picture, terms, loss = self.picture_loss(index, level)
+            picture, terms, loss = self.picture_loss(index, level, only)
             torch.autograd.backward(loss * share)
         finally:
             rest = finish()
@@ -148,13 +154,15 @@ class Learner(TrainState):
             p.grad = p.grad if anywhere else None
         return None if failed else pictures
 
-    def picture_loss(self, index: int, level: int) -> tuple[Picture, dict[str, Tensor], Tensor]:
+    def picture_loss(
+        self, index: int, level: int, only: Tensor | None = None
+    ) -> tuple[Picture, dict[str, Tensor], Tensor]:
         """(picture of training view `index` at `level`, unweighted terms by name, their weighted sum).
 
-        Raises NotFinite where the model has diverged.
+        only: bool [N], the anchors to render, if not all. Raises NotFinite where the model has diverged.
         """
         config, shown = self.config, as_taught(self, self.picture(index), level)
-        picture = render(self.model, level, shown.view.time, shown.view.camera, self.rounding())
+        picture = render(self.model, level, shown.view.time, shown.view.camera, self.rounding(), only)
         if picture.meta["means2d"].requires_grad:
             picture.meta["means2d"].retain_grad()
         part = shown.content(picture.alpha)

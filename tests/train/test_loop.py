@@ -256,6 +256,7 @@ BROKEN_STATES = {
     "rho": math.inf,
     "seconds": -math.inf,
     "noise": torch.zeros(3),
+    "rank": torch.zeros(5, 5),
     "left_out": "[" * 5000,
     "curve": '[{"iteration": 1, "seconds": 1, "psnr": [null]}]',
 }

@@ -1,4 +1,4 @@
-"""The phases of a run: pruning, selection of levels, step classes and whitening."""
+"""The phases of a run: pruning, selection of levels, step classes, whitening and prefixes."""
 
 import json
 from dataclasses import replace
@@ -15,7 +15,7 @@ from pd4dgs_codec.format.encoder import encode, encode_with_report
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.model.networks import EXACT
-from pd4dgs_codec.model.picture import render_image
+from pd4dgs_codec.model.picture import render, render_image
 from pd4dgs_codec.model.sensitivity import rounding_error
 from pd4dgs_codec.quality import TRAIN_MIN_DB, TRAIN_MIN_DB_PER_MEGABYTE
 from pd4dgs_codec.quality.measure import train_rate_bits
@@ -23,8 +23,9 @@ from pd4dgs_codec.scene import ATTRIBUTES, MASK_THRESHOLD, MAX_CLASS
 from pd4dgs_codec.train import learner, losses, phases
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.loop import Trainer
-from pd4dgs_codec.train.phases import levels, prune, quantisation
+from pd4dgs_codec.train.phases import levels, prefixes, prune, quantisation
 from pd4dgs_codec.train.phases.levels import drop_level, held_back_views, levels_without_gain
+from pd4dgs_codec.train.phases.prefixes import draw_prefix, rank_anchors
 from pd4dgs_codec.train.phases.prune import Prune, added_error, least, round_of
 from pd4dgs_codec.train.phases.quantisation import classes_within, whiten, whitening_transform
 from pd4dgs_codec.train.schedule import PRUNING_ROUNDS, Schedule
@@ -51,16 +52,19 @@ def records_of(trainer: Trainer, folder) -> list[dict]:
 
 @pytest.mark.usefixtures("short_runs_have_phases")
 def test_a_run_with_all_phases_resumes_bit_for_bit(dataset, tmp_path, monkeypatch):
-    """Cut on quarter pictures before anchors grow, between two rounds of pruning, and after whitening."""
+    """Cut on quarter pictures before anchors grow, between two rounds of pruning, and while prefixes are trained."""
     monkeypatch.setattr("pd4dgs_codec.train.state.LARGE", 24)
+    monkeypatch.setattr(prefixes, "FEWEST", 20)
     config = TrainConfig(preset="tiny", iterations=44, prune=0.05, grading=0.5, small_pictures=0.6)
     trainer, schedule, whitenings = Trainer(config, dataset), Schedule(44), []
     monkeypatch.setattr(quantisation, "whiten", lambda *args: whitenings.append(trainer.iteration) or whiten(*args))
     trainer.run(tmp_path / "whole.pt", log=tmp_path / "log.jsonl")
     records = read_log(tmp_path / "log.jsonl")
-    pruned = [r for r in records if "left_model" in r]
+    pruned, drawn = ([r for r in records if name in r] for name in ("left_model", "prefix"))
     assert [r["iteration"] for r in pruned] == list(schedule.prune) and sum(r["left_model"] for r in pruned) > 0
     assert records[schedule.prune[0] - 1]["anchors"] - pruned[-1]["anchors"] == sum(r["left_model"] for r in pruned)
+    assert drawn and min(r["iteration"] for r in drawn) >= schedule.rounding
+    assert all(r["level"] == 0 and r["prefix"] >= 20 for r in drawn)
     assert whitenings == [schedule.rounding]
     assert sum("grown" in r for r in records) == sum("step_classes" in r for r in records) == 1
     assert_resumes_bit_for_bit(config, dataset, tmp_path, (12, schedule.prune[2], 36))
@@ -71,10 +75,11 @@ def test_phases_that_meet_infinity_are_skipped(dataset, tmp_path, monkeypatch):
     def diverged(*_, **__):
         raise NotFinite("colors: found inf")
 
-    for owner, name in ((prune, "omission_error"), (quantisation, "grade")):
+    monkeypatch.setattr(prefixes, "FEWEST", 20)
+    for owner, name in ((prune, "omission_error"), (quantisation, "grade"), (prefixes, "utility")):
         monkeypatch.setattr(owner, name, diverged)
     records = records_of(trainer_of(dataset, prune=0.5, grading=0.5), tmp_path)
-    assert len(records) == 30 and not any({"left_model", "step_classes"} & set(r) for r in records)
+    assert len(records) == 30 and not any({"left_model", "step_classes", "prefix"} & set(r) for r in records)
 
 
 def test_short_runs_and_few_views_have_no_measured_phases(dataset, tmp_path, monkeypatch):
@@ -368,3 +373,43 @@ def test_without_its_deformation_level_0_has_the_anchors_of_level_1(dataset):
     drop_level(learner.model, learner.optimiser, 1)
     torch.testing.assert_close(learner.model.masks(0), before)
     torch.testing.assert_close(learner.model.masks(1), before)
+
+
+# -- prefixes ----------------------------------------------------------------------------------------------------------
+
+
+def test_prefixes_are_nested_and_of_every_size(monkeypatch):
+    monkeypatch.setattr(prefixes, "FEWEST", 4)
+    rank = torch.tensor([0.5, -torch.inf, 3.0, 2.0, 0.0, 1.0] + [4.0 + i for i in range(58)], dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    drawn = [draw_prefix(rank, generator) for _ in range(200)]
+    sizes = sorted({int(chosen.sum()) for chosen in drawn})
+    assert sizes[0] == 4 and sizes[-1] > 55 and len(sizes) > 20
+    for chosen in drawn:
+        assert not chosen[1]
+        assert rank[chosen].min() > rank[~chosen].max()
+
+
+def test_anchors_of_a_first_slice_rank_alike_and_absent_ones_not_at_all(dataset, monkeypatch):
+    monkeypatch.setattr(prefixes, "FEWEST", 20)
+    monkeypatch.setattr("pd4dgs_codec.model.sensitivity.FEW", 5)
+    model = trainer_of(dataset).model
+    with torch.no_grad():
+        model.mask_logits[::3, 0] = -20.0
+    rank = rank_anchors(model, dataset.train[:2])
+    assert torch.equal(rank.isfinite(), model.masks(0) > MASK_THRESHOLD)
+    assert int(rank.isfinite().sum()) > 20 >= int((rank == rank.max()).sum()) > 1
+
+
+@pytest.mark.parametrize("fused", (True, False))
+def test_a_picture_of_some_anchors_is_that_of_a_model_without_the_others(dataset, monkeypatch, fused):
+    model = trainer_of(dataset).model
+    if not fused:
+        monkeypatch.setattr(type(model), "_fusible", lambda self: False)
+    view = dataset.test[0]
+    only = torch.arange(len(model.anchor_q)) % 2 == 0
+    part = render(model, 0, view.time, view.camera, only=only)
+    assert set(torch.unique(part.gaussians.anchors % 2).tolist()) == {0}
+    with torch.no_grad():
+        model.mask_logits[~only] = -20.0
+    torch.testing.assert_close(part.image, render(model, 0, view.time, view.camera).image)
