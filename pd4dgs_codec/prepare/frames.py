@@ -65,12 +65,12 @@ class VideoFile:
         """Every frame, small and grey, uint8 [h, w]."""
         width = min(self.size[0], LOOK_WIDTH)
         scale = f"scale={width}:{max(1, round(self.size[1] * width / self.size[0]))}:flags=area"
-        return open_video(self.path, grey=True, output=["-vf", scale, *self._rate()]).pictures
+        return open_video(self.path, grey=True, output=self._filters(f",{scale}")).pictures
 
     def pictures(self, indices: Sequence[int]) -> Iterator[np.ndarray]:
         """uint8 [H, W, 3] of these frames. indices: ascending."""
         wanted = set(indices)
-        for k, picture in enumerate(open_video(self.path, output=self._rate()).pictures):
+        for k, picture in enumerate(open_video(self.path, output=self._filters()).pictures):
             if k in wanted:
                 yield picture
             if k >= indices[-1]:
@@ -80,8 +80,9 @@ class VideoFile:
         """Seconds of a frame."""
         return index / self.fps
 
-    def _rate(self) -> list[str]:
-        return ["-fps_mode", "cfr", "-r", f"{self.fps:.6f}"]
+    def _filters(self, more: str = "") -> list[str]:
+        """The frames nearest in time: cfr of ffmpeg may be more than a frame late."""
+        return ["-vf", f"fps={self.fps:.6f}{more}", "-fps_mode", "passthrough"]
 
 
 class FrameFolder:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+
 import numpy as np
 import pytest
 from PIL import Image, ImageFilter
@@ -57,6 +59,38 @@ def test_the_blurred_and_the_repeated_frame_are_left_out(kind, recording, tmp_pa
         written = np.asarray(Image.open(tmp_path / "out" / name), np.float64)
         blocks = recording[i].reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean(axis=(1, 3))
         assert np.abs(written - blocks).max() <= 0.5
+
+
+def remade(path, target, before=(), after=()):
+    """A video as ffmpeg makes it of another one."""
+    import imageio_ffmpeg
+
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *before, "-i", path, *after, target]
+    subprocess.run(command, check=True)
+    return target
+
+
+def test_a_video_held_upright_is_upright(recording, tmp_path):
+    """A phone writes its sensor's rows and a rotation."""
+    write_video(tmp_path / "flat.mp4", recording, FPS)
+    path = remade(tmp_path / "flat.mp4", tmp_path / "up.mp4", ["-display_rotation:v:0", "90"], ["-c", "copy"])
+    source = open_recording(path, FPS)
+    assert source.size == (HEIGHT, WIDTH) and len(look(source, nothing)) == 16
+    (found,) = source.pictures([3])
+    np.testing.assert_array_equal(found, np.rot90(recording[3]))
+
+
+def test_frames_of_a_varying_rate_have_their_times(recording, tmp_path):
+    """A pause of .8 s is in the middle, as when a phone drops frames."""
+    write_video(tmp_path / "even.mp4", recording, FPS)
+    true = [i / FPS + 0.8 * (i >= 8) for i in range(16)]
+    filters = ["-vf", f"setpts=(N+8*gte(N\\,8))/{FPS}/TB", "-fps_mode", "vfr", "-c:v", "libx264rgb", "-qp", "0"]
+    source = open_recording(remade(tmp_path / "even.mp4", tmp_path / "vary.mp4", after=filters), FPS)
+    choice = choose(look(source, nothing), 0)
+    assert len(choice.chosen) >= FEWEST_FRAMES
+    for index, found in zip(choice.chosen, source.pictures(choice.chosen), strict=True):
+        same = [np.array_equal(found, picture) for picture in recording]
+        assert any(abs(true[i] - source.time(index)) <= 1 / source.fps for i in np.flatnonzero(same))
 
 
 def test_frames_are_spread_over_the_time_and_are_the_sharpest_of_their_stretch():
