@@ -16,7 +16,7 @@ DETAILS = """\
 INPUT is a video, or a folder of frames whose names end with their numbers.
 Frames are chosen evenly over time, without blurred frames and repetitions. pycolmap estimates the camera poses (pip
 install 'pd4dgs-codec[prepare]'). Features that move are found by comparing them with their predicted positions in a
-static scene; then the poses are estimated again without them. Training images are not masked.
+static scene, and the poses are adjusted without them. Training images are not masked.
 
 FOLDER then holds images/, times.txt, sparse/0 (a COLMAP model), report.json and report.png. Intermediate results are
 kept in FOLDER.partial; after Ctrl-C the same command resumes from there.
@@ -49,7 +49,7 @@ def _prepare(args: argparse.Namespace, console: Console) -> int:
 
     choices = Choices(args.frames, args.fps, args.downscale, args.camera, args.threads or -1)
     try:
-        report = prepare(Path(args.input), Path(args.output), choices, progress_bar, args.overwrite)
+        report = prepare(Path(args.input), Path(args.output), choices, progress_bar, args.overwrite, console.message)
     except KeyboardInterrupt:
         raise DataError(f"interrupted; the same command resumes from {args.output}.partial") from None
     console.result({"output": args.output, **report}, _text(args.output, report))

@@ -10,13 +10,14 @@ import json
 import os
 import shutil
 import stat
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pd4dgs_codec.data.files import image_info
 from pd4dgs_codec.errors import DataError, one_line
 from pd4dgs_codec.io import finite, write_bytes
 from pd4dgs_codec.prepare import poses
@@ -33,6 +34,7 @@ from pd4dgs_codec.prepare.frames import (
 )
 from pd4dgs_codec.prepare.poses import Verdicts
 from pd4dgs_codec.signals import held
+from pd4dgs_codec.threads import available
 
 STATE, REPORT = "prepare.json", "report.json"
 #: Thresholds of advice: share of frames, pixels of a picture 1000 wide, points a picture, degrees, share of features.
@@ -57,9 +59,15 @@ class Choices:
 
 
 def prepare(
-    source: Path, output: Path, choices: Choices, progress: Progress, overwrite: bool = False
+    source: Path,
+    output: Path,
+    choices: Choices,
+    progress: Progress,
+    overwrite: bool = False,
+    tell: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
-    """Writes the folder `output`; returns its report. Raises DataError, one line, and leaves nothing, without poses."""
+    """Writes the folder `output`; returns its report. tell: takes an estimate of the time before the poses are sought.
+    Raises DataError, one line, and leaves nothing, without poses."""
     poses.colmap()  # raises now if it is not installed
     check_folder(output, overwrite)
     recording = open_recording(source, choices.fps)
@@ -67,6 +75,10 @@ def prepare(
     _begin(work, source, choices)
     try:
         looks, choice, times = _frames(work, recording, choices, progress)
+        cores = choices.threads if choices.threads > 0 else available()
+        width, height = (side // choices.downscale for side in recording.size)
+        seconds = poses.estimate(len(times), (width, height), cores)
+        tell(f"the poses of {len(times)} frames take up to {max(1, round(seconds / 60))} min on {cores} cores")
         findings = _poses(work, times, choices, progress)
         result = _finish(work, findings, looks, choice, times, source)
     except (DataError, OSError):
@@ -141,30 +153,30 @@ def _frames(
 
 
 def _poses(work: Path, times: dict[str, float], choices: Choices, progress: Progress) -> Findings:
-    """The model, estimated again without moving features, in sparse/0."""
+    """The model without moving features, in sparse/0."""
     names, images, database = sorted(times), work / "images", work / "colmap.db"
     with progress(len(names), "frames", "features") as advance:
         poses.extract(database, images, names, choices.camera, choices.threads, advance)
     listed = poses.pairs(len(names))
     with progress(len(listed), "pairs", "matching") as advance:
         poses.match(database, names, listed, choices.threads, advance)
-    still = work / "still.db"
+    _check_moves(poses.travel(database), image_info(images / names[0])[0])
     with progress(None, "frames", "poses") as advance:
-        first = _checked(poses.reconstruct(database, images, work / "first", choices.threads, advance), len(names))
-    verdicts = poses.moving_features(database, first)
-    named = [image for image in first.images.values() if image.name in verdicts]
+        model = _checked(poses.reconstruct(database, images, work / "models", choices.threads, advance), len(names))
+    verdicts = poses.moving_features(database, model)
+    named = [image for image in model.images.values() if image.name in verdicts]
     moving = {image.name: verdicts[image.name].moving(image.camera.width) for image in named}
-    model = first
-    if any(each.any() for each in moving.values()):
-        shutil.copyfile(database, still)
-        poses.leave_out(still, moving)
-        with progress(None, "frames", "poses without what moves") as advance:
-            second = poses.reconstruct(still, images, work / "second", choices.threads, advance)
-        if second is not None and second.num_reg_images() >= first.num_reg_images():
-            model = second
+    poses.leave_out(model, moving)
     poses.upright(model)
     poses.write(model, work / "sparse" / "0")
     return Findings(model, verdicts, moving)
+
+
+def _check_moves(travel: float, width: int) -> None:
+    """Raises DataError for a camera on a tripod; without any pair of frames `_checked` tells more."""
+    if 0 <= travel < poses.STILL * width / 1000:
+        found = f"static things are {travel:.1f} pixels apart in two frames at most"
+        raise DataError(f"the camera stands still: {found}; expected a camera that walks around them")
 
 
 def _checked(model: Any | None, count: int) -> Any:
@@ -191,9 +203,8 @@ def _finish(
     write_bytes(work / REPORT, json.dumps(finite(result), indent=1).encode(), overwrite=True)
     for name in sorted(set(times) - named):
         (work / "images" / name).unlink()
-    for name in ("first", "second"):
-        shutil.rmtree(work / name, ignore_errors=True)
-    for name in ("colmap.db", "still.db", "frames.json", STATE):
+    shutil.rmtree(work / "models", ignore_errors=True)
+    for name in ("colmap.db", "frames.json", STATE):
         (work / name).unlink(missing_ok=True)
     return result
 

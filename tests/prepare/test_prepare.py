@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
 from PIL import Image
-from rooms import FOCAL, pose, walk
+from rooms import FOCAL, picture, pose, texture, walk
 
 from pd4dgs_codec.cli.prepare import main
 from pd4dgs_codec.data.dataset import load
@@ -19,8 +21,8 @@ COUNT = 9
 
 def write(folder, pictures):
     folder.mkdir()
-    for i, picture in enumerate(pictures):
-        Image.fromarray(picture).save(folder / f"{i:03d}.png")
+    for i, frame in enumerate(pictures):
+        Image.fromarray(frame).save(folder / f"{i:03d}.png")
     return folder
 
 
@@ -93,6 +95,43 @@ def test_an_interruption_says_how_to_go_on(room, tmp_path, monkeypatch, capsys):
     assert main([str(room[0]), "-o", str(tmp_path / "out")]) == 1
     line = f"interrupted; the same command resumes from {tmp_path / 'out'}.partial"
     assert capsys.readouterr().err.splitlines()[-1].endswith(line)
+
+
+@pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
+def test_signals_are_ours_once_pycolmap_is_loaded(number):
+    """Its C++ would print a stack."""
+    program = f"""
+import os, signal
+from pd4dgs_codec.prepare.poses import colmap
+from pd4dgs_codec.signals import interruptible
+with interruptible():
+    try:
+        colmap()
+        os.kill(os.getpid(), signal.{number})
+        while True: pass
+    except KeyboardInterrupt:
+        print("interrupted")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=200)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "interrupted\n", "")
+
+
+def test_a_camera_that_stands_still_is_told(tmp_path, capsys):
+    textures = [texture(seed) for seed in range(4)]
+    pictures = [picture(pose(0.5), textures, -0.9 + 0.2 * step) for step in range(10)]
+    frames = write(tmp_path / "tripod", pictures)
+    assert main([str(frames), "-o", str(tmp_path / "out"), "-j", "2"]) == 1
+    told = capsys.readouterr().err.strip().splitlines()
+    assert "10 frames take up to 1 min on 2 cores" in told[0] and "the camera stands still" in told[-1]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["tripod"]
+
+
+def test_the_estimate_grows_with_frames_and_shrinks_with_cores():
+    assert 100 < poses.estimate(80, (854, 480), 2) < 150  # 226 CPU seconds were measured
+    assert poses.estimate(80, (854, 480), 1) == 2 * poses.estimate(80, (854, 480), 2)
+    assert poses.estimate(80, (3840, 2160), 2) == pytest.approx(
+        poses.estimate(80, (1600, 900), 2)
+    )  # of which the features are
 
 
 def test_unregistrable_recording_is_refused_and_leaves_nothing(tmp_path, capsys):
