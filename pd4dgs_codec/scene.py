@@ -86,9 +86,9 @@ class Widths:
         return dict(zip(SCAFFOLD_NETWORKS, (self.slots, 7 * self.slots, 3 * self.slots), strict=True))
 
     @property
-    def global_heads(self) -> dict[str, int]:
-        """Output width of each head of the global deformation."""
-        return {name: head.outputs(self) for name, head in HEADS[1].items()}
+    def heads(self) -> dict[str, int]:
+        """Output width of each residual head of a deformation."""
+        return {name: head.outputs(self) for name, head in HEADS.items()}
 
 
 #: The widths of Scaffold-GS.
@@ -98,34 +98,22 @@ DEFAULT_WIDTHS = Widths()
 @dataclass(frozen=True)
 class Head:
     """A residual head. outputs: its output width at given widths of the anchors. unit: what its output is added to and
-    measured in: "length" (in units of `deformation_unit`), an attribute, "quaternion" or "color" (0..1)."""
+    measured in: "length" (in units of `deformation_unit`) or an attribute."""
 
     outputs: Callable[[Widths], int]
     unit: str
 
 
-#: By layer, the residual heads that its deformation may have. Their order is that of the numbers 1, 2, .. in the
-#: bitstream, where the trunk has number 0.
-HEADS: dict[int, dict[str, Head]] = {
-    1: {
-        "position": Head(lambda widths: 3, "length"),
-        "feature": Head(lambda widths: widths.feature, "feature"),
-        "offset": Head(lambda widths: 3 * widths.slots, "offset"),
-        "scaling": Head(lambda widths: SCALING_DIM, "scaling_log"),
-    },
-    2: {
-        "mean": Head(lambda widths: 3, "length"),
-        "scale": Head(lambda widths: 3, "length"),
-        "quat": Head(lambda widths: 4, "quaternion"),
-        "opacity": Head(lambda widths: 1, "color"),
-        "color": Head(lambda widths: 3, "color"),
-    },
+#: The residual heads that a deformation may have, each of which adds to a quantity of the anchors. Their order is that
+#: of the numbers 1, 2, .. in the bitstream, where the trunk has number 0.
+HEADS: dict[str, Head] = {
+    "position": Head(lambda widths: 3, "length"),
+    "feature": Head(lambda widths: widths.feature, "feature"),
+    "offset": Head(lambda widths: 3 * widths.slots, "offset"),
+    "scaling": Head(lambda widths: SCALING_DIM, "scaling_log"),
 }
-GLOBAL_HEADS = tuple(HEADS[1])
-#: The heads of layer 2 with their output widths, which are those of a Gaussian.
-LOCAL_HEADS: dict[str, int] = {name: head.outputs(DEFAULT_WIDTHS) for name, head in HEADS[2].items()}
 #: Heads whose output is a length, in units of `deformation_unit`.
-LENGTH_HEADS = tuple(name for heads in HEADS.values() for name, head in heads.items() if head.unit == "length")
+LENGTH_HEADS = tuple(name for name, head in HEADS.items() if head.unit == "length")
 
 
 def deformation_unit(box: np.ndarray) -> np.float32:
@@ -173,16 +161,21 @@ class SceneInfo:
 
 @dataclass(frozen=True, eq=False)
 class Deformation:
-    """A HexPlane and its residual MLP F(x, t).
+    """The planes of a layer, and the residual MLP F(x, t) of its level, which takes the place of that of a layer below.
 
     planes: float32, sampled bilinearly (align corners, border clamp), multiplied within a scale, concatenated over
     scales. networks: "trunk" and the heads that are present. key: the code of the key instant t* (see `instant`) if the
-    residuals are F(x, t) - F(x, t*), so that layer 1 changes nothing at t*; None if they are F(x, t).
+    residuals are F(x, t) - F(x, t*), so that the layer changes nothing at t*; None if they are F(x, t).
     """
 
     planes: Planes
     networks: dict[str, Network]
     key: int | None = None
+
+    @property
+    def channels(self) -> int:
+        """Features that the planes give: channels, over all scales."""
+        return sum(len(scale["xy"]) for scale in self.planes)
 
 
 #: Normalised times that a file holds are multiples of 1 / INSTANTS.
@@ -258,7 +251,7 @@ class Scene:
     3..5 base scale). offset: float32 [N, G, 3], in units of exp(scaling_log[:3]).
     mask: per present layer i, uint8 [rows[i]] codes (see MASK_STEP), non-decreasing from layer to layer.
     networks: "opacity", "covariance", "color". local_deformation belongs to layer 2, global_deformation to layer 1;
-    either may be None (left out). grading: None where every anchor has the steps as they are.
+    either may be None (left out). The trunk of layer 2 reads the planes of layer 1 as well, see `motion`. grading: None where every anchor has the steps as they are.
     """
 
     info: SceneInfo
@@ -313,6 +306,12 @@ class Scene:
     def deformation(self, layer: int) -> Deformation | None:
         """The deformation of layer 1 or 2; None if it is left out, and for layer 0, which has none."""
         return (None, self.global_deformation, self.local_deformation)[layer]
+
+    def motion(self, layer: int) -> Deformation | None:
+        """The deformation of the prefix that ends with `layer`: the planes of all its layers, and the networks and the
+        key instant of the highest that has a deformation; None if none has one."""
+        found = [one for one in (self.global_deformation, self.local_deformation)[:layer] if one is not None]
+        return replace(found[-1], planes=tuple(s for one in found for s in one.planes)) if found else None
 
     def full_masks(self) -> list[np.ndarray]:
         """uint8 [N] codes per layer present; an anchor that a layer's prefix lacks is inactive there."""

@@ -26,7 +26,7 @@ from pd4dgs_codec.model.convert import from_scene, to_scene
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.picture import rasterization, render
-from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS, PLANES, Camera, Deformation, Network, deformation_unit
+from pd4dgs_codec.scene import PLANES, Camera, Deformation, Network, deformation_unit
 from pd4dgs_codec.train.config import LearningRates, TrainConfig
 from pd4dgs_codec.train.loop import Trainer
 
@@ -278,11 +278,9 @@ CROWDS: tuple[tuple[Any, ...], ...] = (
 # -- training: runs that could fail end in a whole checkpoint, a file that decodes and finite images -------------------
 
 SOURCE = "synthetic:local?size=32x24&frames=6"
-_FIELD = DeformationConfig(4, 4, 8, (1,), 8, tuple(GLOBAL_HEADS))
+_FIELD = DeformationConfig(4, 4, 8, 8)
 #: Like the preset `tiny`, but a step takes milliseconds.
-SMALLEST = ModelConfig(
-    _FIELD, replace(_FIELD, heads=tuple(LOCAL_HEADS)), hidden=8, initial_anchors=300, max_anchors=600
-)
+SMALLEST = ModelConfig(_FIELD, _FIELD, hidden=8, initial_anchors=300, max_anchors=600)
 
 
 def _trainer(

@@ -120,9 +120,8 @@ def _left_out(layers: list[dict[str, Any]]) -> list[dict[str, str]]:
         if row is None:
             missing.append(f"layer {kind.layer}")
         elif "networks" in row:  # known only if the whole chunk is present
-            heads = HEADS[kind.layer]
-            gone = [f"{kind.name} head {head}" for head in heads if head not in row["networks"]]
-            missing += [kind.name] if len(gone) == len(heads) else gone
+            gone = [f"{kind.name} head {head}" for head in HEADS if head not in row["networks"]]
+            missing += [kind.name] if len(gone) == len(HEADS) else gone
     return [{"what": what, "why": why} for what in missing]
 
 

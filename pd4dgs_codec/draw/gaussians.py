@@ -263,13 +263,11 @@ def seen(opacity: Array, mask: Array, faintest: float) -> Array:
     return found
 
 
-def finished(gaussians: Array, gates: Array, loose: bool) -> tuple[Array, ...]:
-    """means, quats, scales, opacities and colors of gaussians under gates [K]. loose: residuals were added, so values
-    return to their range: scales >= 0, opacities and colours 0..1, unit quaternions."""
-    shapes: tuple[tuple[int, ...], ...] = ((3,), (4,), (3,), (), (3,))
-    means, quats, scales, opacities, colors = (np.empty((len(gates), *s), gaussians.dtype) for s in shapes)
-    finish(means, quats, scales, opacities, colors, gaussians, gates, loose)
-    return means, quats, scales, opacities, colors
+def finished(gaussians: Array, gates: Array) -> tuple[Array, ...]:
+    """means, quats, scales, opacities and colors of gaussians [K, 14] under gates [K]."""
+    parts = np.split(gaussians, (SCALE, QUAT, OPACITY, COLOR), axis=1)
+    means, scales, quats, opacities, colors = map(np.ascontiguousarray, parts)
+    return means, quats, scales * gates[:, None], opacities[:, 0] * gates, colors
 
 
 # -- kernels -----------------------------------------------------------------------------------------------------------
@@ -545,73 +543,3 @@ def assemble_backward(
             value = gaussians[k, OPACITY]
             g_opacity[n, o] = g[k, OPACITY] * (1 - value * value)
             g_mask[n] += g_gates[k]
-
-
-@kernel(inline=True)
-def _clamped(value: float) -> Any:
-    """value within 0..1; NaN passes."""
-    return value if value != value else min(max(value, 0), 1)
-
-
-@parallel(lambda means, *_: len(means))
-def finish(
-    tasks: Tasks,
-    means: Array,
-    quats: Array,
-    scales: Array,
-    opacities: Array,
-    colors: Array,
-    gaussians: Array,
-    gates: Array,
-    loose: bool,
-) -> None:
-    """Fills the parts of gaussians under gates [K]; loose: clamped and normalised first."""
-    zero, one = gaussians.dtype.type(0), gaussians.dtype.type(1)
-    for k in range(tasks[0], tasks[1]):
-        inverse = one / _norm(gaussians, k, QUAT) if loose else one
-        for i in range(4):
-            quats[k, i] = gaussians[k, QUAT + i] * inverse
-        for i in range(3):
-            means[k, i] = gaussians[k, i]
-            size, color = gaussians[k, SCALE + i], gaussians[k, COLOR + i]
-            scales[k, i] = gates[k] * (zero if loose and size < zero else size)
-            colors[k, i] = _clamped(color) if loose else color
-        opacity = gaussians[k, OPACITY]
-        opacities[k] = gates[k] * (_clamped(opacity) if loose else opacity)
-
-
-@parallel(lambda g, *_: len(g))
-def finish_backward(
-    tasks: Tasks,
-    g: Array,
-    g_gates: Array,
-    gaussians: Array,
-    gates: Array,
-    g_means: Array,
-    g_quats: Array,
-    g_scales: Array,
-    g_opacities: Array,
-    g_colors: Array,
-    loose: bool,
-) -> None:
-    """The transpose of `finish`: fills g [K, 14] and g_gates [K]."""
-    zero, one = gaussians.dtype.type(0), gaussians.dtype.type(1)
-    for k in range(tasks[0], tasks[1]):
-        opacity = gaussians[k, OPACITY]
-        inside = not loose or (opacity >= zero and opacity <= one)
-        g[k, OPACITY] = g_opacities[k] * gates[k] if inside else zero
-        by_gate = g_opacities[k] * (_clamped(opacity) if loose else opacity)
-        for i in range(3):
-            g[k, i] = g_means[k, i]
-            size, color = gaussians[k, SCALE + i], gaussians[k, COLOR + i]
-            inside = not loose or size > zero
-            g[k, SCALE + i] = g_scales[k, i] * gates[k] if inside else zero
-            by_gate += g_scales[k, i] * size if inside else zero
-            inside = not loose or (color >= zero and color <= one)
-            g[k, COLOR + i] = g_colors[k, i] if inside else zero
-        g_gates[k] = by_gate
-        if loose:
-            _unit_backward(g, gaussians, g_quats, k, QUAT, QUAT, 0)
-        else:
-            for i in range(4):
-                g[k, QUAT + i] = g_quats[k, i]

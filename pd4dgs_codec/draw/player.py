@@ -27,7 +27,6 @@ from pd4dgs_codec.draw.gaussians import (
 )
 from pd4dgs_codec.draw.rasteriser import draw
 from pd4dgs_codec.scene import (
-    LOCAL_HEADS,
     MASK_STEP,
     MASK_THRESHOLD,
     SCAFFOLD_NETWORKS,
@@ -53,24 +52,23 @@ class Player:
         self._mask = codes.astype(np.float32) * MASK_STEP
         self._anchor = np.ascontiguousarray(scene.anchor[: len(codes)], np.float32)
         self.slots = scene.widths.slots  #: Gaussians of an anchor
-        #: float32 [N, 9 + D + 3 G]: rows as the kernels take them and as the global deformation moves them
+        #: float32 [N, 9 + D + 3 G]: rows as the kernels take them and as the deformation moves them
         self._table = np.concatenate(
             [self._anchor, scene.feature, scene.offset.reshape(len(codes), 3 * self.slots), scene.scaling_log], axis=1
         )
         extent = np.exp(scene.scaling_log)
         self._radius = OFFSET_REACH * extent[:, :3].max(axis=1) + SIGMA_REACH * extent[:, 3:].max(axis=1)
-        box = scene.info.box
-        fields = (scene.global_deformation, scene.widths.global_heads), (scene.local_deformation, LOCAL_HEADS)
-        self._global, self._local = (None if field is None else Field(field, box, heads) for field, heads in fields)
+        motion = scene.motion(scene.level)
+        self._field = None if motion is None else Field(motion, scene.info.box, scene.widths.heads)
         networks, widths = [scene.networks[name] for name in SCAFFOLD_NETWORKS], scene.widths
         self._decoders = Decoders(networks, widths.feature)
         self.shapes_are_blind = widths.shapes_are_blind  #: whether of the Gaussians colours alone depend on the eye
         self._colors = Colors(networks[-1], self.slots, widths.feature) if self.shapes_are_blind else None
         self._time: float | None = None
         self._moved = self._table  # at self._time
-        if self._global is not None:
-            self._table, self._moved = self._global.rest(self._table, self._anchor), np.empty_like(self._table)
-        self._known = np.full(len(codes), self._global is None)  # the rows of _moved that are there
+        if self._field is not None:
+            self._table, self._moved = self._field.rest(self._table, self._anchor), np.empty_like(self._table)
+        self._known = np.full(len(codes), self._field is None)  # the rows of _moved that are there
         self._count = np.full(len(codes), -1)  # of an anchor's Gaussians in _grown; -1: not evaluated
         self._first = np.zeros(len(codes), np.int64)  # the first of them
         self._slots, self._grown = np.zeros(0, np.int64), np.zeros((0, GAUSSIAN_WIDTH), np.float32)  # with colours of 0
@@ -116,7 +114,7 @@ class Player:
     def _of_eyes(self, rows: np.ndarray, t: float, eyes: list[np.ndarray]) -> Gaussians:
         again = t == self._time
         if not again:
-            self._time, self._known[:], self._count[:] = t, self._global is None, -1
+            self._time, self._known[:], self._count[:] = t, self._field is None, -1
             self._slots, self._grown = self._slots[:0], self._grown[:0]
         if self._colors is not None and (again or len(eyes) > 1):
             return self._of_colors(rows, t, eyes, self._colors)
@@ -125,16 +123,10 @@ class Player:
         shown = [seen(look.opacity, mask, MIN_OPACITY) for look in looks]
         keep = shown[0] if len(eyes) == 1 else np.unique(np.concatenate(shown))
         slots = rows[keep // self.slots] * self.slots + keep % self.slots
-        residuals: np.ndarray | None = None
         found = []
         for look, own in zip(looks, shown, strict=True):
             made = self._decoders.make(anchors, mask, look, keep)
-            if self._local is not None:
-                if residuals is None:  # the means, and so the residuals, are the same for all eyes
-                    residuals = np.zeros_like(made.gaussians)
-                    self._local.move(residuals, np.ascontiguousarray(made.gaussians[:, :3]), t)
-                np.add(made.gaussians, residuals, out=made.gaussians)
-            means, quats, scales, opacities, colors = finished(made.gaussians, made.gates, self._local is not None)
+            means, quats, scales, opacities, colors = finished(made.gaussians, made.gates)
             if len(own) < len(keep):
                 opacities[~np.isin(keep, own, assume_unique=True)] = 0
             found.append((means, quats, scales, opacities, colors, slots))
@@ -143,7 +135,7 @@ class Player:
     def _of_colors(self, rows: np.ndarray, t: float, eyes: list[np.ndarray], colors: Colors) -> Gaussians:
         """`_of_eyes` where nothing but colours depends on the eye."""
         anchors = self._anchors(rows, t)
-        self._grow(rows, anchors, t)
+        self._grow(rows, anchors)
         count = self._count[rows]
         before = np.cumsum(count) - count
         places = np.repeat(self._first[rows] - before, count) + np.arange(count.sum())
@@ -152,10 +144,10 @@ class Player:
         for eye in eyes:
             gaussians = self._grown.take(places, axis=0)
             gaussians[:, COLOR:] += colors(anchors, eye, keep)
-            found.append((*finished(gaussians, gates, self._local is not None), slots))
+            found.append((*finished(gaussians, gates), slots))
         return _joined(found)
 
-    def _grow(self, rows: np.ndarray, anchors: np.ndarray, t: float) -> None:
+    def _grow(self, rows: np.ndarray, anchors: np.ndarray) -> None:
         """Appends the Gaussians of `rows` that are not in _grown."""
         missing = self._count[rows] < 0
         own, anchors, slots = rows[missing], anchors[missing], self.slots
@@ -165,20 +157,18 @@ class Player:
         keep = seen(look.opacity, mask, MIN_OPACITY)
         gaussians = self._decoders.make(anchors, mask, look, keep).gaussians
         gaussians[:, COLOR:] = 0
-        if self._local is not None:
-            self._local.move(gaussians, np.ascontiguousarray(gaussians[:, :3]), t)
         count = np.bincount(keep // slots, minlength=len(own))
         self._count[own], self._first[own] = count, len(self._slots) + np.cumsum(count) - count
         self._slots = np.concatenate([self._slots, own[keep // slots] * slots + keep % slots])
         self._grown = np.concatenate([self._grown, gaussians])
 
     def _anchors(self, rows: np.ndarray, t: float) -> np.ndarray:
-        """float32 [n, 9 + D + 3 G]: the anchors `rows` as the global deformation moves them."""
-        if self._global is not None:
+        """float32 [n, 9 + D + 3 G]: the anchors `rows` as the deformation moves them."""
+        if self._field is not None:
             missing = rows[~self._known[rows]]
             if missing.size:
                 moved = self._table.take(missing, axis=0)
-                self._global.move(moved, self._anchor.take(missing, axis=0), t)
+                self._field.move(moved, self._anchor.take(missing, axis=0), t)
                 self._moved[missing] = moved
                 self._known[missing] = True
         found: np.ndarray = self._moved.take(rows, axis=0)
@@ -219,5 +209,5 @@ def _one_anchor(side: int = 16) -> Scene:
         mask=(np.full(1, 255, np.uint8),) * 3,
         networks={name: constant_network(widths.inputs[name], n, 0.5) for name, n in widths.networks.items()},
         global_deformation=still("position", 3),
-        local_deformation=still("mean", 3),
+        local_deformation=still("position", 3),
     )

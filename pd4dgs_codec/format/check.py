@@ -61,7 +61,8 @@ def check_scene(scene: Scene) -> None:
     for kind in LAYER_KINDS:
         if kind.layer == 0 or scene.deformation(kind.layer) is not None:
             expect(kind.layer in layers, f"{kind.name} is given, but layer {kind.layer} is not among {layers}")
-            check_tensors(scene.tensors(kind.layer), kind, widths)
+            below = scene.global_deformation if kind.layer == 2 else None
+            check_tensors(scene.tensors(kind.layer), kind, widths, below)
 
 
 def _check_masks(scene: Scene) -> None:

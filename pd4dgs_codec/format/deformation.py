@@ -96,26 +96,27 @@ def layer_steps(steps: Steps, kind: LayerKind, tensors: Deformation) -> dict[str
     return {name: float(getattr(steps, name)) for name in kind.step_names} if tensors.networks else {}
 
 
-def check_tensors(tensors: Deformation, kind: LayerKind, widths: Widths) -> None:
+def check_tensors(tensors: Deformation, kind: LayerKind, widths: Widths, below: Deformation | None = None) -> None:
     """Raise EncodeError unless planes and networks of a layer have the shapes and dtypes that scene.Deformation and
-    Widths document, and finite values."""
+    Widths document, and finite values. below: the deformation of the layer below."""
     own, required = kind.name, (TRUNK,) if kind.layer else tuple(kind.network_ids)
     unknown = [name for name in tensors.networks if name not in kind.network_ids]
     expect(not unknown, f"{own}: networks {unknown}, expected some of {list(kind.network_ids)}")
     missing = [name for name in required if name not in tensors.networks]
     expect(not missing, f"{own} networks {missing} are missing")
     expect(bool(tensors.planes) == bool(kind.layer), f"{own}: planes of {len(tensors.planes)} scales")
+    channels_below = len(below.planes[0]["xy"]) if below else 0
     for s, planes in enumerate(tensors.planes):
         expect(set(planes) == {p for p, _, _ in PLANES}, f"{own} scale {s}: planes {sorted(planes)}, expected six")
-        channels, first = len(planes["xy"]), len(tensors.planes[0]["xy"])
-        expect(channels == first, f"{own} scale {s}: {channels} channels, expected {first} as in scale 0")
+        channels, first = len(planes["xy"]), channels_below or len(tensors.planes[0]["xy"])
+        expect(channels == first, f"{own} scale {s}: {channels} channels, expected {first} as in the first scale")
         expect(min(channels, *plane_sides(planes)) >= 1, f"{own} scale {s}: an empty plane")
     key = tensors.key
-    valid = key is None or (kind.layer == 1 and type(key) is int and 0 <= key <= INSTANTS)
-    expect(valid, f"{own}: key instant {key!r}, expected none, or in layer 1 an integer 0..{INSTANTS}")
+    valid = key is None or (kind.layer > 0 and type(key) is int and 0 <= key <= INSTANTS)
+    expect(valid, f"{own}: key instant {key!r}, expected none, or of a deformation an integer 0..{INSTANTS}")
     for name, network in tensors.networks.items():
         expect(len(network) > 0, f"{own} network {name}: no layers")
-    shape = Shape.of(tensors, kind, widths)
+    shape = Shape.of(tensors, kind, widths, below.channels if below else 0)
     for (_, name, array), expected in zip(arrays_of(tensors, kind), shape.planes + shape.weights, strict=True):
         expect_array(f"{own} {name}", array, np.float32, expected)
     for name, outputs in (shape.networks or {}).items():
@@ -189,21 +190,27 @@ class Scale:
 @dataclass(frozen=True)
 class Shape:
     """Sizes of a layer's planes and networks. networks: by name the outputs of its linear layers. inputs: by name the
-    input width of networks of layer 0; those of a deformation follow from the scales and the trunk. key: as in
-    Deformation."""
+    input width of networks of layer 0; those of a deformation follow from the scales, the features of the planes of the
+    layers below, and the trunk. key: as in Deformation."""
 
     scales: tuple[Scale, ...] = ()
     networks: dict[str, tuple[int, ...]] | None = None
     inputs: dict[str, int] | None = None
     key: int | None = None
+    below: int = 0
 
     @staticmethod
-    def of(tensors: Deformation, kind: LayerKind, widths: Widths) -> Shape:
+    def of(tensors: Deformation, kind: LayerKind, widths: Widths, below: int) -> Shape:
         """The shape of a deformation, without predictors."""
         scales = tuple(Scale(len(scale["xy"]), plane_sides(scale), ()) for scale in tensors.planes)
         names = [name for name in kind.network_ids if name in tensors.networks]
         networks = {name: tuple(len(bias) for _, bias in tensors.networks[name]) for name in names}
-        return Shape(scales, networks, None if kind.layer else widths.inputs, tensors.key)
+        return Shape(scales, networks, None if kind.layer else widths.inputs, tensors.key, below)
+
+    @property
+    def channels(self) -> int:
+        """As that of Deformation."""
+        return sum(scale.channels for scale in self.scales)
 
     @property
     def planes(self) -> list[PlaneShape]:
@@ -216,8 +223,8 @@ class Shape:
         shapes: list[tuple[int, ...]] = []
         networks = self.networks or {}
         for name, widths in networks.items():
-            features = sum(scale.channels for scale in self.scales)
-            width = self.inputs[name] if self.inputs else features if name == TRUNK else networks[TRUNK][-1]
+            read = self.below + self.channels
+            width = self.inputs[name] if self.inputs else read if name == TRUNK else networks[TRUNK][-1]
             for outputs in widths:
                 shapes += [(outputs, width), (outputs,)]
                 width = outputs
@@ -255,17 +262,19 @@ def pack_parameters(
 
 
 def unpack_parameters(
-    fields: Fields, kind: LayerKind, widths: Widths, later: bool, where: str
+    fields: Fields, kind: LayerKind, widths: Widths, below: tuple[Scale, ...], later: bool, where: str
 ) -> tuple[Shape, dict[str, float]]:
-    """(shape, steps by name) of a slice; every count is within its limit. later: behind the first of its layer, where
-    it has neither planes nor networks. Raises DecodeError's subclasses."""
+    """(shape, steps by name) of a slice; every count is within its limit. below: the scales of the layers before.
+    later: behind the first of its layer, where it has neither planes nor networks. Raises DecodeError's subclasses."""
     networks = {} if later else _unpack_networks(fields, kind, widths, where)
-    scales = _unpack_scales(fields, where) if networks and kind.layer > 0 else ()
+    scales = _unpack_scales(fields, where, below) if networks and kind.layer > 0 else ()
     for key, expected in ((STEPS, bool(networks)), (SCALES, bool(scales)), (NETWORKS, bool(networks))):
         if (key in fields) != expected:
             found, wanted = ("missing", "it") if expected else ("there", "no such key")
             raise Malformed(f"{where}: key {key} is {found}, expected {wanted}")
-    shape = Shape(scales, networks, None if kind.layer else widths.inputs, _unpack_key(fields, kind, networks, where))
+    key = _unpack_key(fields, kind, networks, where)
+    features = sum(scale.channels for scale in below)
+    shape = Shape(scales, networks, None if kind.layer else widths.inputs, key, features)
     cells = sum(map(math.prod, shape.planes))
     if cells > MAX_PLANE_CELLS:
         raise LimitExceeded(f"{where}: planes of {cells} cells, limit {MAX_PLANE_CELLS}")
@@ -275,8 +284,8 @@ def unpack_parameters(
 def _unpack_key(fields: Fields, kind: LayerKind, networks: dict[str, tuple[int, ...]], where: str) -> int | None:
     if KEY not in fields:
         return None
-    if kind.layer != 1 or not networks:
-        raise Malformed(f"{where}: key {KEY} is there, expected it in a deformation of layer 1 alone")
+    if kind.layer == 0 or not networks:
+        raise Malformed(f"{where}: key {KEY} is there, expected it in a deformation alone")
     return fields.integer(KEY, INSTANTS)
 
 
@@ -288,15 +297,18 @@ def _unpack_steps(fields: Fields, kind: LayerKind, where: str) -> dict[str, floa
     return steps
 
 
-def _unpack_scales(fields: Fields, where: str) -> tuple[Scale, ...]:
+def _unpack_scales(fields: Fields, where: str, below: tuple[Scale, ...]) -> tuple[Scale, ...]:
     rows = fields.sequence(SCALES)
     as_integer(len(rows), MAX_PLANE_SCALES, f"{where}: number of scales", low=1)
     scales: list[Scale] = []
     for i, row in enumerate(rows):
         channels, *rest = as_list(row, f"{where} scale {i}", 5 + len(PLANES))
         as_integer(channels, MAX_PLANE_CHANNELS, f"{where} scale {i} channels", low=1)
-        if scales and channels != scales[0].channels:
-            raise Malformed(f"{where} scale {i}: {channels} channels, expected {scales[0].channels} as in scale 0")
+        first = (*below, *scales)[:1]
+        if first and channels != first[0].channels:
+            raise Malformed(
+                f"{where} scale {i}: {channels} channels, expected {first[0].channels} as in the first scale"
+            )
         for side in rest[:4]:
             as_integer(side, MAX_PLANE_SIDE, f"{where} scale {i} side", low=1)
         for predictor in rest[4:]:

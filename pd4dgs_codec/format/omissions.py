@@ -48,24 +48,25 @@ class Omissions:
         """Leave out everything that no picture depends on."""
         while self._within_range() and self._simplify_networks():
             pass
-        if 1 in self.tensors:
-            self._free_cells()
+        for layer in self.tensors:
+            self._free_cells(layer)
 
     def _within_range(self) -> bool:
         """Whether no value in a network can come near overflow, for any input."""
-        moved: dict[str, np.ndarray] = {}
+        moved: np.ndarray | float = 0.0
+        products: list[np.ndarray] = []
         sizes: list[np.ndarray] = []
         for layer in sorted(self.tensors.keys() - {0}):
             step = self._steps[str(LAYER_KINDS[layer].planes_step)]
-            products = [
+            products += [
                 np.prod([np.abs(scale[n]).max((1, 2)).astype(np.float64) * step for n, _, _ in PLANES], axis=0)
                 for scale in self.tensors[layer].planes
             ]
             hidden = self._largest(layer, TRUNK, np.concatenate(products))
             found = {name: self._largest(layer, name, hidden) for name in self.tensors[layer].networks if name != TRUNK}
-            moved |= found if layer == 1 else {}
+            moved = np.maximum(moved, found.get("feature", 0.0))
             sizes += found.values()
-        inputs = np.concatenate([self.anchors.largest + moved.get("feature", 0.0), np.ones(VIEW_DIM)])
+        inputs = np.concatenate([self.anchors.largest + moved, np.ones(VIEW_DIM)])
         networks = self.tensors[0].networks.items()
         sizes += [self._largest(0, name, inputs[: network[0][0].shape[1]]) for name, network in networks]
         return all((size < LARGEST).all() for size in sizes)
@@ -88,9 +89,7 @@ class Omissions:
         """One pass over all networks and their inputs; whether anything was left out."""
         before = len(self.found)
         self._zero_unread_features()
-        for layer in self.tensors:
-            if layer:
-                self._zero_unread_channels(layer)
+        self._zero_unread_channels()
         for layer in self.tensors:
             self._zero_dead_units(layer)
         return len(self.found) > before
@@ -100,8 +99,10 @@ class Omissions:
         that are 0 in all anchors and have no residual."""
         width, scaffold = len(self.unread), self.tensors[0].networks
         unread = ~np.any([network[0][0][:, :width].any(axis=0) for network in scaffold.values()], axis=0)
-        head = self.tensors[1].networks.get("feature") if 1 in self.tensors else None
-        moved = np.zeros(width, bool) if head is None else head[-1][0].any(axis=1) | (head[-1][1] != 0)
+        moved = np.zeros(width, bool)
+        heads = {layer: t.networks["feature"] for layer, t in self.tensors.items() if "feature" in t.networks}
+        for head in heads.values():
+            moved |= head[-1][0].any(axis=1) | (head[-1][1] != 0)
         stale = unread & ~self.unread
         if stale.any():
             features = np.concatenate([symbols[stale] for symbols in self.anchors.features], axis=1)
@@ -110,30 +111,44 @@ class Omissions:
         if stale.any():
             self._note(f"{int(stale.sum())} feature channels", "no network reads them", _bits(features))
             self.unread |= stale
-        if (unread & moved).any():
-            self._zero_weights(1, "feature", -1, "rows", unread)
+        for layer in heads if (unread & moved).any() else ():
+            self._zero_weights(layer, "feature", -1, "rows", unread)
         idle = np.concatenate([~self.anchors.nonzero & ~moved, np.zeros(VIEW_DIM, bool)])
         for name, network in scaffold.items():
             own = idle[: network[0][0].shape[1]]
             if network[0][0][:, own].any():
                 self._zero_weights(0, name, 0, "columns", own)
 
-    def _zero_unread_channels(self, layer: int) -> None:
-        """Zero plane channels that the trunk does not read, and weights of those whose product is 0."""
-        planes, name = self.tensors[layer].planes, LAYER_KINDS[layer].name
-        alive = [np.all([scale[n].any(axis=(1, 2)) for n, _, _ in PLANES], axis=0) for scale in planes]
-        silent = ~np.concatenate(alive)
-        if self.tensors[layer].networks[TRUNK][0][0][:, silent].any():
-            self._zero_weights(layer, TRUNK, 0, "columns", silent)
-        weight = self.tensors[layer].networks[TRUNK][0][0]
+    def _zero_unread_channels(self) -> None:
+        """Zero plane channels that no trunk reads, and trunks' weights of channels whose product is 0. A trunk reads the
+        planes of its layer behind those of the layers below."""
+        layers = sorted(self.tensors.keys() - {0})
+        alive = [
+            np.all([scale[n].any(axis=(1, 2)) for n, _, _ in PLANES], axis=0)
+            for layer in layers
+            for scale in self.tensors[layer].planes
+        ]
+        silent, read = ~np.concatenate([*alive, np.zeros(0, bool)]), np.zeros(sum(map(len, alive)), bool)
+        for layer in layers:
+            own = silent[: self.tensors[layer].networks[TRUNK][0][0].shape[1]]
+            if self.tensors[layer].networks[TRUNK][0][0][:, own].any():
+                self._zero_weights(layer, TRUNK, 0, "columns", own)
+            read[: len(own)] |= self.tensors[layer].networks[TRUNK][0][0].any(axis=0)
+        for layer in layers:
+            own, read = np.split(read, [self.tensors[layer].channels])
+            self._zero_planes(layer, ~own)
+
+    def _zero_planes(self, layer: int, dead: np.ndarray) -> None:
+        """Zero the channels `dead`, bool over all scales."""
+        planes = self.tensors[layer].planes
         edited, count, bits = [], 0, 0.0
-        for scale, dead in zip(planes, np.split(~weight.any(axis=0), len(planes)), strict=True):
-            stale = [n for n, _, _ in PLANES if scale[n][dead].any()]
-            count += int(dead.sum()) if stale else 0
-            bits += sum(_bits(scale[n][dead].reshape(int(dead.sum()), -1)) for n in stale)
-            edited.append(scale | {n: np.where(dead[:, None, None], np.int32(0), scale[n]) for n in stale})
+        for scale, own in zip(planes, np.split(dead, len(planes)), strict=True):
+            stale = [n for n, _, _ in PLANES if scale[n][own].any()]
+            count += int(own.sum()) if stale else 0
+            bits += sum(_bits(scale[n][own].reshape(int(own.sum()), -1)) for n in stale)
+            edited.append(scale | {n: np.where(own[:, None, None], np.int32(0), scale[n]) for n in stale})
         if count:
-            self._note(f"{name}: {count} plane channels", "the trunk does not read them", bits)
+            self._note(f"{LAYER_KINDS[layer].name}: {count} plane channels", "no trunk reads them", bits)
             self.tensors[layer] = replace(self.tensors[layer], planes=tuple(edited))
 
     def _zero_dead_units(self, layer: int) -> None:
@@ -179,9 +194,9 @@ class Omissions:
 
     # -- cells ---------------------------------------------------------------------------------------------------------
 
-    def _free_cells(self) -> None:
-        """Give cells of the global planes that no anchor reads values of little cost."""
-        planes = self.tensors[1].planes
+    def _free_cells(self, layer: int) -> None:
+        """Give cells of a layer's planes that no anchor reads values of little cost."""
+        planes = self.tensors[layer].planes
         filled, free, cells, saved = [], 0, 0, 0.0
         for scale, marks in zip(planes, cells_read(planes, self.anchors.unit), strict=True):
             found = {name: fill_plane(scale[name], marks[name]) for name, _, _ in PLANES}
@@ -190,9 +205,9 @@ class Omissions:
             free += sum(int((~mark).sum()) for mark in marks.values())
             cells += sum(mark.size for mark in marks.values())
         if any((new[n] != old[n]).any() for new, old in zip(filled, planes, strict=True) for n, _, _ in PLANES):
-            what = f"{LAYER_KINDS[1].name}: {free:,} of {cells:,} plane cells"
+            what = f"{LAYER_KINDS[layer].name}: {free:,} of {cells:,} plane cells"
             self._note(what, "no anchor is ever there", saved)
-            self.tensors[1] = replace(self.tensors[1], planes=tuple(filled))
+            self.tensors[layer] = replace(self.tensors[layer], planes=tuple(filled))
 
     def _note(self, what: str, why: str, bits: float) -> None:
         self.found.append((what, why, max(bits, 0.0)))

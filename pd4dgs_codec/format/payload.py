@@ -22,7 +22,7 @@ from pd4dgs_codec.errors import LimitExceeded, Malformed
 from pd4dgs_codec.format import canonical, deformation
 from pd4dgs_codec.format.attributes import Past, by_class, check_classes, read_attributes, write_attributes
 from pd4dgs_codec.format.canonical import Fields
-from pd4dgs_codec.format.deformation import Shape
+from pd4dgs_codec.format.deformation import Scale, Shape
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, NO_CLASSES, magnitude
 from pd4dgs_codec.format.registry import MAX_ANCHORS, MAX_PARAMETERS, MAX_PAYLOAD, LayerKind, Section
@@ -46,11 +46,13 @@ ROWS_PER_BYTE = 2
 
 @dataclass(frozen=True)
 class Declared:
-    """Sums over the slices of a file so far: rows, symbols, and the bytes of their payloads."""
+    """Sums over the slices of a file so far: rows, symbols, the bytes of their payloads; and the scales of their
+    planes."""
 
     rows: int = 0
     symbols: int = 0
     payload_bytes: int = 0
+    scales: tuple[Scale, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -91,7 +93,7 @@ def read_parameters(
     fields = Fields(canonical.unpack(payload[4 : 4 + length]), where, set(range(ROWS, deformation.KEY + 1)))
     known = {int(section) for section in Section}
     sections = Fields(fields.get(SECTIONS), f"{where} sections", known)
-    shape, steps = deformation.unpack_parameters(fields, kind, widths, later, where)
+    shape, steps = deformation.unpack_parameters(fields, kind, widths, before.scales, later, where)
     parameters = Parameters(
         rows=fields.integer(ROWS, MAX_ANCHORS - before.rows),
         rises=0 if later else before.rows,
@@ -104,7 +106,10 @@ def read_parameters(
     if start + declared != len(payload):
         raise Malformed(f"{where}: sections of {declared} bytes, expected {len(payload) - start}")
     total = Declared(
-        before.rows + parameters.rows, before.symbols + parameters.symbols, before.payload_bytes + len(payload)
+        before.rows + parameters.rows,
+        before.symbols + parameters.symbols,
+        before.payload_bytes + len(payload),
+        before.scales + shape.scales,
     )
     _check_declared(total, where)
     return parameters, start, total

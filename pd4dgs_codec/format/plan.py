@@ -23,13 +23,10 @@ from pd4dgs_codec.format.symbols import LayerSymbols, SceneSymbols, first_duplic
 from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import HEADS, Deformation, Scene, Steps, Widths
 
-#: A head is left out if it moves no position (or local scale) by more than this many voxels ...
+#: A head is left out if it moves no position by more than this many voxels ...
 NEGLIGIBLE_VOXELS = 1e-3
-#: ... no anchor attribute by half its quantisation step or more, no colour or opacity by half an 8-bit step ...
+#: ... and no other attribute by half its quantisation step or more.
 NEGLIGIBLE_STEPS = 0.5
-NEGLIGIBLE_COLOR = 0.5 / 255
-#: ... and no quaternion component (before normalisation) by more than this.
-NEGLIGIBLE_QUAT = 1e-3
 
 #: Samples (points x times) of a first look, which usually finds a head at work, and of the look before one is left out.
 QUICK_SAMPLES = 1 << 12
@@ -105,12 +102,10 @@ def make_plan(scene: Scene, options: EncodeOptions = DEFAULTS) -> Plan:
     auto = options.layers == "auto"
     if not auto:
         scene, left_out = _cut(scene, int(options.layers))
-    kept = [0]
-    for layer in scene.layers[1:]:
+    for layer in reversed(scene.layers[1:]):
         scene, dropped = _drop_heads(scene, LAYER_KINDS[layer], auto and options.omit == "bounded")
         left_out += dropped
-        if not auto or scene.deformation(layer) is not None:
-            kept.append(layer)
+    kept = [layer for layer in scene.layers if layer == 0 or not auto or scene.deformation(layer) is not None]
     arranged, inactive = _arranged(scene, tuple(kept))
     if inactive:
         why = f"mask at or below the threshold at level {scene.level}"
@@ -141,17 +136,19 @@ def _cut(scene: Scene, highest: int) -> tuple[Scene, list[LeftOut]]:
 
 
 def _drop_heads(scene: Scene, kind: LayerKind, bounded: bool) -> tuple[Scene, list[LeftOut]]:
-    """(`scene` without the heads of a layer that have no effect, or without its deformation if none is left; the heads
-    left out). bounded: also leave out heads within head_bounds, not only those that are exactly zero."""
+    """(`scene` without the heads of a layer that have no effect, or without its deformation if none is left and no layer
+    above reads its planes; the heads left out). bounded: also leave out heads within head_bounds, not only those that
+    are exactly zero."""
     given = scene.deformation(kind.layer)
     if given is None:
         return scene, []
-    decoded = deformation.quantise_tensors(given, kind, scene.steps)
-    decoded = deformation.dequantise_tensors(decoded, kind, scene.steps)
+    decoded = _decoded_motion(scene, kind.layer)
     heads = deformation.heads_of(decoded)
     why = {name: "zero after quantisation" for name in heads if deformation.is_zero(decoded, name)}
     if bounded:
-        why |= _negligible(scene, kind, deformation.with_heads(decoded, [name for name in heads if name not in why]))
+        why |= _negligible(scene, deformation.with_heads(decoded, [name for name in heads if name not in why]))
+    if len(why) == len(heads) and any(map(scene.deformation, range(kind.layer + 1, 3))):
+        why.pop(next(iter(why), ""), None)  # a deformation has a head
     if not why and heads:
         return scene, []
     if len(why) == len(heads):
@@ -165,28 +162,37 @@ def _drop_heads(scene: Scene, kind: LayerKind, bounded: bool) -> tuple[Scene, li
     return scene.with_tensors(kind.layer, rest), gone
 
 
-def head_bounds(scene: Scene, kind: LayerKind) -> dict[str, float]:
-    """By head of a layer, the largest negligible residual, in the head's unit; lengths in scene units."""
+def _decoded_motion(scene: Scene, layer: int) -> Deformation:
+    """`Scene.motion` with the values of its symbols."""
+    for kind in LAYER_KINDS[1 : layer + 1]:
+        if (given := scene.deformation(kind.layer)) is not None:
+            symbols = deformation.quantise_tensors(given, kind, scene.steps)
+            scene = scene.with_tensors(kind.layer, deformation.dequantise_tensors(symbols, kind, scene.steps))
+    found = scene.motion(layer)
+    assert found is not None
+    return found
+
+
+def head_bounds(scene: Scene) -> dict[str, float]:
+    """By head, the largest negligible residual, in the head's unit; lengths in scene units."""
     of_unit = {
         "length": NEGLIGIBLE_VOXELS * scene.info.voxel_size,
         **{name: NEGLIGIBLE_STEPS * step for name, step in scene.steps.attributes.items()},
-        "quaternion": NEGLIGIBLE_QUAT,
-        "color": NEGLIGIBLE_COLOR,
     }
-    return {name: of_unit[head.unit] for name, head in HEADS[kind.layer].items()}
+    return {name: of_unit[head.unit] for name, head in HEADS.items()}
 
 
-def _negligible(scene: Scene, kind: LayerKind, field: Deformation) -> dict[str, str]:
+def _negligible(scene: Scene, field: Deformation) -> dict[str, str]:
     """The heads whose residuals stay within head_bounds at all samples, each with the reason."""
     times = max(MIN_TIMES, deformation.time_rows(field))
-    bounds = head_bounds(scene, kind)
+    bounds = head_bounds(scene)
     largest: dict[str, float] = {}
     for n_times, samples in ((MIN_TIMES, QUICK_SAMPLES), (times, FULL_SAMPLES)):
         heads = [name for name in deformation.heads_of(field) if largest.get(name, 0.0) <= bounds[name]]
         if not heads:
             return {}
         field = deformation.with_heads(field, heads)
-        largest = _largest_residuals(scene, kind, field, n_times, samples)
+        largest = _largest_residuals(scene, field, n_times, samples)
     return {
         name: f"largest residual {value:.3g}, negligible up to {bounds[name]:.3g}"
         for name, value in largest.items()
@@ -194,38 +200,18 @@ def _negligible(scene: Scene, kind: LayerKind, field: Deformation) -> dict[str, 
     }
 
 
-def _largest_residuals(
-    scene: Scene, kind: LayerKind, field: Deformation, n_times: int, samples: int
-) -> dict[str, float]:
-    """By head, the largest |residual| (NaN counts as infinite) over times and evenly chosen anchors or Gaussians."""
-    per_time = max(1, samples // n_times)
+def _largest_residuals(scene: Scene, field: Deformation, n_times: int, samples: int) -> dict[str, float]:
+    """By head, the largest |residual| (NaN counts as infinite) over times and evenly chosen anchors."""
     rows = np.flatnonzero(scene.full_masks()[-1] > 0)
-    rows = rows[:: max(1, -(-rows.size // per_time))]
-    largest = dict.fromkeys(deformation.heads_of(field), 0.0)
+    rows = rows[:: max(1, -(-rows.size // max(1, samples // n_times)))]
+    points, largest = scene.anchor_at(rows), dict.fromkeys(deformation.heads_of(field), 0.0)
     for t in np.linspace(0.0, 1.0, n_times):
-        points = _deformed_means(scene, rows, t, per_time) if kind.layer == 2 else scene.anchor_at(rows)
         with np.errstate(all="ignore"):
             found = deformation.residuals(field, scene.info.box, points, float(t)) if len(points) else {}
         for name, value in found.items():
             top = float(np.abs(value).max())
             largest[name] = max(largest[name], top if top == top else np.inf)
     return largest
-
-
-def _deformed_means(scene: Scene, rows: np.ndarray, t: float, most: int) -> np.ndarray:
-    """float32 [n, 3], n <= `most`: means of Gaussians after the global deformation at t, where the local deformation is
-    sampled."""
-    rows = rows[:: max(1, -(-rows.size * scene.offset.shape[1] // max(most, 1)))]
-    anchor, offset, scaling = scene.anchor_at(rows), scene.offset[rows], scene.scaling_log[rows]
-    if scene.global_deformation is not None and len(rows):
-        moved = deformation.residuals(scene.global_deformation, scene.info.box, anchor, float(t))
-        anchor = anchor + moved.get("position", 0)
-        scaling = scaling + moved.get("scaling", 0)
-        offset = offset + (moved["offset"].reshape(offset.shape) if "offset" in moved else 0)
-    with np.errstate(over="ignore"):
-        means = anchor[:, None] + offset * np.exp(scaling[:, None, :3])
-    finite: np.ndarray = np.nan_to_num(means.reshape(-1, 3), posinf=0.0, neginf=0.0)
-    return finite
 
 
 def _arranged(scene: Scene, kept: tuple[int, ...]) -> tuple[Scene, int]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import IntEnum
 
-from pd4dgs_codec.scene import HEADS, LOCAL_HEADS, SCAFFOLD_NETWORKS, TRUNK, Widths
+from pd4dgs_codec.scene import HEADS, SCAFFOLD_NETWORKS, TRUNK, Widths
 
 
 @dataclass(frozen=True)
@@ -29,12 +29,12 @@ class LayerKind:
     @property
     def network_ids(self) -> dict[str, int]:
         """The numbers of its networks in the bitstream, ascending: the order of the tables in `scene`."""
-        names = (TRUNK, *HEADS[self.layer]) if self.layer else SCAFFOLD_NETWORKS
+        names = (TRUNK, *HEADS) if self.layer else SCAFFOLD_NETWORKS
         return {name: number for number, name in enumerate(names)}
 
     def heads(self, widths: Widths) -> dict[str, int]:
         """Output width of each network but the trunk, whose width is free."""
-        return (widths.networks, widths.global_heads, LOCAL_HEADS)[self.layer]
+        return widths.heads if self.layer else widths.networks
 
     @property
     def step_names(self) -> tuple[str, ...]:

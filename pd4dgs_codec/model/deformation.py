@@ -6,7 +6,7 @@ and one network per residual head; another kind is another body of the class.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from itertools import accumulate
 from typing import Any, cast
 
@@ -45,16 +45,15 @@ class DeformationField(nn.Module):
         config: DeformationConfig,
         box: np.ndarray,
         head_widths: dict[str, int],
-        spacing: int | None,
-        step: float,
         key: int | None = None,
+        below: int = 0,
     ) -> DeformationField:
-        """A new field with the heads that `config` names. head_widths: the output width of each; spacing and the
-        quantisation step of the planes: see `HexPlane.start`."""
+        """A new field with the heads that `config` names. head_widths: the output width of each; below: features of the
+        planes of the layer below, which the trunk reads too."""
         side, scales = config.resolution, config.multires
         planes = HexPlane(box, [(side * m,) * 3 + (config.time_resolution,) for m in scales], config.channels)
-        planes.start(spacing, step)
-        trunk = MLP((config.channels * len(scales), config.width, config.width))
+        planes.start()
+        trunk = MLP((below + config.channels * len(scales), config.width, config.width))
         heads = {name: MLP((config.width, head_widths[name]), zero_last=True) for name in config.heads}
         return DeformationField(planes, trunk, heads, key)
 
@@ -88,7 +87,7 @@ class DeformationField(nn.Module):
         )
         # the registry's order, not the dictionary's: optimiser states are matched to parameters by order
         present = {key.split(".")[1] for key in state if key.startswith("heads.")}
-        heads = [head for head in (*scene.GLOBAL_HEADS, *scene.LOCAL_HEADS) if head in present]
+        heads = [head for head in scene.HEADS if head in present]
         names = {scene.TRUNK: scene.TRUNK} | {head: f"heads.{head}" for head in heads}
         networks = {name: MLP.arrays_of_state(state, key) for name, key in names.items()}
         return scene.Deformation(planes, networks, shape["key"])
@@ -129,34 +128,28 @@ class DeformationField(nn.Module):
 
     # -- residuals -----------------------------------------------------------------------------------------------------
 
-    def forward(
-        self, points: Tensor, t: float, plane_step: float | None = None, weight_step: float | None = None
-    ) -> dict[str, Tensor]:
-        """points [n, 3] world, t in 0..1 -> residual [n, width] per head present, lengths in scene units. Steps: planes
-        and weights are rounded to multiples of them, straight through."""
-        if not self.heads:
-            return {}
-        found = self._outputs(points, t, plane_step, weight_step)
-        if self.key is not None:
-            still = self._outputs(points, scene.instant(self.key), plane_step, weight_step)
-            found = {name: value - still[name] for name, value in found.items()}
-        return found
-
-    def _outputs(
-        self, points: Tensor, t: float, plane_step: float | None, weight_step: float | None
-    ) -> dict[str, Tensor]:
-        """F(x, t) per head."""
-        hidden = F.relu(self.trunk(self.planes(points, t, plane_step), weight_step))
-        return {name: head(hidden, weight_step) * self._unit_of(name) for name, head in self._named_heads()}
-
     def moved_reference(
-        self, rows: Tensor, widths: Mapping[str, int], t: float, plane_step: float | None, weight_step: float | None
+        self,
+        rows: Tensor,
+        features: Callable[[float], Tensor],
+        widths: Mapping[str, int],
+        t: float,
+        weight_step: float | None = None,
     ) -> Tensor:
-        """rows [n, sum of widths] plus the residuals at their points, the first three columns. widths: of all heads of
-        the registry, in the order of the columns; the columns of absent heads stay. Plain torch."""
-        found = self(rows[:, :3], t, plane_step, weight_step)
-        parts = [found[name] if name in found else rows.new_zeros(len(rows), width) for name, width in widths.items()]
-        return rows + torch.cat(parts, dim=1)
+        """rows [n, sum of widths] plus the residuals at time t in 0..1, lengths in scene units. Plain torch.
+
+        features: by the time, what the trunk reads of the planes, [n, inputs]. widths: of all heads of the registry, in
+        the order of the columns; the columns of absent heads stay. weight_step: weights are rounded to multiples of it,
+        straight through.
+        """
+        for time, sign in self._signed(t):
+            hidden = F.relu(self.trunk(features(time), weight_step))
+            found = {
+                name: head(hidden, weight_step) * (sign * self._unit_of(name)) for name, head in self._named_heads()
+            }
+            parts = [found[n] if n in found else rows.new_zeros(len(rows), width) for n, width in widths.items()]
+            rows = rows + torch.cat(parts, dim=1)
+        return rows
 
     @property
     def fusible(self) -> bool:
@@ -166,26 +159,26 @@ class DeformationField(nn.Module):
     def moved(
         self,
         rows: Tensor,
+        features: Callable[[float], Tensor],
         widths: Mapping[str, int],
         t: float,
-        plane_step: float | None,
-        weight_step: float | None,
-        follows: bool,
+        weight_step: float | None = None,
     ) -> Tensor:
-        """`moved_reference` by the kernels. follows: whether the gradient by the points is wanted."""
+        """`moved_reference` by the kernels."""
         if not self.heads:
             return rows
-        points = rows[:, :3] if follows else rows[:, :3].detach()
         ends = dict(zip(widths, accumulate(widths.values()), strict=True))
         own = [(slice(ends[name] - widths[name], ends[name]), self._unit_of(name)) for name, _ in self._named_heads()]
         networks = [self.trunk, *(head for _, head in self._named_heads())]
         parameters = [p for network in networks for layer in network.layers for p in (layer.weight, layer.bias)]
-        signed = [(t, 1.0)] if self.key is None else [(t, 1.0), (scene.instant(self.key), -1.0)]
-        for time, sign in signed:
-            features = self.planes(points, time, plane_step)
+        for time, sign in self._signed(t):
             settings = ([(columns, sign * unit) for columns, unit in own], 2 * len(self.trunk.layers), weight_step)
-            rows = _AddNetworks.apply(rows, features, settings, *parameters)  # type: ignore[no-untyped-call]
+            rows = _AddNetworks.apply(rows, features(time), settings, *parameters)  # type: ignore[no-untyped-call]
         return rows
+
+    def _signed(self, t: float) -> list[tuple[float, float]]:
+        """The times at which F is evaluated, each with its sign."""
+        return [(t, 1.0)] if self.key is None else [(t, 1.0), (scene.instant(self.key), -1.0)]
 
     def _named_heads(self) -> list[tuple[str, MLP]]:
         """The heads present, in the registry's order."""

@@ -2,9 +2,8 @@
 
     pick     rows of the attributes, with noise or rounding      [n, 9 + D + 3 G]
     grow     the scaffold's networks: the Gaussians of anchors    [K, 14]
-    finish   their activations and gates, as the rasteriser takes them
 
-A row holds an anchor or a Gaussian; its columns are the heads of its deformation in the registry's order.
+A row's columns are the heads of a deformation in the registry's order.
 `reference` has the same stages in plain torch.
 """
 
@@ -139,28 +138,3 @@ class _Grow(torch.autograd.Function):
         g_anchors, g_mask, layers = ctx.decoders.backward(anchors.numpy(), ctx.look, ctx.keep, ctx.made, *given)
         gradients = [torch.from_numpy(np.ascontiguousarray(part)) for layer in layers for part in layer]
         return torch.from_numpy(g_anchors), torch.from_numpy(g_mask), None, None, *gradients
-
-
-def finish(gaussians: Tensor, gates: Tensor, loose: bool) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """means [K, 3], quats [K, 4], scales [K, 3], opacities [K], colors [K, 3] of Gaussians [K, 14] under gates [K].
-    loose: residuals were added, so values return to their range: scales >= 0, unit quats, others 0..1."""
-    found: tuple[Tensor, ...] = _Finish.apply(gaussians, gates, loose)  # type: ignore[no-untyped-call]
-    means, quats, scales, opacities, colors = found
-    return means, quats, scales, opacities, colors
-
-
-class _Finish(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, gaussians: Tensor, gates: Tensor, loose: bool) -> tuple[Tensor, ...]:
-        ctx.loose = loose
-        ctx.save_for_backward(gaussians, gates)
-        return tuple(map(torch.from_numpy, kernels.finished(gaussians.numpy(), gates.numpy(), loose)))
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, None]:
-        gaussians, gates = ctx.saved_tensors
-        results = torch.empty_like(gaussians), torch.empty_like(gates)
-        given = (gaussians, gates, *(g.contiguous() for g in gradients))
-        kernels.finish_backward(*[*(x.numpy() for x in (*results, *given)), ctx.loose])
-        return *results, None

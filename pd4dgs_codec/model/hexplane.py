@@ -25,6 +25,8 @@ from pd4dgs_codec.threads import kernel_threads
 
 #: Start values of spatial planes are drawn between these.
 START = (0.5, 1.5)
+#: Cells between independent draws: few values, so that positions differ at the start.
+SPACING = 4
 
 
 class _Sample(torch.autograd.Function):
@@ -103,20 +105,17 @@ class HexPlane(nn.Module):
         self.grid = nn.Parameter(torch.ones(self.layout.n_cells, channels))
 
     @torch.no_grad()
-    def start(self, spacing: int | None, step: float, generator: torch.Generator | None = None) -> None:
+    def start(self, generator: torch.Generator | None = None) -> None:
         """Draws start values: time planes 1, spatial planes random in START.
 
         Their products are then of the size of 1, as are the optimiser's steps in them; from 0.1..0.5, as public code
         starts, features of about 0.03 told places and times apart so slowly that some runs never began to move. Draws
-        are independent every `spacing` cells and linear in between, so that cells that no anchor reaches cost few bits.
-        With spacing None a plane has one draw per channel, a multiple of the quantisation step `step`, dithered within
-        the rounding interval of each cell: dither is free where no anchor comes, and elsewhere keeps the rounding
-        errors of neighbours independent.
+        are independent every SPACING cells and linear in between, so that cells that no anchor reaches cost few bits.
         """
         for scale in self.layout.views(self.grid.fill_(1)):
             for name, _, b in PLANES:
                 if b != TIME_AXIS:
-                    scale[name].copy_(_start(scale[name].shape, spacing, step, generator))
+                    scale[name].copy_(_start(scale[name].shape, generator))
 
     @property
     def fusible(self) -> bool:
@@ -155,13 +154,9 @@ class HexPlane(nn.Module):
         return found
 
 
-def _start(shape: Sequence[int], spacing: int | None, step: float, generator: torch.Generator | None) -> Tensor:
+def _start(shape: Sequence[int], generator: torch.Generator | None) -> Tensor:
     """Start values [H, W, C] of a spatial plane, see `HexPlane.start`."""
     height, width, channels = shape
-    if spacing is None:
-        draw = torch.empty(channels).uniform_(*START, generator=generator)
-        dither = torch.empty(height, width, channels).uniform_(-0.45, 0.45, generator=generator)
-        return (torch.round(draw / step) + dither) * step
-    draws = torch.empty(1, channels, -(-height // spacing), -(-width // spacing)).uniform_(*START, generator=generator)
+    draws = torch.empty(1, channels, -(-height // SPACING), -(-width // SPACING)).uniform_(*START, generator=generator)
     field = F.interpolate(draws, size=(height, width), mode="bilinear", align_corners=True)
     return field[0].permute(1, 2, 0)

@@ -2,10 +2,11 @@
 
 Render_0    = R(MLP(A))
 Render_1(t) = R(MLP(A + F_global(A, t)))
-Render_2(t) = R(MLP(A + F_global(A, t)) + F_local(G, t))
+Render_2(t) = R(MLP(A + F_local(A, t)))
 
-A: anchors (feature, log-scaling, offsets on a voxel grid); G: the Gaussians that the scaffold's networks make of them.
-The gate m^(level) multiplies each Gaussian's final opacity and scale, after the local residuals.
+A: anchors (feature, log-scaling, offsets on a voxel grid), of which the scaffold's networks make Gaussians. F_global
+reads the planes of layer 1, coarse in space and time; F_local, in its place, reads these and the finer ones of layer 2.
+The gate m^(level) multiplies each Gaussian's opacity and scale.
 """
 
 from __future__ import annotations
@@ -23,7 +24,6 @@ from pd4dgs_codec.model import fused, reference
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.networks import EXACT, MLP, Rounding, level_mask
 from pd4dgs_codec.scene import (
-    LOCAL_HEADS,
     MASK_THRESHOLD,
     SCAFFOLD_NETWORKS,
     Camera,
@@ -164,19 +164,15 @@ class Model(nn.Module):
         masks, slots = self.masks(level), self.widths.slots
         rows, viewmat = self._visible(masks, self.anchor, camera, only), self._viewmat(camera)
         anchors = self._picked(rows, rounding, kernels)
-        if level >= 1:
-            anchors = self._moved(1, anchors, self.widths.global_heads, t, rounding, kernels)
+        anchors = self._moved(level, anchors, t, rounding, kernels)
         step = self.steps.weights_scaffold if rounding.weights else None
         networks = [self.network(name) for name in SCAFFOLD_NETWORKS]
         eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
         found, gates, raw_opacity, keep = stages.grow(anchors, masks.index_select(0, rows), eye, networks, step)
-        loose = level >= 2 and self.local_deformation is not None
-        if loose:
-            found = self._moved(2, found, LOCAL_HEADS, t, rounding, kernels)
         owner = rows.index_select(0, torch.div(keep, slots, rounding_mode="floor"))
-        means, quats, scales, opacities, colors = stages.finish(found, gates, loose)
-        kept = owner * slots + keep % slots
-        return Gaussians(means, quats, scales, opacities, colors, kept, rows, raw_opacity)
+        means, scales, quats, opacities, colors = torch.split(found, [3, 3, 4, 1, 3], dim=1)
+        gated, kept = (scales * gates[:, None], opacities[:, 0] * gates), owner * slots + keep % slots
+        return Gaussians(means, quats, *gated, colors, kept, rows, raw_opacity)
 
     def _picked(self, rows: Tensor, rounding: Rounding, kernels: bool) -> Tensor:
         """[n, 9 + D + 3 G]: the attributes of the anchors `rows`, with noise or rounding."""
@@ -199,17 +195,21 @@ class Model(nn.Module):
         )
         return picked
 
-    def _moved(
-        self, layer: int, values: Tensor, widths: dict[str, int], t: float, rounding: Rounding, kernels: bool
-    ) -> Tensor:
-        """The rows of anchors (layer 1) or Gaussians (layer 2) plus the residuals of that layer's deformation."""
-        field = self.deformations.get(layer)
-        if field is None:
-            return values
-        planes, weights = (self.steps.planes(layer), self.steps.weights(layer)) if rounding.weights else (None, None)
-        if kernels:
-            return field.moved(values, widths, t, planes, weights, follows=layer == 2)
-        return field.moved_reference(values, widths, t, planes, weights)
+    def _moved(self, level: int, rows: Tensor, t: float, rounding: Rounding, kernels: bool) -> Tensor:
+        """The rows of anchors plus the residuals of the deformation of `level`."""
+        layers = [layer for layer in self.deformations if layer <= level]
+        if not layers:
+            return rows
+        fields, points = [self.deformations[layer] for layer in layers], rows[:, :3].detach()
+        steps = [self.steps.planes(layer) if rounding.weights else None for layer in layers]
+
+        def features(time: float) -> Tensor:
+            parts = [field.planes(points, time, step) for field, step in zip(fields, steps, strict=True)]
+            return torch.cat(parts, dim=1)
+
+        step = self.steps.weights(layers[-1]) if rounding.weights else None
+        moved = fields[-1].moved if kernels else fields[-1].moved_reference
+        return moved(rows, features, self.widths.heads, t, step)
 
     def _viewmat(self, camera: Camera) -> Tensor:
         """[4, 4] world to camera."""

@@ -111,13 +111,13 @@ class MLP(nn.Module):
 def level_mask(logits: Tensor, level: int) -> Tensor:
     """m^(level) [N] of logits [N, 3]: sigmoid(a0 + sum_{1<=j<=level} softplus(a_j)), so never falling with level.
 
-    The gradient reaches a_level alone. If it reached the logits below as well, layer 0 would hold the anchors of higher
-    levels too, and the levels' masks would stay together.
+    Above level 0 the gradient does not reach a_0: else layer 0 would hold the anchors of higher levels too, and the
+    levels' masks would stay together.
     """
     columns = logits.T.contiguous()  # torch vectorises contiguous tensors only
-    total = columns[0]
+    total = columns[0].detach() if level else columns[0]
     for j in range(1, level + 1):
-        total = total.detach() + F.softplus(columns[j])
+        total = total + F.softplus(columns[j])
     return torch.sigmoid(total)
 
 

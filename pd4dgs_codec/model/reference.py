@@ -190,12 +190,3 @@ def grow(
     kept = opacity.flatten().index_select(0, keep)[:, None]
     gaussians = torch.cat([means, scales, quats, kept, torch.sigmoid(color)], dim=1)
     return gaussians, mask.index_select(0, owner), opacity.detach(), keep
-
-
-def finish(gaussians: Tensor, gates: Tensor, loose: bool) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """See `fused.finish`."""
-    means, scales, quats, opacities, colors = torch.split(gaussians, [3, 3, 4, 1, 3], dim=1)
-    if loose:
-        scales, quats = F.relu(scales), F.normalize(quats, dim=1)
-        opacities, colors = opacities.clamp(0, 1), colors.clamp(0, 1)
-    return means, quats, scales * gates[:, None], opacities[:, 0] * gates, colors

@@ -97,10 +97,10 @@ def leave_out_low_gain(
 ) -> tuple[Scene, list[LeftOut]]:
     """(scene without the deformations that gain less than min_gain dB per megabyte, each of them with its figures).
 
-    From the highest layer down, the scene is quantised with and without the layer's deformation. A layer's gain is the
-    largest increase of the mean mPSNR over `views` at its own level or one above. Only the deformation's own bytes
-    count: its anchors pass to a lower layer. The plan drops a layer without a deformation. The steps of `scene` are
-    binary32.
+    From the highest layer down until one stays, whose trunk reads the planes below it, the scene is quantised with and
+    without the layer's deformation. A layer's gain is the increase of the mean mPSNR over `views` at its level. Only
+    the deformation's own bytes count: its anchors pass to a lower layer. The plan drops a layer without a deformation.
+    The steps of `scene` are binary32.
     """
     left_out: list[LeftOut] = []
     present = None
@@ -114,19 +114,16 @@ def leave_out_low_gain(
             continue
         without = scene.with_tensors(kind.layer, None)
         remaining = _measure(without, views, options, step)
-        gain = max(
-            present[level] - remaining[max(lower for lower in remaining if lower <= level)]
-            for level in present
-            if level >= kind.layer
-        )
+        gain = present[max(present)] - remaining[max(remaining)]
         size = tensor_bytes(deformation, kind, scene.steps, options)
-        if gain * 1e6 < min_gain * size:
-            why = (
-                f"level {kind.layer} gains {gain:.3f} dB for {size:,} bytes on {len(views)} views: "
-                f"{gain * 1e6 / size:.2f} dB per MB, expected at least {min_gain:,g}"
-            )
-            left_out.append(LeftOut(kind.name, why, kind, deformation))
-            scene, present = without, remaining
+        if gain * 1e6 >= min_gain * size:
+            break
+        why = (
+            f"level {kind.layer} gains {gain:.3f} dB for {size:,} bytes on {len(views)} views: "
+            f"{gain * 1e6 / size:.2f} dB per MB, expected at least {min_gain:,g}"
+        )
+        left_out.append(LeftOut(kind.name, why, kind, deformation))
+        scene, present = without, remaining
     return scene, left_out
 
 

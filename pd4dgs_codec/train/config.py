@@ -156,7 +156,8 @@ class TrainConfig:
         None, help="time to train; a resumed run counts the time before it too", metavar="S", above=0, fixed=False
     )
     seed: int = option(0, help="seed of all randomness in training", metavar="N", least=0, most=2**63 - 2)
-    lambdas: tuple[float, float, float] = (0.04, 0.01, 0.00025)  #: rate weight per level
+    #: rate weight per level; the paper's of level 2 is 0.00025, for anchors that only layer 2 has
+    lambdas: tuple[float, float, float] = (0.04, 0.01, 0.01)
     #: multiplies every lambda; 1 is the paper's operating point
     rate_scale: float = option(0.08, help="weight of the anchors' bit rate; 1 is the paper's", least=0, dial=4.0)
     rate_share: float = 0.05  #: share of the anchors from which a step estimates the rate
@@ -215,8 +216,7 @@ class TrainConfig:
     #: multiplies the steps of features, log-scalings and planes
     step_scale: float = option(1.16, above=0, dial=1.6, fixed=False)
     rates: LearningRates = field(default_factory=LearningRates)
-    global_planes: PlaneWeights = PlaneWeights(1e-4, 5e-4, 5e-5)
-    local_planes: PlaneWeights = PlaneWeights(2e-4, 1e-3, 1e-4)
+    planes: PlaneWeights = PlaneWeights(1e-4, 5e-4, 5e-5)
     max_gradient_norm: float = 100.0
 
     def __post_init__(self) -> None:

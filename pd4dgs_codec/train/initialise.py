@@ -13,7 +13,7 @@ from pd4dgs_codec.draw.simd import Tasks, parallel
 from pd4dgs_codec.model.config import ModelConfig
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model, fresh_networks
-from pd4dgs_codec.scene import INSTANTS, LOCAL_HEADS, SceneInfo, Steps, Widths
+from pd4dgs_codec.scene import INSTANTS, SceneInfo, Steps, Widths
 
 #: Voxels along the longest side of the scene's box.
 GRID = 1024
@@ -25,8 +25,6 @@ CARVE_CANDIDATES = 20
 CARVE_VIEWS = 40
 #: The difference of a channel from the background, of 255, that counts as an object.
 CARVE_CONTRAST = 8
-#: Spacing of the start values of global planes, in cells: few values, so that positions differ at the start.
-GLOBAL_SPACING = 4
 
 
 def fresh_model(
@@ -50,13 +48,12 @@ def fresh_model(
     n = len(anchor_q)
     spacing = nearest_distances((anchor_q.double() * info.voxel_size).float()).clamp(min=info.voxel_size)
     key_code = None if key is None else round(INSTANTS * key)  # see `scene.instant`
-    fields: list[DeformationField | None] = [
-        None if field is None else DeformationField.fresh(field, info.box, heads, start_spacing, step, code)
-        for field, heads, start_spacing, step, code in (
-            (config.global_deformation, widths.global_heads, GLOBAL_SPACING, steps.planes_global, key_code),
-            (config.local_deformation, LOCAL_HEADS, None, steps.planes_local, None),
-        )
-    ]
+    fields: list[DeformationField | None] = []
+    below = 0
+    for field in (config.global_deformation, config.local_deformation):
+        fresh = None if field is None else DeformationField.fresh(field, info.box, widths.heads, key_code, below)
+        fields.append(fresh)
+        below += field.channels * len(field.multires) if field else 0
     model = Model(
         info,
         steps,
@@ -66,7 +63,8 @@ def fresh_model(
         torch.zeros(n, widths.slots, 3),
         fresh_mask_logits(n, min(config.level, max_layer)),
         fresh_networks(widths, config.hidden),
-        *fields,  # type: ignore[arg-type]
+        fields[0],
+        fields[1],
     )
     if max_layer < 2:
         model.local_deformation = None
@@ -76,10 +74,10 @@ def fresh_model(
 
 
 def fresh_mask_logits(n: int, level: int) -> Tensor:
-    """float32 [n, 3]: a_0 = MASK_START, a_j = 0 up to the model's highest level, TIED above."""
-    logits = torch.zeros(n, 3)
+    """float32 [n, 3]: a_0 = MASK_START, a_1 = 0 if the model has that level, the others TIED: layer 2 adds no anchors."""
+    logits = torch.full((n, 3), TIED)
     logits[:, 0] = MASK_START
-    logits[:, level + 1 :] = TIED
+    logits[:, 1 : min(level, 1) + 1] = 0
     return logits
 
 

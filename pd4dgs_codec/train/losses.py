@@ -73,9 +73,9 @@ class ModelLoss:
         self, layer: int, field: DeformationField, features: list[Tensor], step: float, pressure: float
     ) -> Iterator[Weighted]:
         """The regularisers and the rate of a layer's deformation."""
-        name, weights = {1: ("global", self.config.global_planes), 2: ("local", self.config.local_planes)}[layer]
+        name = {1: "global", 2: "local"}[layer]
         for term, value in field.regularisers(features).items():
-            yield f"{name}_{term}", getattr(weights, term), value
+            yield f"{name}_{term}", getattr(self.config.planes, term), value
         if weight := self.config.plane_rate * pressure:
             yield f"{name}_rate_proxy", weight, field.rate(features, step)
 

@@ -1,9 +1,9 @@
 """Which levels and views a step trains, and which pixels of a view teach a level.
 
-With a key instant t*, level 0 is the scene at t*, and level 1 adds F(x, t) - F(x, t*). The levels then agree: most
-steps train the highest level, from all views. The first steps, in which the deformation is still, see views near t*
+With a key instant t*, level 0 is the scene at t*, to which the others add F(x, t) - F(x, t*). The levels then agree:
+most steps train the highest level, from all views. The first steps, in which the deformation is still, see views near t*
 alone: in views of all times what moves would fade. Later a share of the steps trains level 0: near t*, and from all
-views in the pixels that layer 1 leaves as they are, so that what stands still is complete without it.
+views in the pixels that motion leaves as they are, so that what stands still is complete without it.
 
 The rollouts of the paper have no key instant: they teach level 0 the mean over time.
 """
@@ -24,10 +24,10 @@ from pd4dgs_codec.train.state import TrainingView, TrainState
 STILL_ODDS, NEAR_ODDS = 0.15, 1 / 3
 #: The views near the key instant: this share of all, but at least so many.
 NEAR_SHARE, NEAR_VIEWS = 1 / 12, 4
-#: The largest difference of a colour between levels 0 and 1 in pixels that layer 1 leaves as they are.
+#: The largest difference of a colour between level 0 and the highest in pixels that motion leaves as they are.
 STILL_CONTRAST = 0.15
-#: Odds of level 2 from `Schedule.local` on.
-LOCAL_ODDS = 1 / 3
+#: Share of the steps that train level 1 where there is a level 2.
+GLOBAL_ODDS = 0.1
 
 
 def draw_levels(state: TrainState) -> tuple[tuple[int, ...], Probabilities]:
@@ -40,8 +40,7 @@ def draw_levels(state: TrainState) -> tuple[tuple[int, ...], Probabilities]:
     if rollout == "top":
         probabilities = TOP
     elif rollout == "key":
-        local = LOCAL_ODDS if state.position >= state.schedule.local else 0.0
-        probabilities = STILL_ODDS, 1 - STILL_ODDS - local, local
+        probabilities = STILL_ODDS, GLOBAL_ODDS, 1 - STILL_ODDS - GLOBAL_ODDS
     elif rollout == "uniform" or state.position < state.schedule.progressive:
         probabilities = UNIFORM
     else:
@@ -86,11 +85,11 @@ def taught_views(state: TrainState, views: Sequence[TrainingView]) -> dict[int, 
 
 def as_taught(state: TrainState, shown: TrainingView, level: int) -> TrainingView:
     """The view with the weights of the pixels that teach `level`: at level 0 of a scene with a key instant none where
-    layer 1 changes the picture."""
+    motion changes the picture."""
     if level > 0 or state.key is None or state.position < state.schedule.coarse_end:
         return shown
     with torch.no_grad():
         place = shown.view.time, shown.view.camera, state.rounding(noisy=False)
-        still, moved = (render(state.model, drawn, *place).image for drawn in (0, 1))
+        still, moved = (render(state.model, drawn, *place).image for drawn in (0, state.model.level))
     same = (still - moved).abs().amax(-1) < STILL_CONTRAST
     return replace(shown, weights=shown.weights * same)
