@@ -251,7 +251,8 @@ class Scene:
     3..5 base scale). offset: float32 [N, G, 3], in units of exp(scaling_log[:3]).
     mask: per present layer i, uint8 [rows[i]] codes (see MASK_STEP), non-decreasing from layer to layer.
     networks: "opacity", "covariance", "color". local_deformation belongs to layer 2, global_deformation to layer 1;
-    either may be None (left out). The trunk of layer 2 reads the planes of layer 1 as well, see `motion`. grading: None where every anchor has the steps as they are.
+    either may be None (left out). The trunk of layer 2 reads the planes of layer 1 as well, see `motion`.
+    grading: None where every anchor has the steps as they are.
     """
 
     info: SceneInfo

@@ -272,9 +272,9 @@ def unpack_parameters(
         if (key in fields) != expected:
             found, wanted = ("missing", "it") if expected else ("there", "no such key")
             raise Malformed(f"{where}: key {key} is {found}, expected {wanted}")
-    key = _unpack_key(fields, kind, networks, where)
+    instant_code = _unpack_key(fields, kind, networks, where)
     features = sum(scale.channels for scale in below)
-    shape = Shape(scales, networks, None if kind.layer else widths.inputs, key, features)
+    shape = Shape(scales, networks, None if kind.layer else widths.inputs, instant_code, features)
     cells = sum(map(math.prod, shape.planes))
     if cells > MAX_PLANE_CELLS:
         raise LimitExceeded(f"{where}: planes of {cells} cells, limit {MAX_PLANE_CELLS}")

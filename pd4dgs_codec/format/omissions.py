@@ -120,8 +120,8 @@ class Omissions:
                 self._zero_weights(0, name, 0, "columns", own)
 
     def _zero_unread_channels(self) -> None:
-        """Zero plane channels that no trunk reads, and trunks' weights of channels whose product is 0. A trunk reads the
-        planes of its layer behind those of the layers below."""
+        """Zero plane channels that no trunk reads, and trunks' weights of channels whose product is 0. A trunk reads
+        the planes of its layer behind those of the layers below."""
         layers = sorted(self.tensors.keys() - {0})
         alive = [
             np.all([scale[n].any(axis=(1, 2)) for n, _, _ in PLANES], axis=0)

@@ -136,9 +136,9 @@ def _cut(scene: Scene, highest: int) -> tuple[Scene, list[LeftOut]]:
 
 
 def _drop_heads(scene: Scene, kind: LayerKind, bounded: bool) -> tuple[Scene, list[LeftOut]]:
-    """(`scene` without the heads of a layer that have no effect, or without its deformation if none is left and no layer
-    above reads its planes; the heads left out). bounded: also leave out heads within head_bounds, not only those that
-    are exactly zero."""
+    """(`scene` without the heads of a layer that have no effect, or without its deformation if none is left and no
+    layer above reads its planes; the heads left out). bounded: also leave out heads within head_bounds, not only those
+    that are exactly zero."""
     given = scene.deformation(kind.layer)
     if given is None:
         return scene, []

@@ -27,9 +27,9 @@ STEPS = Steps(planes_global=0.2, planes_local=1 / 3)
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Both deformations (None: absent), of equally many channels, and the counts of anchors that training starts from and
-    stays below. That of layer 1 is coarse, that of layer 2 fine in space and above all in time: what moves fast needs an
-    instant for each four pictures, and finds its motion sooner where the coarse planes are there as well."""
+    """Both deformations (None: absent), of equally many channels, and the counts of anchors that training starts from
+    and stays below. That of layer 1 is coarse, that of layer 2 fine in space and above all in time: what moves fast
+    needs an instant for each four pictures, and finds its motion sooner where the coarse planes are there as well."""
 
     global_deformation: DeformationConfig | None
     local_deformation: DeformationConfig | None

@@ -74,7 +74,8 @@ def fresh_model(
 
 
 def fresh_mask_logits(n: int, level: int) -> Tensor:
-    """float32 [n, 3]: a_0 = MASK_START, a_1 = 0 if the model has that level, the others TIED: layer 2 adds no anchors."""
+    """float32 [n, 3]: a_0 = MASK_START, a_1 = 0 if the model has that level, the others TIED: layer 2 has no anchors of
+    its own."""
     logits = torch.full((n, 3), TIED)
     logits[:, 0] = MASK_START
     logits[:, 1 : min(level, 1) + 1] = 0

@@ -1,8 +1,8 @@
 """Which levels and views a step trains, and which pixels of a view teach a level.
 
 With a key instant t*, level 0 is the scene at t*, to which the others add F(x, t) - F(x, t*). The levels then agree:
-most steps train the highest level, from all views. The first steps, in which the deformation is still, see views near t*
-alone: in views of all times what moves would fade. Later a share of the steps trains level 0: near t*, and from all
+most steps train the highest level, from all views. The first steps, in which the deformation is still, see views near
+t* alone: in views of all times what moves would fade. Later a share of the steps trains level 0: near t*, and from all
 views in the pixels that motion leaves as they are, so that what stands still is complete without it.
 
 The rollouts of the paper have no key instant: they teach level 0 the mean over time.
