@@ -19,7 +19,6 @@ from pd4dgs_codec.format.quantise import NO_CLASSES, Grid, attribute_rows, dequa
 from pd4dgs_codec.scene import (
     DEFAULT_WIDTHS,
     INSTANTS,
-    LOCAL_HEADS,
     MAX_CLASS,
     PLANES,
     SCAFFOLD_NETWORKS,
@@ -69,15 +68,17 @@ def deformation(
     width: int = 3,
     kind: str = "small",
     key: int | None = None,
+    below: int = 0,
 ) -> Deformation:
-    """A Deformation with the steps (planes, weights); the sides x, y, z double from scale to scale."""
+    """A Deformation with the steps (planes, weights); the sides x, y, z double from scale to scale. below: features of
+    the planes of the layer below."""
     planes = []
     for s in range(scales):
         reso = [side << s for side in sides[:3]] + [sides[3]]
         planes.append(
             {name: dequantise(symbols(rng, (channels, reso[b], reso[a]), kind), steps[0]) for name, a, b in PLANES}
         )
-    networks = {"trunk": network(rng, (channels * scales, width), steps[1], kind)}
+    networks = {"trunk": network(rng, (below + channels * scales, width), steps[1], kind)}
     for name, outputs in heads.items():
         layers = network(rng, (width, outputs), steps[1], kind)
         layers[-1][1][0] = np.float32(steps[1])  # not all zero: such a head is not sent
@@ -102,7 +103,7 @@ def make_scene(
     layers: tuple[int, ...] = (0, 1, 2),
     anchors: int = 6,
     kind: str = "small",
-    heads: tuple[dict[str, int] | None, dict[str, int]] = (None, LOCAL_HEADS),
+    heads: tuple[dict[str, int] | None, dict[str, int] | None] = (None, None),
     widths: Widths = DEFAULT_WIDTHS,
     with_camera: bool = True,
     extent: int = 8,
@@ -112,11 +113,11 @@ def make_scene(
 ) -> Scene:
     """An unplanned scene: every anchor in every layer's prefix, in random order, some of them inactive.
 
-    heads: with their outputs; None stands for all global ones.
+    heads: of layers 1 and 2, with their outputs; None stands for all.
     Steps are powers of two, so that even the largest symbols come back from their float32 values.
     """
     rng = np.random.default_rng(seed)
-    heads = (widths.global_heads if heads[0] is None else heads[0], heads[1])
+    of_layer = {i: widths.heads if heads[i - 1] is None else heads[i - 1] for i in (1, 2)}
     steps = Steps(0.0625, 0.03125, 0.125, 0.25, 0.5, 0.0078125, 0.015625, 0.0078125)
     cells = np.unique(rng.integers(-extent, extent + 1, (anchors, 3), dtype=np.int32), axis=0)
     cells = rng.permutation(cells)
@@ -136,6 +137,15 @@ def make_scene(
         rows = attribute_rows(centre, widths)
         values_of_centre = np.concatenate([dequantise(m, steps.attributes[name]) for name, m in rows])
         grading = Grading(classes.astype(np.uint8), values_of_centre)
+    networks = {
+        name: network(rng, (widths.inputs[name], *hidden, outputs), steps.weights_scaffold, kind)
+        for name, outputs in widths.networks.items()
+    }
+    fields: dict[int, Deformation] = {}
+    for layer in [layer for layer in layers if of_layer.get(layer)]:
+        below = fields[1].channels if layer == 2 and 1 in fields else 0
+        own = steps.planes(layer), steps.weights(layer)
+        fields[layer] = deformation(rng, of_layer[layer], own, kind=kind, key=key, below=below, **deformation_options)
     return Scene(
         info=info(rng, with_camera),
         steps=steps,
@@ -145,20 +155,9 @@ def make_scene(
         **grid.dequantise(k, classes),
         grading=grading,
         mask=tuple(codes.T.copy()),
-        networks={
-            name: network(rng, (widths.inputs[name], *hidden, outputs), steps.weights_scaffold, kind)
-            for name, outputs in widths.networks.items()
-        },
-        global_deformation=deformation(
-            rng, heads[0], (steps.planes_global, steps.weights_global), kind=kind, key=key, **deformation_options
-        )
-        if 1 in layers and heads[0]
-        else None,
-        local_deformation=deformation(
-            rng, heads[1], (steps.planes_local, steps.weights_local), kind=kind, **deformation_options
-        )
-        if 2 in layers and heads[1]
-        else None,
+        networks=networks,
+        global_deformation=fields.get(1),
+        local_deformation=fields.get(2),
     )
 
 
@@ -189,7 +188,7 @@ def scenes(draw: st.DrawFn) -> Scene:
         layers=draw(st.sampled_from(LAYER_SETS)),
         anchors=draw(st.sampled_from((0, 1) if kind == "huge" else (0, 1, 2, 5, 40))),
         kind=kind,
-        heads=(draw(_subset(widths.global_heads)), draw(_subset(LOCAL_HEADS))),
+        heads=(draw(_subset(widths.heads)), draw(_subset(widths.heads))),
         key=draw(st.none() | st.integers(0, INSTANTS)),
         widths=widths,
         with_camera=draw(st.booleans()),

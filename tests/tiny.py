@@ -13,8 +13,6 @@ from strategies import make_scene
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.model.config import DeformationConfig, ModelConfig
 from pd4dgs_codec.scene import (
-    GLOBAL_HEADS,
-    LOCAL_HEADS,
     PLANES,
     Camera,
     Deformation,
@@ -27,8 +25,8 @@ from pd4dgs_codec.scene import (
 
 #: The preset `tiny` with few anchors and cells.
 TINY = ModelConfig(
-    DeformationConfig(4, 4, 4, (1,), 8, GLOBAL_HEADS),
-    DeformationConfig(4, 4, 4, (1,), 8, tuple(LOCAL_HEADS)),
+    DeformationConfig(4, 4, 4, 8),
+    DeformationConfig(4, 4, 4, 8),
     hidden=8,
     initial_anchors=300,
     max_anchors=600,
@@ -112,8 +110,8 @@ def trained_like_scene() -> Scene:
         offset=rng.normal(0, 0.5, (n, 10, 3)).astype(np.float32),
         mask=tuple(np.full(r, 200, np.uint8) for r in rows),
         networks={name: _network(rng, 35, 16, width) for name, width in Widths().networks.items()},
-        global_deformation=_deformation(rng, Widths().global_heads, key=40_000),
-        local_deformation=_deformation(rng, LOCAL_HEADS),
+        global_deformation=_deformation(rng, key=40_000),
+        local_deformation=_deformation(rng, below=4),
     )
 
 
@@ -133,13 +131,13 @@ def _network(rng: np.random.Generator, *widths: int, scale: float = 0.3) -> Netw
     )
 
 
-def _deformation(rng: np.random.Generator, heads: dict[str, int], key: int | None = None) -> Deformation:
+def _deformation(rng: np.random.Generator, key: int | None = None, below: int = 0) -> Deformation:
     reso = (3, 4, 5, 6)
     planes = tuple(
         {name: rng.normal(1, 0.3, (2, reso[b], reso[a])).astype(np.float32) for name, a, b in PLANES} for _ in range(2)
     )
-    networks = {"trunk": _network(rng, 4, 8, 8)}
-    networks |= {name: _network(rng, 8, width, scale=0.05) for name, width in heads.items()}
+    networks = {"trunk": _network(rng, below + 4, 8, 8)}
+    networks |= {name: _network(rng, 8, width, scale=0.05) for name, width in Widths().heads.items()}
     return Deformation(planes, networks, key)
 
 
