@@ -57,6 +57,8 @@ def dead_scene(widths: Widths = DEFAULT_WIDTHS) -> Scene:
     heads["scaling"] = edited(heads["scaling"], 0, rows=list(range(6)))
     heads["trunk"] = edited(heads["trunk"], 0, rows=[2], columns=[4])  # a silent unit; channel 4 of scale 0 is unread
     local_heads = {n: net if n == "trunk" else edited(net, 0, columns=[0]) for n, net in local.networks.items()}
+    local_heads["trunk"] = edited(local_heads["trunk"], 0, columns=[4])  # channel 4 is unread here, too
+    local_heads["feature"] = edited(local_heads["feature"], 0, rows=[9])
     return replace(
         scene,
         networks=networks,
@@ -90,7 +92,7 @@ def test_every_dead_part_is_found_and_costs_less():
         "local_deformation trunk: 1 units of layer 1",
     ]
     assert set(expected) <= set(found)
-    assert [what.split(":")[0] for what in found if "cells" in what] == ["global_deformation"]
+    assert [what.split(":")[0] for what in found if "cells" in what] == ["global_deformation", "local_deformation"]
     assert sum(found.values()) > 400 and len(whole) - len(data) > 300
     got = decode(data)
     assert not got.networks["opacity"][0][0][[3, 5]].any() and not got.networks["opacity"][1][0][:, [3, 5]].any()
@@ -132,16 +134,16 @@ def test_nothing_that_matters_goes():
     assert all("cells" in item.what for item in left_out)
     untouched = decode(encode(scene, layers=2, effort=1, omit="nothing"))
     low, high = untouched.info.box
-    read = cells_read(untouched.global_deformation.planes, np.clip((untouched.anchor - low) / (high - low), 0, 1))
-    free = 0
-    for marks, given, got in zip(
-        read, untouched.global_deformation.planes, planned.global_deformation.planes, strict=True
-    ):
-        for name, _, _ in PLANES:
-            assert np.array_equal(given[name][:, marks[name]], got[name][:, marks[name]])
-            free += int((~marks[name]).sum())
+    unit, free = np.clip((untouched.anchor - low) / (high - low), 0, 1), 0
+    for layer in (1, 2):
+        both = untouched.deformation(layer).planes, planned.deformation(layer).planes
+        for marks, given, got in zip(cells_read(both[0], unit), *both, strict=True):
+            for name, _, _ in PLANES:
+                assert np.array_equal(given[name][:, marks[name]], got[name][:, marks[name]])
+                free += int((~marks[name]).sum())
     assert free > 0
-    assert_same_scene(replace(planned, global_deformation=None), replace(untouched, global_deformation=None))
+    without = [replace(s, global_deformation=None, local_deformation=None) for s in (planned, untouched)]
+    assert_same_scene(*without)
 
 
 def test_a_filled_plane_keeps_what_is_given_and_costs_less():
