@@ -57,6 +57,22 @@ class DeformationField(nn.Module):
         heads = {name: MLP((config.width, head_widths[name]), zero_last=True) for name in config.heads}
         return DeformationField(planes, trunk, heads, key)
 
+    @torch.no_grad()
+    def start_as(self, below: DeformationField) -> None:
+        """Makes the residuals those of the field `below`, whose planes the trunk reads first: its own planes begin to
+        count as training gives them weight."""
+        (first, *rest), (first_below, *rest_below) = self.trunk.layers, below.trunk.layers
+        first.weight.zero_()[:, : first_below.in_features] = first_below.weight
+        first.bias.copy_(first_below.bias)
+        pairs = [*zip(rest, rest_below, strict=True)]
+        pairs += [
+            (head, below_head)
+            for (_, a), (_, b) in zip(self._named_heads(), below._named_heads(), strict=True)
+            for head, below_head in zip(a.layers, b.layers, strict=True)
+        ]
+        for layer, given in pairs:
+            layer.load_state_dict(given.state_dict())
+
     @staticmethod
     def from_arrays(deformation: scene.Deformation, box: np.ndarray) -> DeformationField:
         """The field of a decoded scene."""

@@ -20,7 +20,7 @@ from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.losses import ModelLoss
 from pd4dgs_codec.train.phases import Phase
 from pd4dgs_codec.train.phases.grow import Grow
-from pd4dgs_codec.train.phases.levels import SelectLevels
+from pd4dgs_codec.train.phases.levels import SelectLevels, StartLevel2
 from pd4dgs_codec.train.phases.prefixes import Prefixes
 from pd4dgs_codec.train.phases.prune import Prune
 from pd4dgs_codec.train.phases.quantisation import FitQuantisation
@@ -50,9 +50,9 @@ class Learner(TrainState):
             torch.backends.cudnn.allow_tf32 = False
         super().__init__(config, dataset, schedule, device, size)
         self.model_loss = ModelLoss(config, self.generator)
-        self.levels, self.prefixes, self.grow = SelectLevels(), Prefixes(), Grow()
+        self.levels, self.prefixes, self.grow = SelectLevels(self.practise), Prefixes(), Grow()
         pruning = (Prune(turn) for turn in range(PRUNING_ROUNDS))
-        self.before_step: list[Phase] = [self.levels, FitQuantisation(), *pruning, self.prefixes]
+        self.before_step: list[Phase] = [StartLevel2(), self.levels, FitQuantisation(), *pruning, self.prefixes]
 
     def step(self) -> dict[str, Any]:
         """One training step; returns its log record with every term unweighted."""
@@ -69,6 +69,14 @@ class Learner(TrainState):
         self.optimiser.zero_grad()
         self._measure(record)
         return record
+
+    def practise(self, level: int, steps: int) -> None:
+        """Trains `level` for so many steps, from all views and all their pixels, where the run stands."""
+        self.practising = True
+        for _ in range(steps):
+            self._learn([(next_view(self, level), level) for _ in range(self.config.views_per_step)], {}, None)
+            self.optimiser.zero_grad()
+        self.practising = False
 
     def _apply(self, phases: Sequence[Phase], record: dict[str, Any]) -> None:
         for phase in phases:

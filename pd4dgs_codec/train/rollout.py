@@ -40,7 +40,8 @@ def draw_levels(state: TrainState) -> tuple[tuple[int, ...], Probabilities]:
     if rollout == "top":
         probabilities = TOP
     elif rollout == "key":
-        probabilities = STILL_ODDS, GLOBAL_ODDS, 1 - STILL_ODDS - GLOBAL_ODDS
+        above = 1 - STILL_ODDS - GLOBAL_ODDS if state.position >= state.schedule.local else 0.0
+        probabilities = STILL_ODDS, 1 - STILL_ODDS - above, above
     elif rollout == "uniform" or state.position < state.schedule.progressive:
         probabilities = UNIFORM
     else:
@@ -52,8 +53,8 @@ def draw_levels(state: TrainState) -> tuple[tuple[int, ...], Probabilities]:
 
 def next_view(state: TrainState, level: int) -> int:
     """The training view of the next picture at `level`: each in turn, in random order; views near the key instant at
-    random."""
-    if level == 0 and state.key is not None:
+    random, but not in practice."""
+    if level == 0 and state.key is not None and not state.practising:
         still = state.position < state.schedule.coarse_end
         if still or float(torch.rand((), generator=state.generator)) < NEAR_ODDS:
             held_back = _held_back(state)
@@ -68,7 +69,7 @@ def next_view(state: TrainState, level: int) -> int:
 
 def _held_back(state: TrainState) -> set[int]:
     """The training views that wait for the selection of levels."""
-    return held_back_views(state) if state.position < state.schedule.rounding else set()
+    return held_back_views(state) if state.position <= state.schedule.rounding else set()
 
 
 def near_key(state: TrainState, among: list[int]) -> list[int]:
@@ -86,7 +87,7 @@ def taught_views(state: TrainState, views: Sequence[TrainingView]) -> dict[int, 
 def as_taught(state: TrainState, shown: TrainingView, level: int) -> TrainingView:
     """The view with the weights of the pixels that teach `level`: at level 0 of a scene with a key instant none where
     motion changes the picture."""
-    if level > 0 or state.key is None or state.position < state.schedule.coarse_end:
+    if level > 0 or state.key is None or state.practising or state.position < state.schedule.coarse_end:
         return shown
     with torch.no_grad():
         place = shown.view.time, shown.view.camera, state.rounding(noisy=False)

@@ -122,6 +122,7 @@ class TrainState:
     statistics: [N] or [N, slots] per anchor, what growing is decided by.
     order: training views drawn and not yet used, the next one last.
     rho: moving average of how much the masks of levels 0 and 2 differ.
+    practising: all views and pixels teach level 0, see `phases.levels`.
     """
 
     def __init__(
@@ -146,7 +147,7 @@ class TrainState:
         self.statistics = fresh_statistics(len(model.anchor_q), config.slots)
         self.iteration = self.skipped = 0
         self.share: float | None = None
-        self.rho = 0.0
+        self.rho, self.practising = 0.0, False
         self.order: list[int] = []
         self._before = -1  #: the position of the step before; a timed run may advance by more than one
 
@@ -209,6 +210,18 @@ class TrainState:
         return list(level_psnr(draw, range(self.model.level + 1), views).values())
 
     # -- changes ---------------------------------------------------------------------------------------------------
+
+    def snapshot(self) -> list[dict[Any, Any]]:
+        """The parameters and their moments as they are, for `return_to`."""
+        moments = {p: {n: m.clone() for n, m in own.items()} for p, own in self.optimiser.moments.items()}
+        return [{p: p.detach().clone() for p in self.optimiser.parameters}, moments]
+
+    @torch.no_grad()
+    def return_to(self, before: list[dict[Any, Any]]) -> None:
+        """Undoes all steps since a `snapshot`."""
+        values, self.optimiser.moments = before
+        for parameter, value in values.items():
+            parameter.copy_(value)
 
     def keep_anchors(self, rows: Tensor) -> None:
         """Keeps only the anchors `rows` (int64)."""

@@ -1,36 +1,63 @@
-"""Selection of levels: a level that gains too little on views not trained on yet is removed for the rest of the run.
+"""Levels come and go: level 2 starts as a copy of level 1; a level without use is removed for the rest of the run.
 
-On the views it is trained on every level gains: 1.5 dB on a static scene, of which other views show -0.4.
+Whether a level is of use shows on views held back from training, for on those it is trained on every level gains, and
+only after the level below, which has seen few steps of its own, has tried to do without it: on a static scene level 1
+is then no better. Both are compared in the pixels that the level changes, so that small things count as large ones do.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 from torch.nn.functional import softplus
 
 from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.quality import TRAIN_MIN_DB, TRAIN_MIN_DB_PER_MEGABYTE
-from pd4dgs_codec.train import phases, workers
+from pd4dgs_codec.model.picture import render
+from pd4dgs_codec.train import phases
 from pd4dgs_codec.train.initialise import TIED
 from pd4dgs_codec.train.optimiser import Optimiser
-from pd4dgs_codec.train.state import TrainState
+from pd4dgs_codec.train.state import TrainingView, TrainState
 
 #: One training view in so many is held back until levels are selected, if there are enough of them.
 EVERY = 16
 MIN_VIEWS = 4
+#: A level stays if it is better by so many dB ...
+MIN_GAIN = 0.5
+#: ... in the pixels in which it changes some colour by so much, if there are so many of them, ...
+MIN_CONTRAST, MIN_PIXELS = 0.02, 32
+#: ... than the level below after so many further steps, as a share of the run.
+PRACTICE = 1 / 20
+
+
+class StartLevel2(phases.Phase):
+    """With a key instant, level 2 starts where level 1 stands: the fine planes would find motion later than the coarse
+    ones alone, or not at all."""
+
+    def due(self, state: TrainState) -> bool:
+        """At `Schedule.local`."""
+        return (
+            state.config.rollout == "key" and len(state.model.deformations) == 2 and state.reached(state.schedule.local)
+        )
+
+    def apply(self, state: TrainState, record: dict[str, Any]) -> None:
+        """Copies the networks."""
+        state.model.deformations[2].start_as(state.model.deformations[1])
 
 
 class SelectLevels(phases.Phase):
-    """Where planes and weights begin to be rounded, removes the levels that gain too little.
+    """Where planes and weights begin to be rounded, removes the levels of little use.
 
-    left_out: the removed levels, each with its level, gain in dB and number of views.
+    practise: trains a level alone for so many steps. left_out: the removed levels, each with its level, gain in dB
+    where it acts, and number of views.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, practise: Callable[[int, int], None]) -> None:
+        self._practise = practise
         self.left_out: list[dict[str, Any]] = []
 
     def due(self, state: TrainState) -> bool:
@@ -38,17 +65,38 @@ class SelectLevels(phases.Phase):
         return state.reached(state.schedule.rounding) and bool(held_back_views(state))
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
-        """Logs the PSNR per level and what is left out."""
-        views = [state.dataset.train[index] for index in sorted(held_back_views(state))]
-        psnr = workers.alike(lambda: state.level_psnr(views))
-        fields, bits = state.model.deformations, [0.0, *state.plane_bits()]
-        weights = [sum(p.numel() for p in fields[i].weights) if i in fields else 0 for i in range(3)]  # a byte for each
-        sizes = [count / 8 + number for count, number in zip(bits, weights, strict=True)]
-        found = levels_without_gain(psnr, sizes)
-        for level, _ in found:
+        """From the highest level down, until one stays."""
+        record["level_gains"] = gains = []
+        while state.model.level:
+            level, views = state.model.level, [state.views[index] for index in sorted(held_back_views(state))]
+            gain = self._gain(state, level, views)
+            gains.append(gain)
+            if gain >= MIN_GAIN:
+                break
             drop_level(state.model, state.optimiser, level)
-        self.left_out = [{"level": level, "gain": gain, "views": len(views)} for level, gain in found]
-        record |= {"judged_psnr": psnr, "left_out": self.left_out}
+            self.left_out.append({"level": level, "gain": gain, "views": len(views)})
+
+    def _gain(self, state: TrainState, level: int, views: list[TrainingView]) -> float:
+        """By how many dB `level` is better in the pixels that it changes than the level below after practice. The state
+        is as before if that is MIN_GAIN or more."""
+        below = max(layer for layer in (0, *state.model.deformations) if layer < level)
+        pictures = [_images(state, view, (below, level)) for view in views]
+        acts = [(a - b).abs().amax(-1) >= MIN_CONTRAST for a, b in pictures]
+        if sum(int(mask.sum()) for mask in acts) < MIN_PIXELS:
+            return 0.0
+        before, logits = state.snapshot(), state.model.mask_logits
+        with torch.no_grad():
+            logits[:, below] += softplus(logits[:, level])  # the anchors of the level, without its motion
+        self._practise(below, round(PRACTICE * (state.schedule.iterations or 0)))
+        errors = [0.0, 0.0]
+        for view, mask, (_, with_it) in zip(views, acts, pictures, strict=True):
+            (without,) = _images(state, view, (below,))
+            for i, image in enumerate((without, with_it)):
+                errors[i] += float(((image.clamp(0, 1) - view.image)[mask] ** 2 * view.weights[mask, None]).sum())
+        gain = 10 * math.log10(max(errors[0], 1e-9) / max(errors[1], 1e-9))
+        if gain >= MIN_GAIN:
+            state.return_to(before)
+        return gain
 
     def stored(self) -> dict[str, Any]:
         """left_out, as JSON."""
@@ -57,6 +105,13 @@ class SelectLevels(phases.Phase):
     def restore(self, stored: Mapping[str, Any]) -> None:
         """The inverse of `stored`."""
         self.left_out = list(json.loads(stored["left_out"]))
+
+
+@torch.no_grad()
+def _images(state: TrainState, view: TrainingView, levels: Sequence[int]) -> list[Tensor]:
+    """The pictures of a view at these levels, as the steps at this position see them, without noise."""
+    rounding = state.rounding(noisy=False)
+    return [render(state.model, level, view.view.time, view.view.camera, rounding).image for level in levels]
 
 
 def held_back_views(state: TrainState) -> set[int]:
@@ -68,29 +123,12 @@ def held_back_views(state: TrainState) -> set[int]:
     return views if len(views) >= MIN_VIEWS else set()
 
 
-def levels_without_gain(psnr: Sequence[float], sizes: Sequence[float]) -> list[tuple[int, float]]:
-    """(level, gain in dB over the level below) from the top down, as long as the gain is below TRAIN_MIN_DB or
-    TRAIN_MIN_DB_PER_MEGABYTE. psnr: per level, over held-back views. sizes: about the bytes per level of its planes and
-    networks."""
-    found = []
-    for level in range(len(psnr) - 1, 0, -1):
-        gain = psnr[level] - psnr[level - 1]
-        if gain >= max(TRAIN_MIN_DB[level], TRAIN_MIN_DB_PER_MEGABYTE * sizes[level] / 1e6):
-            break
-        found.append((level, gain))
-    return found
-
-
 def drop_level(model: Model, optimiser: Optimiser, level: int) -> None:
-    """Removes the deformation of `level` from the model and its optimiser, and ties its masks to the level below. Most
-    steps with a key instant have trained the masks of level 1, which then become those of level 0."""
+    """Removes the deformation of `level` from the model and its optimiser, and ties its masks to the level below."""
     name = {1: "global_deformation", 2: "local_deformation"}[level]
     field = getattr(model, name)
-    keyed = field is not None and field.key is not None
     if field is not None:
         optimiser.forget(field)
         setattr(model, name, None)
     with torch.no_grad():
-        if keyed:
-            model.mask_logits[:, level - 1] += softplus(model.mask_logits[:, level])
         model.mask_logits[:, level] = TIED
