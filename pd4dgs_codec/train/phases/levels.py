@@ -18,7 +18,7 @@ from torch.nn.functional import softplus
 
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.picture import render
-from pd4dgs_codec.train import phases
+from pd4dgs_codec.train import phases, workers
 from pd4dgs_codec.train.initialise import TIED
 from pd4dgs_codec.train.optimiser import Optimiser
 from pd4dgs_codec.train.state import TrainingView, TrainState
@@ -88,12 +88,15 @@ class SelectLevels(phases.Phase):
         with torch.no_grad():
             logits[:, below] += softplus(logits[:, level])  # the anchors of the level, without its motion
         self._practise(below, round(PRACTICE * (state.schedule.iterations or 0)))
-        errors = [0.0, 0.0]
-        for view, mask, (_, with_it) in zip(views, acts, pictures, strict=True):
-            (without,) = _images(state, view, (below,))
-            for i, image in enumerate((without, with_it)):
-                errors[i] += float(((image.clamp(0, 1) - view.image)[mask] ** 2 * view.weights[mask, None]).sum())
-        gain = 10 * math.log10(max(errors[0], 1e-9) / max(errors[1], 1e-9))
+
+        def measure() -> float:
+            errors = [0.0, 0.0]
+            for view, mask, (_, with_it) in zip(views, acts, pictures, strict=True):
+                for i, image in enumerate((*_images(state, view, (below,)), with_it)):
+                    errors[i] += float(((image.clamp(0, 1) - view.image)[mask] ** 2 * view.weights[mask, None]).sum())
+            return 10 * math.log10(max(errors[0], 1e-9) / max(errors[1], 1e-9))
+
+        gain = workers.alike(measure)
         if gain >= MIN_GAIN:
             state.return_to(before)
         return gain
