@@ -25,8 +25,8 @@ from pd4dgs_codec.scene import (
 
 #: The preset `tiny` with few anchors and cells.
 TINY = ModelConfig(
-    DeformationConfig(4, 4, 4, 8),
-    DeformationConfig(4, 4, 4, 8),
+    DeformationConfig(((4, 4),), 4, 8),
+    DeformationConfig(((4, 4),), 4, 8),
     hidden=8,
     initial_anchors=300,
     max_anchors=600,

@@ -278,7 +278,7 @@ CROWDS: tuple[tuple[Any, ...], ...] = (
 # -- training: runs that could fail end in a whole checkpoint, a file that decodes and finite images -------------------
 
 SOURCE = "synthetic:local?size=32x24&frames=6"
-_FIELD = DeformationConfig(4, 4, 8, 8)
+_FIELD = DeformationConfig(((4, 4),), 8, 8)
 #: Like the preset `tiny`, but a step takes milliseconds.
 SMALLEST = ModelConfig(_FIELD, _FIELD, hidden=8, initial_anchors=300, max_anchors=600)
 

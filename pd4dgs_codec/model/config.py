@@ -9,15 +9,18 @@ from pd4dgs_codec.scene import HEADS, Steps
 
 @dataclass(frozen=True)
 class DeformationConfig:
-    """Planes and networks of a layer. multires: a factor per scale on `resolution`, that of x, y and z. heads: names in
-    HEADS."""
+    """Planes and networks of a layer. scales: of the planes, each with its cells along x, y and z, and along time.
+    width: of the trunk. heads: names in HEADS."""
 
-    resolution: int
-    time_resolution: int
+    scales: tuple[tuple[int, int], ...]
     channels: int
     width: int
-    multires: tuple[int, ...] = (1,)
     heads: tuple[str, ...] = tuple(HEADS)
+
+    @property
+    def features(self) -> int:
+        """Numbers that the planes give at a point."""
+        return self.channels * len(self.scales)
 
 
 #: Quantisation steps of the presets, before the quality dial scales them. The rate of the planes makes them so flat
@@ -27,9 +30,12 @@ STEPS = Steps(planes_global=0.2, planes_local=1 / 3)
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Both deformations (None: absent), of equally many channels, and the counts of anchors that training starts from
-    and stays below. That of layer 1 is coarse, that of layer 2 fine in space and above all in time: what moves fast
-    needs an instant for each four pictures, and finds its motion sooner where the coarse planes are there as well."""
+    """Both deformations (None: absent), of equal channels and width, and the counts of anchors that training starts from
+    and stays below.
+
+    Layer 1 is coarse in space and time. Layer 2 adds a scale that is finer in space and one that is finer in time: fast
+    motion needs about an instant for four pictures, and where only such planes are there training does not find it.
+    """
 
     global_deformation: DeformationConfig | None
     local_deformation: DeformationConfig | None
@@ -46,16 +52,19 @@ class ModelConfig:
 
 PRESETS: dict[str, ModelConfig] = {
     "tiny": ModelConfig(
-        DeformationConfig(16, 16, 8, 32),
-        DeformationConfig(32, 48, 8, 32),
+        DeformationConfig(((16, 16),), 8, 32),
+        DeformationConfig(((32, 16), (32, 48)), 8, 32),
         initial_anchors=5_000,
         max_anchors=12_000,
     ),
-    "small": ModelConfig(DeformationConfig(32, 24, 16, 64), DeformationConfig(64, 72, 16, 64)),
+    "small": ModelConfig(
+        DeformationConfig(((32, 24),), 16, 64),
+        DeformationConfig(((64, 24), (64, 72)), 16, 64),
+    ),
     # the grids of the paper: 291,840 and 1,904,640 values; its networks are 128 wide, these 64
     "paper": ModelConfig(
-        DeformationConfig(32, 10, 16, 64, (1, 2)),
-        DeformationConfig(64, 100, 16, 64, (1, 2)),
+        DeformationConfig(((32, 10), (64, 10)), 16, 64),
+        DeformationConfig(((64, 100), (128, 100)), 16, 64),
         initial_anchors=26_000,
         max_anchors=50_000,
     ),

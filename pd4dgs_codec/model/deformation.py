@@ -50,10 +50,9 @@ class DeformationField(nn.Module):
     ) -> DeformationField:
         """A new field with the heads that `config` names. head_widths: the output width of each; below: features of the
         planes of the layer below, which the trunk reads too."""
-        side, scales = config.resolution, config.multires
-        planes = HexPlane(box, [(side * m,) * 3 + (config.time_resolution,) for m in scales], config.channels)
+        planes = HexPlane(box, [(side, side, side, times) for side, times in config.scales], config.channels)
         planes.start()
-        trunk = MLP((below + config.channels * len(scales), config.width, config.width))
+        trunk = MLP((below + config.features, config.width, config.width))
         heads = {name: MLP((config.width, head_widths[name]), zero_last=True) for name in config.heads}
         return DeformationField(planes, trunk, heads, key)
 

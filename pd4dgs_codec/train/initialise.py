@@ -53,7 +53,7 @@ def fresh_model(
     for field in (config.global_deformation, config.local_deformation):
         fresh = None if field is None else DeformationField.fresh(field, info.box, widths.heads, key_code, below)
         fields.append(fresh)
-        below += field.channels * len(field.multires) if field else 0
+        below += field.features if field else 0
     model = Model(
         info,
         steps,
