@@ -30,8 +30,8 @@ STEPS = Steps(planes_global=0.2, planes_local=1 / 3)
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Both deformations (None: absent), of equal channels and width, and the counts of anchors that training starts from
-    and stays below.
+    """Both deformations (None: absent), of equal channels and width, and the counts of anchors that training starts
+    from and stays below.
 
     Layer 1 is coarse in space and time. Layer 2 adds a scale that is finer in space and one that is finer in time: fast
     motion needs about an instant for four pictures, and where only such planes are there training does not find it.
