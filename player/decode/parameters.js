@@ -3,7 +3,7 @@
 import { limitExceeded, malformed } from "./errors.js";
 import { Fields, asInteger, asList, asRegistered, checkStep } from "./fields.js";
 import { channelCount } from "./header.js";
-import { LOCAL_HEADS, globalHeads } from "./heads.js";
+import { headsOf } from "./heads.js";
 import {
   INSTANTS,
   MAX_CHANNELS,
@@ -38,7 +38,7 @@ export function layerKind(layer, { widths, centres }) {
   /** @type {[string, number | null][]} */
   const networks = [["trunk", null]];
   if (layer === 0) networks.splice(0, 1, ["opacity", G], ["covariance", 7 * G], ["color", 3 * G]);
-  else for (const { name, outputs } of layer === 1 ? globalHeads(widths) : LOCAL_HEADS) networks.push([name, outputs]);
+  else for (const { name, outputs } of headsOf(widths)) networks.push([name, outputs]);
   const classes = layer ? [2 + 2 * layer, 3 + 2 * layer] : [3];
   const inputs = [0, 1, 2].map((id) => D + (views & (1 << id) ? 3 : 0));
   return { layer, networks, inputs, classes, widths, stepClasses: centres !== null };
@@ -58,13 +58,13 @@ const KEYS = [1, 2, 3, 4, 5, 6];
  * @property {number[]} steps of the weights in layer 0, else of planes and weights; empty without a deformation
  * @property {PlaneShape[]} planes six per scale
  * @property {NetworkShape[]} networks
- * @property {number | null} key instant of layer 1, normalised time, if there is one
+ * @property {number | null} key instant of the deformation, normalised time, if there is one
  * @property {Partial<Record<(typeof SECTIONS)[number], Uint8Array>>} sections
  * @property {Declared} declared by the slices so far, this one included
  */
 
-/** Totals of slices: rows, symbols, bytes of payloads (6.5).
- * @typedef {{rows: number, symbols: number, bytes: number}} Declared */
+/** Totals of slices: rows, symbols, bytes of payloads (6.5). scales: the channels of each scale of their planes.
+ * @typedef {{rows: number, symbols: number, bytes: number, scales: number[]}} Declared */
 
 /**
  * The parameters of a slice's payload, with its sections; all counts are held against the limits and the payload.
@@ -86,8 +86,8 @@ export function readParameters(payload, kind, before, later) {
   const rows = asInteger(fields.get(1), 0, MAX_ROWS - before.rows, `${where}: own rows`);
   const lengths = new Fields(fields.get(2), `${where}: sections`, [...SECTIONS.keys()]);
   if (later) for (const key of [3, 4, 5, 6]) if (fields.has(key)) throw malformed(`${where}: key ${key} in a later slice`);
-  const scales = readScales(fields, kind, where);
-  const networks = later ? [] : readNetworks(fields, kind, where, scales);
+  const scales = readScales(fields, kind, where, before.scales);
+  const networks = later ? [] : readNetworks(fields, kind, where, scales, before.scales);
   const steps = readSteps(fields, kind, where, networks.length > 0);
   const key = readKey(fields, kind, where, networks.length > 0);
   const planes = scales.flat();
@@ -103,6 +103,7 @@ export function readParameters(payload, kind, before, later) {
     rows: before.rows + rows,
     symbols: before.symbols + rises + (perRow + 4) * rows + cells + weights,
     bytes: before.bytes + payload.length,
+    scales: [...before.scales, ...scales.map(([{ channels }]) => channels)],
   };
   checkDeclared(where, "rows", declared.rows, 2 ** 13, 2, declared.bytes);
   checkDeclared(where, "symbols", declared.symbols, 2 ** 22, 256, declared.bytes);
@@ -147,24 +148,27 @@ function readSteps(fields, kind, where, expected) {
 /** Key 6. @param {Fields} fields @param {LayerKind} kind @param {string} where @param {boolean} deformed */
 function readKey(fields, kind, where, deformed) {
   if (!fields.has(6)) return null;
-  if (kind.layer !== 1 || !deformed) throw malformed(`${where}: a key instant, expected none`);
+  if (!deformed || kind.layer === 0) throw malformed(`${where}: a key instant, expected none`);
   return Math.fround(asInteger(fields.get(6), 0, INSTANTS, `${where}: key instant`) / INSTANTS);
 }
 
-/** Key 4: the planes of each scale. @param {Fields} fields @param {LayerKind} kind @param {string} where */
-function readScales(fields, kind, where) {
+/** Key 4: the planes of each scale. @param {Fields} fields @param {LayerKind} kind @param {string} where
+ * @param {number[]} below channels of each scale of the layers before */
+function readScales(fields, kind, where, below) {
   if (!fields.has(4)) return [];
   if (kind.layer === 0) throw malformed(`${where}: planes, expected none`);
   const rows = asList(fields.get(4), `${where}: scales`);
   asInteger(rows.length, 1, MAX_SCALES, `${where}: number of scales`);
-  let expected = 0;
+  let [expected] = below;
   return rows.map((row) => {
     const entry = asList(row, `${where}: a scale`, 11);
     const channels = asInteger(entry[0], 1, MAX_CHANNELS, `${where}: channels of a scale`);
     const [x, y, z, t] = entry.slice(1, 5).map((side) => asInteger(side, 1, MAX_SIDE, `${where}: side of a plane`));
     const predictors = entry.slice(5).map((p) => asRegistered(p, PREDICTORS, `${where}: predictor`));
-    expected ||= channels;
-    if (channels !== expected) throw malformed(`${where}: a scale of ${channels} channels after one of ${expected}`);
+    expected ??= channels;
+    if (channels !== expected) {
+      throw malformed(`${where}: a scale of ${channels} channels, expected ${expected} as in the first scale`);
+    }
     const side = { x, y, z, t };
     return PLANES.map((name, i) => ({
       channels,
@@ -176,8 +180,8 @@ function readScales(fields, kind, where) {
 }
 
 /** Key 5. @param {Fields} fields @param {LayerKind} kind @param {string} where @param {PlaneShape[][]} scales
- * @returns {NetworkShape[]} */
-function readNetworks(fields, kind, where, scales) {
+ * @param {number[]} below as in readScales @returns {NetworkShape[]} */
+function readNetworks(fields, kind, where, scales, below) {
   const deformation = kind.layer > 0;
   if (!fields.has(5)) {
     if (!deformation || scales.length) throw malformed(`${where}: networks are missing`);
@@ -186,7 +190,7 @@ function readNetworks(fields, kind, where, scales) {
   const rows = asList(fields.get(5), `${where}: networks`);
   if (!rows.length) throw malformed(`${where}: an empty list of networks`);
   if (deformation && !scales.length) throw malformed(`${where}: a deformation without planes`);
-  let inputs = scales.reduce((sum, planes) => sum + planes[0].channels, 0);
+  let inputs = scales.length && (below.length + scales.length) * scales[0][0].channels;
   let last = -1;
   const networks = rows.map((row) => {
     const [id, ...widths] = asList(row, `${where}: a network`);

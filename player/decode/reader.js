@@ -57,7 +57,7 @@ export class LayerReader {
     /** How many slices have been read. */
     this.count = 0;
     /** By those slices. @type {Declared} */
-    this._declared = { rows: 0, symbols: 0, bytes: 0 };
+    this._declared = { rows: 0, symbols: 0, bytes: 0, scales: [] };
     this._voxels = new VoxelTable();
     /** Voxels that are not in the table yet: of one slice nothing is looked up. @type {Int32Array[]} */
     this._loose = [];

@@ -15,8 +15,8 @@
  */
 
 /**
- * planes: per scale its six planes. networks: `trunk` and the heads that are there, in the order of their ids: of the
- * global deformation position, feature, offset, scaling, of the local one mean, scale, quat, opacity, color.
+ * planes: per scale its six planes. networks: `trunk`, which reads the planes of the layers below before these, and
+ * those of the heads position, feature, offset, scaling that are there, in this order.
  *
  * key: the key instant t* in normalised time if the residuals are those at t minus those at t* (13.4), else null.
  *

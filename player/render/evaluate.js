@@ -1,22 +1,21 @@
 // Clauses 13.2 to 13.4 without a GPU: the Gaussians of a level at a time, for a camera's centre. For Spark, for
 // machines whose GPU is missing or slow, and the reference of the evaluator on the GPU.
 
-import { GAUSSIAN_COLUMNS, LOCAL_HEADS, anchorColumns, columnsOf, globalHeads } from "../decode/heads.js";
+import { anchorColumns, columnsOf, headsOf } from "../decode/heads.js";
 import { Arena } from "./kernel.js";
-import { deformationUnit, eachAttribute, levelOf, MIN_OPACITY, SPATIAL, sliceAt, TEMPORAL, widthsOf } from "./level.js";
-/** @import { Head } from "../decode/heads.js" */
-/** @import { Deformation, Network, Scene } from "../decode/scene.js" */
+import { deformationUnit, eachAttribute, GAUSSIAN_COLUMNS as COLUMNS, levelOf, MIN_OPACITY } from "./level.js";
+import { SPATIAL, sliceAt, TEMPORAL } from "./level.js";
+/** @import { Deformation, Network, Plane, PlaneName, Scene } from "../decode/scene.js" */
 
 /**
- * The visible Gaussians in ascending order of their slot, anchor · slots + i. records: [count, 16], mean and opacity,
- * (scale, 0), quaternion, (colour, 0); lengths in scene units. Opacity and scale include the anchor's gate.
+ * The visible Gaussians in ascending order of their slot, anchor · slots + i. records: [count, GAUSSIAN_COLUMNS].
+ * Opacity and scale include the anchor's gate.
  *
  * @typedef {{count: number, slot: Uint32Array, records: Float32Array}} Gaussians
  */
 
 /** Rows that networks process at a time: their intermediate values stay in the processor's cache. */
 const BATCH = 256;
-const COLUMNS = GAUSSIAN_COLUMNS;
 
 /** @param {number} x */
 const sigmoid = (x) => 1 / (1 + Math.exp(-x));
@@ -87,35 +86,33 @@ class Sampler {
   }
 }
 
-/** Spatial planes with their channels last, by deformation. @type {WeakMap<Deformation, Sampler[][]>} */
+/** Spatial planes with their channels last, by scale: levels share scales. @type {WeakMap<object, Sampler[]>} */
 const transposed = new WeakMap();
 
-/** @param {Deformation} deformation @returns {Sampler[][]} by scale */
-function spatialPlanes(deformation) {
-  let scales = transposed.get(deformation);
-  if (!scales) {
-    scales = deformation.planes.map((planes) =>
-      SPATIAL.map(([name]) => {
-        const { data, channels, height, width } = planes[name];
-        const out = new Float32Array(data.length);
-        const cells = height * width;
-        for (let c = 0; c < channels; c++) for (let i = 0; i < cells; i++) out[i * channels + c] = data[c * cells + i];
-        return new Sampler(out, width, height, channels);
-      }),
-    );
-    transposed.set(deformation, scales);
+/** @param {Record<PlaneName, Plane>} planes of a scale */
+function spatialPlanes(planes) {
+  let samplers = transposed.get(planes);
+  if (!samplers) {
+    samplers = SPATIAL.map(([name]) => {
+      const { data, channels, height, width } = planes[name];
+      const out = new Float32Array(data.length);
+      const cells = height * width;
+      for (let c = 0; c < channels; c++) for (let i = 0; i < cells; i++) out[i * channels + c] = data[c * cells + i];
+      return new Sampler(out, width, height, channels);
+    });
+    transposed.set(planes, samplers);
   }
-  return scales;
+  return samplers;
 }
 
-/** A deformation in an arena: HexPlane, trunk, and heads that add to records. */
+/** A deformation in an arena: planes, trunk, and heads that add to anchors' records. */
 class Field {
-  /** @param {Arena} arena @param {Deformation} deformation @param {Scene} scene @param {Head[]} heads */
-  constructor(arena, deformation, scene, heads) {
+  /** @param {Arena} arena @param {Deformation} deformation @param {Scene} scene */
+  constructor(arena, deformation, scene) {
     this._arena = arena;
     this._deformation = deformation;
     this._box = scene.info.box;
-    this._spatial = spatialPlanes(deformation);
+    this._spatial = deformation.planes.map(spatialPlanes);
     /** @type {Sampler[][]} */
     this._temporal = [];
     this._channels = deformation.planes[0].xy.channels;
@@ -124,13 +121,13 @@ class Field {
     const { networks } = deformation;
     this._trunk = new Chain(arena, networks.trunk, true);
     const unit = deformationUnit(scene);
-    this._heads = heads
+    this._stride = anchorColumns(scene.widths);
+    this._heads = headsOf(scene.widths)
       .filter(({ name }) => networks[name])
       .map((head) => ({
         chain: new Chain(arena, networks[head.name]),
         columns: Int32Array.from(columnsOf(head)),
         unit: head.length ? unit : 1,
-        head,
       }));
   }
 
@@ -149,34 +146,31 @@ class Field {
   /**
    * Adds F(x, t) to records.
    *
-   * @param {Float32Array} records @param {number} first @param {number} rows at most BATCH @param {number} stride
-   * @param {Float32Array} [points] x, [rows, 3]; default: the first three columns of the records
+   * @param {Float32Array} points x, [rows, 3] @param {number} rows at most BATCH @param {Float32Array} records
    */
-  deform(records, first, rows, stride, points) {
-    if (points) this._sample(points, 0, rows, 3);
-    else this._sample(records, first * stride, rows, stride);
+  deform(points, rows, records) {
+    this._sample(points, rows);
     this._trunk.run(rows, this._features, this._width);
     const { floats } = this._arena;
-    for (const { chain, columns, unit, head } of this._heads) {
+    for (const { chain, columns, unit } of this._heads) {
       chain.run(rows, this._trunk.out, this._trunk.stride);
       for (let r = 0; r < rows; r++) {
         const from = chain.out + r * chain.stride;
-        const to = (first + r) * stride;
+        const to = r * this._stride;
         for (let k = 0; k < columns.length; k++) records[to + columns[k]] += floats[from + k] * unit;
-        if (head.then) bringIntoRange(records, to + head.at, head);
       }
     }
   }
 
-  /** @param {Float32Array} points @param {number} at @param {number} rows @param {number} stride */
-  _sample(points, at, rows, stride) {
+  /** @param {Float32Array} points @param {number} rows */
+  _sample(points, rows) {
     const { floats } = this._arena;
     const C = this._channels;
     const u = new Float64Array(3);
     const [low, high] = this._box;
-    for (let r = 0, to = this._features; r < rows; r++, at += stride) {
+    for (let r = 0, to = this._features; r < rows; r++) {
       for (let k = 0; k < 3; k++) {
-        const x = points[at + k];
+        const x = points[3 * r + k];
         u[k] = !(x > low[k]) ? 0 : x >= high[k] ? 1 : (x - low[k]) / (high[k] - low[k]);
       }
       for (let s = 0; s < this._spatial.length; s++) {
@@ -196,18 +190,13 @@ class Field {
   }
 }
 
-/** @param {Float32Array} values in place @param {number} at @param {Head} head */
-function bringIntoRange(values, at, { outputs, then }) {
-  const most = then === "clip" ? 1 : Infinity;
-  if (then === "unit") normaliseQuaternion(values, at);
-  else for (let k = at; k < at + outputs; k++) values[k] = Math.min(Math.max(values[k], 0), most);
-}
-
 /** @param {Float32Array} q normalised in place from `at` on; the identity if 0 @param {number} at */
 function normaliseQuaternion(q, at) {
   const norm = Math.hypot(q[at], q[at + 1], q[at + 2], q[at + 3]);
   for (let k = 0; k < 4; k++) q[at + k] = norm > 0 ? q[at + k] / norm : k === 0 ? 1 : 0;
 }
+
+/** A deformation, and the attributes of the anchors to which it adds. @typedef {{field: Field, rest: Scene}} Motion */
 
 /** A scene's networks in an arena, whose content they replace. */
 class Evaluator {
@@ -216,52 +205,52 @@ class Evaluator {
     arena.reset();
     this.scene = scene;
     this.arena = arena;
-    this._widths = widthsOf(scene);
+    this._widths = scene.widths;
     const { opacity, covariance, color } = scene.networks;
     this._opacity = new Chain(arena, opacity);
     this._covariance = new Chain(arena, covariance);
     this._color = new Chain(arena, color);
-    const { globalDeformation, localDeformation } = scene;
-    this._global = globalDeformation && new Field(arena, globalDeformation, scene, globalHeads(this._widths));
-    this._local = localDeformation && new Field(arena, localDeformation, scene, LOCAL_HEADS);
+    /** Those of the levels shown so far. @type {Map<Deformation, Motion>} */
+    this._motions = new Map();
     /** Inputs of the scaffold's networks, features and direction: the distance of rows, and where they begin. */
     this._stride = this._widths.feature + 3;
     this._inputs = arena.take(BATCH * this._stride);
     this._anchorStride = anchorColumns(this._widths);
     this._anchors = new Float32Array(BATCH * this._anchorStride);
     this._points = new Float32Array(BATCH * 3);
-    /** The scene with what the global deformation adds to. @type {Scene | null} */
-    this._rest = null;
     this._offsetAt = this._anchorStride - 4 * this._widths.slots;
   }
 
   /** @param {number} level @param {number} t @param {number[]} eye @returns {Gaussians} */
   evaluate(level, t, eye) {
-    const { rows, codes, global, local } = levelOf(this.scene, level);
-    const moved = global && this._global;
-    const source = moved ? (this._rest ??= this._withoutStill(moved)) : this.scene;
-    moved?.setTime(t);
+    const { rows, codes, motion } = levelOf(this.scene, level);
+    const moving = motion && this._motionOf(motion);
+    moving?.field.setTime(t);
     const kept = new Records(rows);
     const anchors = new Uint32Array(BATCH);
     for (let a = 0; a < rows; ) {
       let count = 0;
       for (; a < rows && count < BATCH; a++) if (codes[a]) anchors[count++] = a;
-      this._keep(source, moved, anchors.subarray(0, count), codes, eye, kept);
+      this._keep(moving, anchors.subarray(0, count), codes, eye, kept);
     }
-    if (local && this._local) {
-      this._local.setTime(t);
-      for (let first = 0; first < kept.count; first += BATCH) {
-        this._local.deform(kept.data, first, Math.min(BATCH, kept.count - first), COLUMNS);
-      }
-    }
-    return kept.gated(codes, this._widths.slots);
+    return kept.gaussians();
   }
 
-  /** The scene; with a key instant t*, its attributes without F(x, t*). @param {Field} field @returns {Scene} */
-  _withoutStill(field) {
+  /** @param {Deformation} deformation @returns {Motion} */
+  _motionOf(deformation) {
+    let motion = this._motions.get(deformation);
+    if (!motion) {
+      const field = new Field(this.arena, deformation, this.scene);
+      const { key } = deformation;
+      motion = { field, rest: key === null ? this.scene : this._withoutStill(field, key) };
+      this._motions.set(deformation, motion);
+    }
+    return motion;
+  }
+
+  /** The scene with its attributes without F(x, t*). @param {Field} field @param {number} key t* @returns {Scene} */
+  _withoutStill(field, key) {
     const { scene, _anchors: records, _anchorStride: wide } = this;
-    const key = scene.globalDeformation?.key ?? null;
-    if (key === null) return scene;
     const attributes = [scene.anchor, scene.feature, scene.offset, scene.scalingLog];
     const [anchor, feature, offset, scalingLog] = attributes.map((values) => values.slice());
     const rest = { ...scene, anchor, feature, offset, scalingLog };
@@ -269,7 +258,7 @@ class Evaluator {
     for (let first = 0; 3 * first < anchor.length; first += BATCH) {
       const points = scene.anchor.subarray(3 * first, 3 * (first + BATCH));
       records.fill(0);
-      field.deform(records, 0, points.length / 3, wide, points);
+      field.deform(points, points.length / 3, records);
       eachAttribute(rest, (values, width, columns) => {
         for (let r = 0; 3 * r < points.length; r++) {
           const to = width * (first + r);
@@ -281,26 +270,26 @@ class Evaluator {
   }
 
   /**
-   * Steps 1 to 4 for at most BATCH anchors: their visible Gaussians.
+   * Adds the visible Gaussians of at most BATCH anchors to `kept`.
    *
-   * @param {Scene} source of the attributes @param {Field | null} moved the global deformation, at its time
-   * @param {Uint32Array} anchors @param {Uint8Array} codes @param {number[]} eye @param {Records} kept takes them
+   * @param {Motion | null} moving at its time @param {Uint32Array} anchors @param {Uint8Array} codes
+   * @param {number[]} eye @param {Records} kept
    */
-  _keep(source, moved, anchors, codes, eye, kept) {
+  _keep(moving, anchors, codes, eye, kept) {
     const { floats } = this.arena;
     const { feature: F, slots: S } = this._widths;
     const { _anchors: records, _anchorStride: wide, _points: points, _inputs: inputs, _stride: stride } = this;
     const count = anchors.length;
-    eachAttribute(source, (values, width, columns) => {
+    eachAttribute(moving?.rest ?? this.scene, (values, width, columns) => {
       for (let r = 0; r < count; r++) {
         const from = width * anchors[r];
         for (let k = 0; k < width; k++) records[r * wide + columns[k]] = values[from + k];
       }
     });
-    if (moved) {
+    if (moving) {
       const { anchor } = this.scene; // the field is sampled at stored positions, which `records` may not have
       for (let r = 0; r < count; r++) for (let k = 0; k < 3; k++) points[3 * r + k] = anchor[3 * anchors[r] + k];
-      moved.deform(records, 0, count, wide, points);
+      moving.field.deform(points, count, records);
     }
     for (let r = 0; r < count; r++) {
       const from = r * wide;
@@ -337,6 +326,7 @@ class Evaluator {
     const record = new Float32Array(COLUMNS);
     alive.forEach((r, row) => {
       const from = r * wide;
+      const gate = codes[anchors[r]] / 255;
       for (let k = 4; k < 12; k++) records[from + k] = Math.exp(records[from + k]);
       for (let i = 0; i < S; i++) {
         const opacity = opacities[r * S + i];
@@ -346,10 +336,10 @@ class Evaluator {
         const offset = from + this._offsetAt + 4 * i;
         for (let k = 0; k < 3; k++) {
           record[k] = records[from + k] + records[offset + k] * records[from + 4 + k];
-          record[4 + k] = records[from + 8 + k] * sigmoid(floats[v + k]);
+          record[4 + k] = records[from + 8 + k] * sigmoid(floats[v + k]) * gate;
           record[12 + k] = sigmoid(floats[w + k]);
         }
-        record[3] = opacity;
+        record[3] = opacity * gate;
         for (let k = 0; k < 4; k++) record[8 + k] = floats[v + 3 + k];
         normaliseQuaternion(record, 8);
         kept.add(S * anchors[r] + i, record);
@@ -381,20 +371,10 @@ class Records {
     this.data.set(record, this.count++ * COLUMNS);
   }
 
-  /** Step 6: opacity and scale times the gates of their anchors, without Gaussians that are no longer visible.
-   * @param {Uint8Array} codes @param {number} slots of an anchor @returns {Gaussians} */
-  gated(codes, slots) {
-    const { data } = this;
-    let count = 0;
-    for (let i = 0; i < this.count; i++) {
-      const at = i * COLUMNS;
-      const gate = codes[Math.floor(this._slots[i] / slots)] / 255;
-      for (let k = 3; k < 7; k++) data[at + k] *= gate;
-      if (!(data[at + 3] >= MIN_OPACITY)) continue;
-      data.copyWithin(count * COLUMNS, at, at + COLUMNS);
-      this._slots[count++] = this._slots[i];
-    }
-    return { count, slot: this._slots.slice(0, count), records: data.slice(0, count * COLUMNS) };
+  /** @returns {Gaussians} */
+  gaussians() {
+    const { count } = this;
+    return { count, slot: this._slots.slice(0, count), records: this.data.slice(0, count * COLUMNS) };
   }
 }
 

@@ -1,19 +1,19 @@
 // Clauses 13.2 to 13.4 on the GPU, as fragment passes into float textures.
 //
-// Per anchor, when time changes: global deformation; the features' share of the scaffold's first layers. Per anchor,
-// when the camera's centre changes: opacities. They tell which Gaussians are visible, about a fifth of all, and only
-// these are evaluated further. Per Gaussian, when time changes: mean and local deformation. Per Gaussian, when the
-// camera's centre changes: shape and colour. Opacities and shapes that do not take the view direction change with time.
+// Per anchor, when time changes: the deformation; the features' share of the scaffold's first layers. Per anchor, when
+// the camera's centre changes: opacities. They tell which Gaussians are visible, about a fifth of all, and only these
+// are evaluated further, when time or the camera's centre changes. Opacities and shapes that do not take the view
+// direction change with time alone.
 
-import { GAUSSIAN_COLUMNS, LOCAL_HEADS, anchorColumns, globalHeads } from "../decode/heads.js";
+import { anchorColumns } from "../decode/heads.js";
 import { FieldPass } from "./field.js";
 import { blocksOf, Linear, pack, repeat, targets, TooLarge } from "./layers.js";
-import { eachAttribute, levelOf, widthsOf } from "./level.js";
-/** @import { Network, Scene } from "../decode/scene.js" */
+import { eachAttribute, GAUSSIAN_COLUMNS, levelOf } from "./level.js";
+/** @import { Deformation, Network, Scene } from "../decode/scene.js" */
 /** @import { Field, Gpu } from "./gl.js" */
 
 /**
- * Visible Gaussians for the renderer: the records of heads.js, in texels of four blocks. A texel without a Gaussian has
+ * Visible Gaussians for the renderer: their records in texels of SPLAT_BLOCKS blocks. A texel without a Gaussian has
  * opacity −1. shapes: stands for the time and the list of which they have the opacities and shapes.
  *
  * @typedef {{field: Field, texels: number, shapes?: object}} Splats
@@ -109,6 +109,13 @@ function stack(layers) {
   return { weight, bias, inputs, outputs };
 }
 
+/**
+ * A deformation on the GPU, and the field of its residuals. rest: if it has a key instant, the anchors' records without
+ * the residuals there.
+ *
+ * @typedef {{deformation: Deformation, pass: FieldPass, residual: Field, rest: Field | null}} Motion
+ */
+
 export class GpuEvaluator {
   /**
    * Throws TooLarge where the scene's networks or planes are larger than shaders take.
@@ -118,10 +125,10 @@ export class GpuEvaluator {
   constructor(gpu, scene) {
     this._gpu = gpu;
     this.scene = scene;
-    const widths = widthsOf(scene);
-    const { anchors, feature, slots } = widths;
+    const anchors = scene.anchor.length / 3;
+    const { feature, slots } = scene.widths;
     this._slots = slots;
-    this._blocks = anchorColumns(widths) / 4;
+    this._blocks = anchorColumns(scene.widths) / 4;
     this._offsetBlock = this._blocks - slots;
     this._width = widthFor(anchors);
     this._height = Math.ceil(anchors / this._width);
@@ -142,8 +149,7 @@ export class GpuEvaluator {
     this._scaffolds = [this._opacity, this._covariance, this._color];
     this._first = new Linear(gpu, stack(this._scaffolds.map((scaffold) => scaffold.features)));
     if (this._first.paddedBlocks > gpu.maxLayers) throw new TooLarge("the networks' first layers");
-    const key = scene.globalDeformation?.key ?? null;
-    const tables = scene.globalDeformation ? (key === null ? 2 : 3) : 1;
+    const tables = levelOf(scene, 2).motion ? 3 : 1; // anchors, residuals, and anchors without those at the key instant
     const blocks = this._blocks * tables + this._first.paddedBlocks + blocksOf(slots);
     if (16 * this._width * this._height * blocks > MAX_BYTES) throw new TooLarge(`${anchors} anchors`);
     this._anchors = gpu.field(this._width, this._height, this._blocks, this._attributes());
@@ -152,21 +158,12 @@ export class GpuEvaluator {
     this._opacities = gpu.field(this._width, this._height, this._opacityLast.paddedBlocks);
     this._shapes = this._uploadShapes();
 
-    const { global, local } = levelOf(scene, 2);
-    this._global = global && new FieldPass(gpu, global, scene, globalHeads(widths), 4 * this._blocks);
-    this._residual = this._global && gpu.field(this._width, this._height, this._global.outputBlocks);
-    /** Records to which residuals are added. @type {Field} */
-    this._rest = this._residual && key !== null ? this._withoutStill(key, this._residual) : this._anchors;
-    this._local = local && new FieldPass(gpu, local, scene, LOCAL_HEADS, GAUSSIAN_COLUMNS);
-
+    /** Of the level. @type {Motion | null} */
+    this._motion = null;
     /** @type {WebGLTexture | null} */
     this._codes = null;
     /** @type {WebGLTexture | null} */
     this._list = null;
-    /** Of the listed Gaussians. @type {Field | null} */
-    this._means = null;
-    /** @type {Field | null} */
-    this._changes = null;
     /** @type {List} */
     this._listed = { width: 16, rows: 0, entries: new Uint32Array(0), starts: new Uint32Array(slots + 1), count: 0 };
     /** What the textures hold: level, time, camera's centre. @type {number | null} */
@@ -175,9 +172,7 @@ export class GpuEvaluator {
     this._time = null;
     /** @type {number[] | null} */
     this._eye = null;
-    /** Whether the listed Gaussians' means and changes are those of the time. */
-    this._current = false;
-    /** Stands for their time and list. */
+    /** Stands for the time and the list. */
     this._shape = {};
   }
 
@@ -194,11 +189,31 @@ export class GpuEvaluator {
     return out;
   }
 
-  /** The anchors' records without F(x, t*). @param {number} key t* @param {Field} residual */
-  _withoutStill(key, residual) {
+  /** Makes a deformation the one that moves the anchors. @param {Deformation | null} deformation */
+  _setMotion(deformation) {
+    if (deformation === (this._motion?.deformation ?? null)) return;
+    this._freeMotion();
+    if (!deformation) return;
+    const gpu = this._gpu;
+    const pass = new FieldPass(gpu, deformation, this.scene);
+    const residual = gpu.field(this._width, this._height, pass.outputBlocks);
+    this._motion = { deformation, pass, residual, rest: null };
+    if (deformation.key !== null) this._motion.rest = this._withoutStill(this._motion, deformation.key);
+  }
+
+  _freeMotion() {
+    if (!this._motion) return;
+    const { pass, residual, rest } = this._motion;
+    this._motion = null;
+    pass.free();
+    this._gpu.free(residual, rest);
+  }
+
+  /** The anchors' records without F(x, t*). @param {Motion} motion @param {number} key t* */
+  _withoutStill({ pass, residual }, key) {
     const gpu = this._gpu;
     const rest = gpu.field(this._width, this._height, this._blocks);
-    this._global?.run(key, this._anchors, this._height, residual);
+    pass.run(key, this._anchors, this._height, residual);
     const program = gpu.program(`${targets(1)}uniform sampler2DArray anchors, residual;
 uniform int block;
 void main() {
@@ -245,44 +260,38 @@ void main() {
    */
   async evaluate(level, t, eye, into, lister) {
     const gpu = this._gpu;
-    const { number, rows, codes, global, local } = levelOf(this.scene, level);
+    const { number, rows, codes, motion } = levelOf(this.scene, level);
     const lines = Math.ceil(rows / this._width);
     const levelMoved = number !== this._level;
-    const timeMoved = levelMoved || (t !== this._time && !!(global || local));
-    const anchorsMoved = levelMoved || (t !== this._time && !!global);
+    const anchorsMoved = levelMoved || (t !== this._time && !!motion);
     const eyeMoved = !this._eye || [0, 1, 2].some((k) => this._eye?.[k] !== eye[k]);
+    this._level = null; // until all is done, the textures hold nothing in particular
     if (levelMoved) {
       const padded = new Uint8Array(this._width * this._height);
       padded.set(codes);
       gpu.free(this._codes);
       this._codes = gpu.plain(this._width, this._height, padded);
+      this._setMotion(motion);
     }
-    this._level = null; // until all is done, the textures hold nothing in particular
-    const residual = global ? this._residual : null;
     if (anchorsMoved) {
-      if (residual) this._global?.run(t, this._anchors, lines, residual);
-      this._runFirst(residual, lines);
+      this._motion?.pass.run(t, this._anchors, lines, this._motion.residual);
+      this._runFirst(lines);
     }
-    if (timeMoved) this._current = false;
+    let gaussiansMoved = anchorsMoved;
     if (anchorsMoved || (eyeMoved && this._opacity.views)) {
-      this._runOpacities(residual, eye, lines);
+      this._runOpacities(eye, lines);
       const opacities = await gpu.read(this._opacities, 0, blocksOf(this._slots), lines);
-      const previous = timeMoved ? null : this._listed;
+      const previous = anchorsMoved ? null : this._listed;
       const list = await lister(opacities, this._slots, lines * this._width, previous);
       if (list) this._setList(list);
+      gaussiansMoved ||= !!list;
     }
-    const moved = !this._current;
-    if (!this._current) {
-      this._runMeans(residual);
-      if (local && this._changes && this._means) this._local?.run(t, this._means, this._listed.rows, this._changes);
-      this._current = true;
-      this._shape = {};
-    }
-    const splats = this._runShapes(residual, local ? this._changes : null, eye, into);
+    if (gaussiansMoved) this._shape = {};
+    const splats = this._runShapes(eye, into);
     this._level = number;
     this._time = t;
     this._eye = eye;
-    return { splats, means: moved ? await gpu.read(splats.field, 0, 1, this._listed.rows) : null };
+    return { splats, means: gaussiansMoved ? await gpu.read(splats.field, 0, 1, this._listed.rows) : null };
   }
 
   /** The Gaussians of the last evaluation: anchor · slots + i of each texel, NO_ENTRY where there is none. */
@@ -292,36 +301,47 @@ void main() {
     );
   }
 
-  /** First layers. @param {Field | null} residual @param {number} lines */
-  _runFirst(residual, lines) {
+  /** First layers. @param {number} lines */
+  _runFirst(lines) {
     const gpu = this._gpu;
     const linear = this._first;
     const program = gpu.program(
       linear.declare() +
-        anchorSource(residual) +
+        this._anchorSource() +
         `void main() {
 ivec2 p = ivec2(gl_FragCoord.xy);
 ${repeat(linear.inputBlocks, (k) => `vec4 x${k} = anchorBlock(p, ${FEATURE_BLOCK + k});`)}
 ${linear.apply(false)}
 ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i};`)}}`,
     );
-    gpu.use(program, this._anchorTextures(residual));
+    gpu.use(program, this._anchorTextures());
     linear.cover(this._before, 0, lines);
   }
 
-  /** @param {Field | null} residual @returns {Record<string, Field>} */
-  _anchorTextures(residual) {
-    return residual ? { anchors: this._rest, residual } : { anchors: this._anchors };
+  /** Source that reads anchors' attributes, moved if something moves them. */
+  _anchorSource() {
+    return `uniform sampler2DArray anchors${this._motion ? ", residual" : ""};
+vec4 anchorBlock(ivec2 p, int block) {
+  return texelFetch(anchors, ivec3(p, block), 0)${this._motion ? " + texelFetch(residual, ivec3(p, block), 0)" : ""};
+}
+`;
   }
 
-  /** @param {Field | null} residual @param {number[]} eye @param {number} lines */
-  _runOpacities(residual, eye, lines) {
+  /** @returns {Record<string, Field>} */
+  _anchorTextures() {
+    if (!this._motion) return { anchors: this._anchors };
+    const { rest, residual } = this._motion;
+    return { anchors: rest ?? this._anchors, residual };
+  }
+
+  /** @param {number[]} eye @param {number} lines */
+  _runOpacities(eye, lines) {
     const gpu = this._gpu;
     const linear = this._opacityLast;
     const program = gpu.program(
       linear.declare() +
         this._opacity.declare(1) +
-        anchorSource(residual) +
+        this._anchorSource() +
         `uniform sampler2DArray before;
 uniform sampler2D codes;
 uniform vec3 eye;
@@ -336,7 +356,7 @@ ${repeat(linear.chunkBlocks, (i) => `y${i} = tanh(clamp(y${i}, -15., 15.));`)}
 ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i} * vec4(greaterThanEqual(y${i} * gate, vec4(1. / 255.)));`)}}`,
     );
     const codes = /** @type {WebGLTexture} */ (this._codes);
-    gpu.use(program, { ...this._anchorTextures(residual), before: this._before, codes });
+    gpu.use(program, { ...this._anchorTextures(), before: this._before, codes });
     gpu.gl.uniform3fv(program.uniform("eye"), eye);
     this._opacity.bind(1);
     linear.cover(this._opacities, 0, lines);
@@ -349,42 +369,11 @@ ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i} * vec4(greaterThanEqual(y${
     if (Math.max(list.width, height) > gpu.maxSide) throw new TooLarge(`${list.count} Gaussians`);
     gpu.free(this._list);
     this._list = gpu.plain(list.width, height, list.entries);
-    if (this._means?.width !== list.width || this._means.height !== height) {
-      gpu.free(this._means, this._changes);
-      this._means = gpu.field(list.width, height, 1);
-      this._changes = this._local && gpu.field(list.width, height, this._local.outputBlocks);
-    }
     this._listed = list;
-    this._current = false;
   }
 
-  /** Means before the local deformation. @param {Field | null} residual */
-  _runMeans(residual) {
-    if (!this._means || !this._list || !this._listed.rows) return;
-    const gpu = this._gpu;
-    const program = gpu.program(
-      targets(1) +
-        anchorSource(residual) +
-        entrySource(this._width) +
-        `void main() {
-  uint entry = texelFetch(list, ivec2(gl_FragCoord.xy), 0).r;
-  out0 = vec4(0);
-  if (entry == ${NO_ENTRY}u) return;
-  ivec2 p = anchorOf(entry);
-  vec3 offset = anchorBlock(p, ${this._offsetBlock} + int(entry >> ${ANCHOR_BITS})).xyz;
-  out0 = vec4(anchorBlock(p, 0).xyz + offset * exp(anchorBlock(p, 1).xyz), 0);
-}`,
-    );
-    gpu.use(program, { ...this._anchorTextures(residual), list: this._list });
-    gpu.cover(this._means, 0, 1, 0, this._listed.rows);
-  }
-
-  /**
-   * @param {Field | null} residual @param {Field | null} changes of the local deformation
-   * @param {number[]} eye @param {Splats | null} into
-   * @returns {Splats}
-   */
-  _runShapes(residual, changes, eye, into) {
+  /** @param {number[]} eye @param {Splats | null} into @returns {Splats} */
+  _runShapes(eye, into) {
     const gpu = this._gpu;
     const { gl } = gpu;
     const { width, starts, rows } = this._listed;
@@ -397,20 +386,11 @@ ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i} * vec4(greaterThanEqual(y${
     const blind = !this._opacity.views && !this._covariance.views;
     const kept = blind && into?.field === field && into.shapes === this._shape;
     const splats = { field, texels: rows * width, shapes: this._shape };
-    if (!rows || !this._means || !this._list || !this._codes) return splats;
+    if (!rows || !this._list || !this._codes) return splats;
     const shapes = this._shapes;
-    const program = gpu.program(kept ? this._colorSource(residual, changes) : this._shapeSource(residual, changes));
-    /** @type {Record<string, Field | WebGLTexture>} */
-    const textures = {
-      ...this._anchorTextures(residual),
-      before: this._before,
-      list: this._list,
-      means: this._means,
-      opacities: this._opacities,
-      codes: this._codes,
-    };
-    if (changes) textures.changes = changes;
-    gpu.use(program, textures);
+    const program = gpu.program(kept ? this._colorSource() : this._shapeSource());
+    const { _before: before, _list: list, _opacities: opacities, _codes: codes } = this;
+    gpu.use(program, { ...this._anchorTextures(), before, list, opacities, codes });
     gl.uniform3fv(program.uniform("eye"), eye);
     this._covariance.bind(1);
     this._color.bind(2);
@@ -424,12 +404,12 @@ ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i} * vec4(greaterThanEqual(y${
     return splats;
   }
 
-  /** Shapes and colours of listed Gaussians. @param {Field | null} residual @param {Field | null} changes */
-  _shapeSource(residual, changes) {
+  /** The listed Gaussians. */
+  _shapeSource() {
     const K = this._covariance.blocks;
-    return `${targets(SPLAT_BLOCKS) + this._listedSource(residual, changes) + this._covariance.declare(1)}
+    return `${targets(SPLAT_BLOCKS) + this._listedSource() + this._covariance.declare(1)}
 layout(std140) uniform U3 { vec4 b3[2]; mat4 w3[${2 * K}]; };
-uniform sampler2DArray means, opacities;
+uniform sampler2DArray opacities;
 uniform sampler2D codes;
 void main() {
   ivec2 g = ivec2(gl_FragCoord.xy);
@@ -440,52 +420,43 @@ void main() {
   ivec2 p = anchorOf(entry);
   int slot = int(entry >> ${ANCHOR_BITS});
   float opacity = texelFetch(opacities, ivec3(p, slot >> 2), 0)[slot & 3];
-  vec3 mean = texelFetch(means, ivec3(g, 0), 0).xyz;
+  vec3 offset = anchorBlock(p, ${this._offsetBlock} + slot).xyz;
+  vec3 mean = anchorBlock(p, 0).xyz + offset * exp(anchorBlock(p, 1).xyz);
   out0 = vec4(mean, 0);
   if (!(opacity > 0.)) return;
   vec3 d = directionTo(p);
 ${this._covariance.compute(1, "x")}
   vec4 v = b3[0], q = b3[1];
 ${repeat(K, (k) => `v += w3[${k}] * x${k}; q += w3[${K + k}] * x${k};`)}
-  vec4 g0 = vec4(mean, opacity);
-  vec4 g1 = vec4(exp(anchorBlock(p, 2).xyz) / (1. + exp(-v.xyz)), 0);
-  vec4 g2 = unit(q);
-  vec4 g3 = colorOf(p, d);
-${changes ? localSource([0, 1, 2, 3]) : ""}
   float gate = texelFetch(codes, p, 0).r;
-  out0 = vec4(g0.xyz, g0.w * gate);
-  out1 = vec4(g1.xyz * gate, 0);
-  out2 = g2;
-  out3 = g3;
+  float n = length(q);
+  out0 = vec4(mean, opacity * gate);
+  out1 = vec4(exp(anchorBlock(p, 2).xyz) / (1. + exp(-v.xyz)) * gate, 0);
+  out2 = n > 0. ? q / n : vec4(1, 0, 0, 0);
+  out3 = colorOf(p, d);
 }`;
   }
 
-  /** Colours alone. @param {Field | null} residual @param {Field | null} changes */
-  _colorSource(residual, changes) {
-    return `${targets(1) + this._listedSource(residual, changes)}
+  /** Their colours alone. */
+  _colorSource() {
+    return `${targets(1) + this._listedSource()}
 void main() {
   ivec2 g = ivec2(gl_FragCoord.xy);
   uint entry = texelFetch(list, g, 0).r;
   out0 = vec4(0);
   if (entry == ${NO_ENTRY}u) return;
   ivec2 p = anchorOf(entry);
-  vec4 g3 = colorOf(p, directionTo(p));
-${changes ? localSource([COLOR_BLOCK]) : ""}
-  out0 = g3;
+  out0 = colorOf(p, directionTo(p));
 }`;
   }
 
-  /** What both take. @param {Field | null} residual @param {Field | null} changes */
-  _listedSource(residual, changes) {
+  /** What both take. */
+  _listedSource() {
     const L = this._color.blocks;
-    return `${anchorSource(residual) + entrySource(this._width) + this._color.declare(2)}
+    return `${this._anchorSource() + entrySource(this._width) + this._color.declare(2)}
 layout(std140) uniform U4 { vec4 b4; mat4 w4[${L}]; };
-uniform sampler2DArray before${changes ? ", changes" : ""};
+uniform sampler2DArray before;
 uniform vec3 eye;
-vec4 unit(vec4 q) {
-  float n = length(q);
-  return n > 0. ? q / n : vec4(1, 0, 0, 0);
-}
 vec3 directionTo(ivec2 p) {
   vec3 d = anchorBlock(p, 0).xyz - eye;
   return d / max(length(d), 1e-30);
@@ -500,12 +471,10 @@ ${repeat(L, (k) => `w += w4[${k}] * c${k};`)}
   }
 
   free() {
-    this._gpu.free(this._anchors, this._before, this._opacities, this._residual, this._codes);
-    this._gpu.free(this._list, this._means, this._changes, this._rest);
+    this._gpu.free(this._anchors, this._before, this._opacities, this._codes, this._list);
+    this._freeMotion();
     for (const scaffold of this._scaffolds) scaffold.free();
     this._gpu.gl.deleteBuffer(this._shapes.buffer);
-    this._global?.free();
-    this._local?.free();
     this._first.free();
     this._opacityLast.free();
   }
@@ -519,28 +488,6 @@ function rowsOf({ weight, bias, inputs }, first, count) {
     inputs,
     outputs: count,
   };
-}
-
-/** Source that adds the changes of the local deformation to blocks of a Gaussian's record, and brings each sum into its
- * range. @param {number[]} of the blocks */
-function localSource(of) {
-  const blocks = of.map((b) => `g${b} += texelFetch(changes, ivec3(g, ${b}), 0);\n`).join("");
-  const ranges = LOCAL_HEADS.filter(({ at }) => of.includes(at >> 2)).map(({ at, outputs, then }) => {
-    const part = `g${at >> 2}.${"xyzw".slice(at & 3, (at & 3) + outputs)}`;
-    if (then === "unit") return `${part} = unit(${part});`;
-    if (then === "positive") return `${part} = max(${part}, 0.);`;
-    return then === "clip" ? `${part} = clamp(${part}, 0., 1.);` : "";
-  });
-  return blocks + ranges.join("\n");
-}
-
-/** Source that reads anchors' attributes, deformed if there is a residual. @param {Field | null} residual */
-function anchorSource(residual) {
-  return `uniform sampler2DArray anchors${residual ? ", residual" : ""};
-vec4 anchorBlock(ivec2 p, int block) {
-  return texelFetch(anchors, ivec3(p, block), 0)${residual ? " + texelFetch(residual, ivec3(p, block), 0)" : ""};
-}
-`;
 }
 
 /** Source that reads the list of kept Gaussians. @param {number} width of the anchors' textures */

@@ -1,18 +1,14 @@
-// A deformation on the GPU: HexPlane, trunk and heads at points that lie in a texture.
+// A deformation on the GPU: planes, trunk and heads at points that lie in a texture.
 
-import { columnsOf } from "../decode/heads.js";
+import { anchorColumns, columnsOf, headsOf } from "../decode/heads.js";
 import { blocksOf, Linear, repeat, targets, TooLarge } from "./layers.js";
 import { deformationUnit, sliceAt, SPATIAL, TEMPORAL } from "./level.js";
-/** @import { Head } from "../decode/heads.js" */
 /** @import { Deformation, Network, Scene } from "../decode/scene.js" */
 /** @import { Field, Gpu } from "./gl.js" */
 
 export class FieldPass {
-  /**
-   * @param {Gpu} gpu @param {Deformation} deformation @param {Scene} scene
-   * @param {Head[]} heads @param {number} columns of the record to which they add
-   */
-  constructor(gpu, deformation, scene, heads, columns) {
+  /** @param {Gpu} gpu @param {Deformation} deformation @param {Scene} scene */
+  constructor(gpu, deformation, scene) {
     this._gpu = gpu;
     this._deformation = deformation;
     this._box = scene.info.box;
@@ -22,7 +18,7 @@ export class FieldPass {
     const { trunk } = deformation.networks;
     // a scale's channels are padded to whole blocks; so are the columns that take them
     const first = padInputs(trunk[0], channels, this._scales);
-    const layers = [first, ...trunk.slice(1), joinHeads(deformation.networks, heads, deformationUnit(scene), columns)];
+    const layers = [first, ...trunk.slice(1), joinHeads(deformation.networks, scene)];
     this._linears = layers.map((layer) => new Linear(gpu, layer));
     this._scratchBlocks = Math.max(
       this._scales * this._channelBlocks,
@@ -226,14 +222,15 @@ function padInputs(layer, channels, scales) {
 }
 
 /**
- * All heads as one layer, whose outputs are the columns of a record.
+ * All heads as one layer, whose outputs are the columns of an anchor's record.
  *
- * @param {Record<string, Network>} networks @param {Head[]} heads @param {number} unit of lengths, scene units
- * @param {number} outputs
+ * @param {Record<string, Network>} networks @param {Scene} scene
  * @returns {Network[number]}
  */
-function joinHeads(networks, heads, unit, outputs) {
-  const present = heads.filter(({ name }) => networks[name]);
+function joinHeads(networks, scene) {
+  const present = headsOf(scene.widths).filter(({ name }) => networks[name]);
+  const outputs = anchorColumns(scene.widths);
+  const unit = deformationUnit(scene);
   const { inputs } = networks[present[0].name][0];
   const weight = new Float32Array(inputs * outputs);
   const bias = new Float32Array(outputs);

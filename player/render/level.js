@@ -1,15 +1,21 @@
 // The parts of a scene that a level shows (clause 13.4), in the forms that both evaluators take.
 
-import { columnsOf, globalHeads } from "../decode/heads.js";
+import { columnsOf, headsOf } from "../decode/heads.js";
 /** @import { Deformation, Plane, PlaneName, Scene } from "../decode/scene.js" */
 
 /**
  * One level of a scene: the highest layer that is there and at most the requested one. It has the first `rows` anchors.
- * codes: their gates times 255.
+ * codes: their gates times 255. motion: what moves them, the planes of all layers up to this one with the networks and
+ * the key instant of the highest that has a deformation; null if none has one, else the same object at every call.
  *
- * @typedef {{number: number, rows: number, codes: Uint8Array, global: Deformation | null, local: Deformation | null}}
- * Level
+ * @typedef {{number: number, rows: number, codes: Uint8Array, motion: Deformation | null}} Level
  */
+
+/** Of scenes with two deformations, that of layer 2. @type {WeakMap<Scene, Deformation>} */
+const motions = new WeakMap();
+
+/** Columns of a Gaussian's record: mean and opacity; scale, 0; quaternion w x y z; colour, 0. In scene units. */
+export const GAUSSIAN_COLUMNS = 16;
 
 /** Lower opacities never reach a pixel: a picture has 255 steps. */
 export const MIN_OPACITY = 1 / 255;
@@ -18,20 +24,21 @@ export const MIN_OPACITY = 1 / 255;
 export function levelOf(scene, level) {
   const i = scene.layers.filter((layer) => layer <= level).length - 1;
   const number = scene.layers[i];
-  return {
-    number,
-    rows: scene.rows[i],
-    codes: scene.mask[i],
-    global: number >= 1 ? scene.globalDeformation : null,
-    local: number >= 2 ? scene.localDeformation : null,
-  };
+  return { number, rows: scene.rows[i], codes: scene.mask[i], motion: motionOf(scene, number) };
 }
 
-/** The widths of a scene's arrays. @param {Scene} scene */
-export const widthsOf = ({ anchor, widths }) => ({ anchors: anchor.length / 3, ...widths });
+/** @param {Scene} scene @param {number} level */
+function motionOf(scene, level) {
+  const lower = level >= 1 ? scene.globalDeformation : null;
+  const upper = level >= 2 ? scene.localDeformation : null;
+  if (!lower || !upper) return upper ?? lower;
+  let motion = motions.get(scene);
+  if (!motion) motions.set(scene, (motion = { ...upper, planes: [...lower.planes, ...upper.planes] }));
+  return motion;
+}
 
 /**
- * The unit of the heads position, mean and scale: a quarter of the longest side of the box, scene units.
+ * The unit of the head position: a quarter of the longest side of the box, scene units.
  *
  * @param {Scene} scene
  */
@@ -47,9 +54,9 @@ export function deformationUnit({ info: { box } }) {
  */
 export function eachAttribute(scene, put) {
   const sources = { position: scene.anchor, feature: scene.feature, offset: scene.offset, scaling: scene.scalingLog };
-  for (const head of globalHeads(widthsOf(scene))) {
+  for (const head of headsOf(scene.widths)) {
     const values = sources[/** @type {keyof typeof sources} */ (head.name)];
-    if (values) put(values, head.outputs, columnsOf(head));
+    put(values, head.outputs, columnsOf(head));
   }
 }
 
@@ -102,9 +109,8 @@ const EYE_TOLERANCE = 1e-5;
  * @returns {State} with a time only where something moves
  */
 export function stateOf(scene, level, seconds, eye) {
-  const shown = levelOf(scene, level);
-  const still = !shown.global && !shown.local;
-  return { scene, level: shown.number, t: still ? 0 : normalisedTime(scene.info, seconds), eye };
+  const { number, motion } = levelOf(scene, level);
+  return { scene, level: number, t: motion ? normalisedTime(scene.info, seconds) : 0, eye };
 }
 
 /** @param {State} a @param {State} b */
