@@ -75,7 +75,13 @@ def _network(rng: np.random.Generator, *widths: int, scale: float) -> Network:
 
 
 def _deformation(
-    rng: np.random.Generator, heads: dict[str, int], channels: int, scales: int, trunk: tuple[int, ...], key: int | None
+    rng: np.random.Generator,
+    heads: dict[str, int],
+    channels: int,
+    scales: int,
+    trunk: tuple[int, ...],
+    key: int | None,
+    below: int,
 ) -> Deformation | None:
     if not heads:
         return None
@@ -87,7 +93,7 @@ def _deformation(
         }
         for s in range(scales)
     )
-    networks = {"trunk": _network(rng, scales * channels, *trunk, scale=0.3)}
+    networks = {"trunk": _network(rng, (below + scales) * channels, *trunk, scale=0.3)}
     networks |= {name: _network(rng, trunk[-1], width, scale=0.05) for name, width in heads.items()}
     return Deformation(planes, networks, key)
 
@@ -103,7 +109,7 @@ def lively_scene(
     heads: tuple[dict[str, int], dict[str, int]] | None = None,
     layers: tuple[int, ...] = (0, 1, 2),
     widths: Widths = scene_module.DEFAULT_WIDTHS,
-    key: int | None = None,
+    keys: tuple[int | None, int | None] = (None, None),
 ) -> Scene:
     """Layers that differ, some thousand Gaussians of all shapes in front of the scene's camera."""
     rng = np.random.default_rng(seed)
@@ -114,9 +120,10 @@ def lively_scene(
     K = np.array([[80, 0, WIDTH / 2 + 3], [0, 84, HEIGHT / 2 - 2], [0, 0, 1]], np.float32)
     codes = np.sort(rng.choice(np.array([0, 60, 180, 255], np.uint8), (anchors, 3)), axis=1)
     codes[: anchors // 2] = [140, 200, 255]
-    named = heads or (widths.global_heads, scene_module.LOCAL_HEADS)
-    keys = (key, None)
-    fields = [_deformation(rng, names, channels, scales, trunk, k) for names, k in zip(named, keys, strict=True)]
+    fields: list[Deformation | None] = []
+    for layer, names, key in zip((1, 2), heads or (widths.heads, widths.heads), keys, strict=True):
+        below = sum(len(field.planes) for field in fields if field)
+        fields.append(_deformation(rng, names if layer in layers else {}, channels, scales, trunk, key, below))
     return Scene(
         info=SceneInfo(
             voxel_size=float(np.float32(1 / 40)),
@@ -141,8 +148,8 @@ def lively_scene(
             name: _network(rng, widths.inputs[name], *hidden, width, scale=0.4)
             for name, width in widths.networks.items()
         },
-        global_deformation=fields[0] if 1 in layers else None,
-        local_deformation=fields[1] if 2 in layers else None,
+        global_deformation=fields[0],
+        local_deformation=fields[1],
     )
 
 
@@ -242,12 +249,14 @@ SHAPES: dict[str, dict[str, Any]] = {
     "small": dict(hidden=(5,), channels=2, scales=1, trunk=(3,)),
     "odd widths": dict(hidden=(7,), channels=5, scales=3, trunk=(6, 21)),
     "many channels": dict(
-        hidden=(40,), channels=33, scales=1, heads=({"position": 3, "scaling": 6}, {"mean": 3, "opacity": 1})
+        hidden=(40,), channels=33, scales=1, heads=({"position": 3, "scaling": 6}, {"position": 3, "offset": 30})
     ),
-    "global only": dict(hidden=(4,), channels=3, heads=({"feature": 32}, {})),
-    "no layer 1": dict(layers=(0, 2), heads=({}, {"quat": 4, "color": 3})),
+    "layer 2 does not move": dict(hidden=(4,), channels=3, heads=({"feature": 32}, {})),
+    "layer 1 does not move": dict(channels=3, heads=({}, {"scaling": 6}), keys=(None, 500)),
+    "no layer 1": dict(layers=(0, 2), heads=({}, {"feature": 32, "offset": 30})),
     "16 and 4": dict(widths=Widths(16, 4)),
-    "key instant": dict(key=26_214),
+    "key instants": dict(keys=(26_214, 40_000)),
+    "key instant of layer 1": dict(keys=(26_214, None)),
     "most": dict(widths=Widths(64, 16), hidden=(7,)),
     "least": dict(widths=Widths(1, 1), anchors=700, seed=6),
     "views of color": dict(widths=Widths(viewing=("color",))),
@@ -274,7 +283,7 @@ def test_both_evaluators_agree(harness, folder, server, options):
 @pytest.fixture(scope="module")
 def narrow() -> bytes:
     """Features of 16 numbers, four Gaussians an anchor, and a key instant."""
-    return encode(lively_scene(700, widths=Widths(16, 4), key=20_000), layers=2, effort=1)
+    return encode(lively_scene(700, widths=Widths(16, 4), keys=(20_000, 20_000)), layers=2, effort=1)
 
 
 @pytest.mark.parametrize("evaluator", ["gpu", "cpu"])
