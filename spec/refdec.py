@@ -291,8 +291,7 @@ def network_outputs(number, header):
     return (
         {0: slots, 1: 7 * slots, 2: 3 * slots},
         {0: None, 1: 3, 2: feature, 3: 3 * slots, 4: 6},
-        {0: None, 1: 3, 2: 3, 3: 4, 4: 1, 5: 3},
-    )[number]
+    )[number > 0]
 
 
 # 5.3 Camera map: "fx and fy MUST be positive" "All four are required."
@@ -386,8 +385,9 @@ class Layer:
     """What one slice of a layer says: symbols {name: [int]} in the order of clause 12.4, and what dequantisation
     needs."""
 
-    def __init__(self, number, later, rows_before, header, past):
+    def __init__(self, number, later, rows_before, below, header, past):
         self.number, self.later, self.rows_before, self.header, self.past = number, later, rows_before, header, past
+        self.below = below  # the scales of the layers before it
         self.rises = 0 if later else rows_before
         self.slices = [self]  # those of its layer, if it is the first
         self.symbols = {}
@@ -395,8 +395,8 @@ class Layer:
 
 
 # 6.1 Layout: "The lengths of the sections MUST sum to the rest exactly."
-def read_layer(payload, number, later, before, header, past):
-    layer = Layer(number, later, before[0], header, past)
+def read_layer(payload, number, later, before, below, header, past):
+    layer = Layer(number, later, before[0], below, header, past)
     reader = Reader(payload)
     parameters = reader.take(limited(reader.number("<I"), 4096, "the parameters' length"))
     read_parameters(layer, unpack(parameters))
@@ -407,16 +407,15 @@ def read_layer(payload, number, later, before, header, past):
     return layer
 
 
-# 6.2 Layer parameters: "In its first slice, layer 0 has keys 3 and 5 and not 4. Layers 1 and 2 have keys 3, 4 and 5 if
-# the layer has a deformation, else none of them. Only a deformation of layer 1 may have key 6. No later slice has any
-# of the four."
+# 6.2 Layer parameters: "In its first slice, layer 0 has keys 3 and 5 and neither 4 nor 6. Layers 1 and 2 have keys 3, 4
+# and 5, and MAY have key 6, if the layer has a deformation, else none of them. No later slice has any of the four."
 def read_parameters(layer, value):
     parameters = fields(value, range(1, 7), (1, 2), "layer parameters")
     layer.rows = limited(parameters[1], (1 << 24) - layer.rows_before, "own rows")
     sections = fields(parameters[2], range(6), (), "sections")
     layer.sections = {s: limited(sections[s], (1 << 31) - 1, "a section", 1) for s in sections if s < 64}
     if 6 in parameters:
-        need(layer.number == 1 and 5 in parameters and not layer.later, f"layer {layer.number} with a key instant")
+        need(layer.number and 5 in parameters and not layer.later, f"layer {layer.number} with a key instant")
         limited(parameters[6], 65535, "the key instant")
     found = {3, 4, 5} & set(parameters)
     wanted = [set()] if layer.later else [{3, 4, 5}, set()] if layer.number else [{3, 5}]
@@ -425,7 +424,7 @@ def read_parameters(layer, value):
     layer.deformed = bool(layer.networks) and layer.number > 0
     steps = reals(parameters[3], "steps", 1 + layer.deformed) if layer.networks else []
     layer.steps = [a_step(step) for step in steps]
-    layer.scales = read_scales(parameters[4]) if layer.deformed else []
+    layer.scales = read_scales(parameters[4], layer.below) if layer.deformed else []
     check_bounded(layer)
 
 
@@ -435,14 +434,14 @@ def check_bounded(layer):
     need(classes <= set(layer.header[13]), "no error bound for a deformation")
 
 
-# 6.3 Planes and networks: "channels 1..256, the same in every scale, resolutions 1..4096 along x, y, z, t, and one
-# predictor per plane (11.3)."
-def read_scales(rows):
+# 6.3 Planes and networks: "channels 1..256, the same in every scale of the file, resolutions 1..4096 along x, y, z, t,
+# and one predictor per plane (11.3)."
+def read_scales(rows, below):
     limited(len(a_list(rows, "scales")), 8, "the number of scales", 1)
     for row in rows:
         a_list(row, "a scale", 11)
         limited(row[0], 256, "plane channels", 1)
-        need(row[0] == rows[0][0], "scales with different channels")
+        need(row[0] == (below or rows)[0][0], "scales with different channels")
         for side in row[1:5]:
             limited(side, 4096, "a plane's side", 1)
         for predictor in row[5:]:
@@ -482,11 +481,12 @@ def plane_shapes(layer):
 
 
 # 6.3 Planes and networks: "Linear layer i is a weight [o_i, o_{i−1}] and a bias [o_i]; o_0 is the network's input
-# width." "The input width is D in layer 0, but D + 3 (feature D, view direction 3) for network i if bit i of V is set"
+# width." "The input width is D in layer 0, but D + 3 (feature D, view direction 3) for network i if bit i of V is set. A
+# trunk reads the scales of its own layer behind those of the layers before it in the file"
 def weight_shapes(layer):
     shapes, (feature, _, viewing) = [], layer.header[15]
     for key, widths in layer.networks.items():
-        width = sum(s[0] for s in layer.scales) if layer.number else feature + 3 * (viewing >> key & 1)
+        width = sum(s[0] for s in layer.below + layer.scales) if layer.number else feature + 3 * (viewing >> key & 1)
         if layer.number and key:
             width = layer.networks[0][-1]
         for i, outputs in enumerate(widths):
@@ -1359,7 +1359,8 @@ def decode(data, max_layer=None):
             later = bool(layers) and layers[-1].number == kind
             number, following = len(layers[-1].slices) if later else 0, [k for k, _ in header[1][i + 1 :] if k < 3]
             check_slice(flags, number, kind, following)
-            read = read_layer(payload, kind, later, declared, header, layers[-1].past if later else Past())
+            below = [scale for own in layers for scale in own.scales]
+            read = read_layer(payload, kind, later, declared, below, header, layers[-1].past if later else Past())
             if later:
                 add_slice(layers[-1], read)
             else:

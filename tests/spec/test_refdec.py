@@ -84,7 +84,7 @@ def test_tensors_by_name_and_prefixes():
     for name in ("anchor", "feature", "scaling_log", "offset"):
         assert layers[1].tensors[name] == getattr(scene, name)[own].ravel().tolist(), name
     assert layers[1].tensors["planes.0.yt"] == scene.global_deformation.planes[0]["yt"].ravel().tolist()
-    assert layers[2].tensors["network.3.bias.0"] == scene.local_deformation.networks["quat"][0][1].tolist()
+    assert layers[2].tensors["network.3.bias.0"] == scene.local_deformation.networks["offset"][0][1].tolist()
     assert layers[0].symbols["anchor"] == scene.anchor_q[: scene.rows[0]].ravel().tolist()
     prefix = refdec.decode(data, max_layer=1)
     assert [p.tensors for p in prefix] == [p.tensors for p in layers[:2]] and len(prefix) == 2

@@ -183,7 +183,7 @@ def _histogram(rng: random.Random, window: Window) -> Hist:
 
 
 class Choices:
-    """What holds for a whole file: widths, centres, the voxels that are taken, the codes of the rows so far."""
+    """What holds for a whole file: widths, centres, the planes' channels, the scales, voxels and codes so far."""
 
     def __init__(self, rng: random.Random):
         self.rng = rng
@@ -193,6 +193,8 @@ class Choices:
         self.mode = LZMA if rng.random() < 0.1 else blocks.ANS
         self.graded = rng.random() < 0.4
         self.centres = symbols(rng, self.widths.channels).tolist() if self.graded else None
+        self.channels = rng.choices((1, 2, 3, 5, 9, 17), (6, 6, 6, 3, 1, 1))[0]  # of all planes
+        self.scales = list[Scale]()  # of the layers so far
         self.taken = set[tuple[int, int, int]]()
         self.codes = np.zeros(0, np.int64)
 
@@ -312,12 +314,14 @@ def _slice(choices: Choices, number: int, first: bool) -> Layer:
         return make_layer(number, cells, networks={}, **fields)
     high = rng.choice((0, 2, 255))
     rises = [_near(rng, 0, min(high, 255 - int(code))) for code in choices.codes]
-    scales = _scales(rng) if number and rng.random() < 0.6 else []
-    networks = _networks(rng, number, choices.widths, scales) if scales or not number else None
+    scales = _scales(rng, choices.channels) if number and rng.random() < 0.6 else []
+    choices.scales += scales
+    read = choices.channels * len(choices.scales)
+    networks = _networks(rng, number, choices.widths, read) if scales or not number else None
     layer = make_layer(number, cells, before=len(rises), rises=rises, scales=scales, networks=networks, **fields)
     if layer.weights:
         layer.meta[3] = [_step(rng, *own) for own in ((layer.planes, layer.weights) if number else (layer.weights,))]
-    if number == 1 and scales and rng.random() < 0.5:
+    if scales and rng.random() < 0.5:
         layer.meta[6] = _near(rng, 0, 65535)
     return layer if choices.mode == LZMA else layer.with_sections(_tensors(rng, layer))
 
@@ -335,8 +339,8 @@ def _tensors(rng: random.Random, layer: Layer) -> dict[int, bytes | None]:
     return found | {PLANE: b"\1" + varint(*counts, *map(len, payloads[:-1])) + b"".join(payloads)}
 
 
-def _scales(rng: random.Random) -> list[Scale]:
-    channels, made = rng.choices((1, 2, 3, 5, 9, 17), (6, 6, 6, 3, 1, 1))[0], list[Scale]()
+def _scales(rng: random.Random, channels: int) -> list[Scale]:
+    made = list[Scale]()
     for _ in range(rng.choices((1, 2, 8), (9, 3, 0.3))[0]):
         sides = [rng.choices((1, 2, 3, 5, 40), (8, 8, 8, 4, 1))[0] for _ in range(4)]
         samples = {n: symbols(rng, channels, sides[b], sides[a], most=rng.choice((M, 3))) for n, a, b in PLANES}
@@ -350,16 +354,17 @@ def _scales(rng: random.Random) -> list[Scale]:
     return made
 
 
-def _networks(rng: random.Random, number: int, widths: Widths, scales: Sequence[Scale]) -> dict[int, list[np.ndarray]]:
+def _networks(rng: random.Random, number: int, widths: Widths, read: int) -> dict[int, list[np.ndarray]]:
+    """read: features of the planes that a trunk reads."""
     d, g = widths.feature, widths.slots
-    outputs = ({0: g, 1: 7 * g, 2: 3 * g}, {1: 3, 2: d, 3: 3 * g, 4: 6}, {1: 3, 2: 3, 3: 4, 4: 1, 5: 3})[number]
+    outputs = {1: 3, 2: d, 3: 3 * g, 4: 6} if number else {0: g, 1: 7 * g, 2: 3 * g}
     inputs, made = [*widths.inputs.values()], dict[int, list[np.ndarray]]()
     if number:
         outputs = {0: rng.choice((1, 2, 5))} | {
             i: outputs[i] for i in sorted(rng.sample(sorted(outputs), rng.randint(1, 4)))
         }
     for key, last in outputs.items():
-        wide, made[key] = inputs[key] if number == 0 else sum(s.channels for s in scales), []
+        wide, made[key] = read if number else inputs[key], []
         if number and key:
             wide = made[0][-1].size
         for out in [*(rng.choice((1, 2, 4)) for _ in range(rng.choices((0, 1, 2, 15), (9, 5, 2, 0.5))[0])), last]:

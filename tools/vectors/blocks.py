@@ -477,6 +477,7 @@ def make_layer(
     cells: Sequence[Sequence[int]] = ((-1, 0, 2),),
     *,
     before: int = 0,
+    below: int = 0,
     rises: Sequence[int] | None = None,
     codes: Sequence[int] | None = None,
     attributes: np.ndarray | None = None,
@@ -487,7 +488,8 @@ def make_layer(
     widths: Widths = DEFAULT_WIDTHS,
     classes: Sequence[int] | None = None,
 ) -> Layer:
-    """A layer of `cells` (in Morton order) after `before` earlier rows.
+    """A layer of `cells` (in Morton order) after `before` earlier rows. below: features of the planes of the layer
+    below.
 
     Defaults: every rise 0, every code 77, attributes all 2; in layer 0 the networks without hidden layers, elsewhere a
     trunk and the head 1 if there are `scales`. networks: outputs by id, or their weights and biases.
@@ -499,7 +501,8 @@ def make_layer(
     if not any(isinstance(x, np.ndarray) for own in networks.values() for x in own):
         inputs = dict(enumerate(widths.inputs.values()))
         if number:
-            inputs = {i: networks[0][-1] if i else sum(s.channels for s in scales) for i in networks}  # type: ignore[misc]
+            read = below + sum(s.channels for s in scales)
+            inputs = {i: networks[0][-1] if i else read for i in networks}  # type: ignore[misc]
         networks = constant_networks(networks, inputs)  # type: ignore[arg-type]
     planes = [plane for scale in scales for plane in scale.planes()]
     predictors = [p for s in scales for p in s.predictors]

@@ -246,9 +246,8 @@ def three_layers(**fields: Any) -> File:
     first = make_layer(0, line(3), codes=[3, 77, 200], attributes=pattern(68, 3))
     second = make_layer(1, line(2, z=5), before=3, rises=[0, 1, 5], codes=[9, 255], scales=[Scale()])
     k, rises = pattern(68, 1, seed=4), [252, 0, 50, 3, 0]
-    return make_file(
-        first, second, make_layer(2, line(1, z=9), before=5, rises=rises, scales=[Scale()], attributes=k), **fields
-    )
+    third = make_layer(2, line(1, z=9), before=5, below=2, rises=rises, scales=[Scale()], attributes=k)
+    return make_file(first, second, third, **fields)
 
 
 def rows(count: int = 3, **fields: Any) -> File:
