@@ -25,7 +25,7 @@ from pd4dgs_codec.format.planes import PREDICTORS, PlaneShape, read_planes, rest
 from pd4dgs_codec.format.planes import choose_predictor as choose_predictor
 from pd4dgs_codec.format.planes import sample_planes as sample_planes
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, dequantise, expect, expect_array, is_step, magnitude, quantise
-from pd4dgs_codec.format.registry import LayerKind, Section
+from pd4dgs_codec.format.registry import LAYER_KINDS, LayerKind, Section
 from pd4dgs_codec.scene import (
     INSTANTS,
     LENGTH_HEADS,
@@ -105,6 +105,7 @@ def check_tensors(tensors: Deformation, kind: LayerKind, widths: Widths, below: 
     missing = [name for name in required if name not in tensors.networks]
     expect(not missing, f"{own} networks {missing} are missing")
     expect(bool(tensors.planes) == bool(kind.layer), f"{own}: planes of {len(tensors.planes)} scales")
+    expect(not below or len(below.networks) > 1, f"{LAYER_KINDS[1].name} has no head, expected one below {own}")
     channels_below = len(below.planes[0]["xy"]) if below else 0
     for s, planes in enumerate(tensors.planes):
         expect(set(planes) == {p for p, _, _ in PLANES}, f"{own} scale {s}: planes {sorted(planes)}, expected six")

@@ -73,11 +73,12 @@ def test_pictures_are_those_of_the_torch_model(changes):
     assert seen > 2, "the pictures show something"
 
 
-def test_layer_1_changes_nothing_at_its_key_instant():
+@pytest.mark.parametrize("level", [1, 2])
+def test_motion_changes_nothing_at_its_key_instant(level):
     scene = _scene(**KEYED)
     rows = (len(scene.anchor_q),) * 3  # all anchors in every layer
     scene = replace(scene, rows=rows, mask=tuple(np.full(n, 255, np.uint8) for n in rows))
-    still, moving = Player(scene.prefix(0)), Player(scene.prefix(1))
+    still, moving = Player(scene.prefix(0)), Player(scene.prefix(level))
     at = instant(KEYED["key"])
     np.testing.assert_allclose(moving.picture(_camera(1), at), still.picture(_camera(1), at), atol=1e-5)
     assert np.abs(moving.picture(_camera(1), 0.0) - still.picture(_camera(1), 0.0)).max() > 0.05
@@ -107,13 +108,13 @@ class Untouchable:
 
 
 def test_where_shapes_do_not_take_the_direction_another_eye_evaluates_colours_alone():
-    scene = _scene(widths=Widths(viewing=("color",)), heads=(None, {"mean": 3, "opacity": 1}))
+    scene = _scene(widths=Widths(viewing=("color",)), heads=(None, {"position": 3, "scaling": 6}))
     mild = tuple((weight / 64, bias / 64) for weight, bias in scene.networks["color"])  # no sigmoid is at its end
     scene = replace(scene, networks={**scene.networks, "color": mild})
     player, eyes = Player(scene), np.array([[0, 0, -4], [3, 1, 2]], np.float32)
     for _ in range(2):  # from the second view on
         first = player.gaussians_of_eyes(player.active, 0.4, eyes[:1])
-    player._decoders = player._global = player._local = Untouchable()
+    player._decoders = player._field = Untouchable()
     second = player.gaussians_of_eyes(player.active, 0.4, eyes[1:])
     both = Player(scene).gaussians_of_eyes(player.active, 0.4, eyes)
     for name, values in vars(both).items():
@@ -130,12 +131,12 @@ def test_scenes_without_gaussians_in_view_show_the_background():
     np.testing.assert_array_equal(picture, np.broadcast_to(np.float32(scene.info.background), picture.shape))
 
 
-def test_colours_that_overflow_hide_their_gaussian():
+def test_features_that_overflow_hide_their_gaussians():
     scene = _scene()
     field = scene.local_deformation
     heads = dict(field.networks)
-    ((weight, bias),) = heads["color"]
-    heads["color"] = ((weight, np.full_like(bias, np.inf)),)
+    ((weight, bias),) = heads["feature"]
+    heads["feature"] = ((weight, np.full_like(bias, np.inf)),)
     scene = replace(scene, local_deformation=Deformation(field.planes, heads))
     assert np.isfinite(Player(scene).picture(_camera(0), 0.5)).all()
 

@@ -137,7 +137,7 @@ MESSAGES = {
     "payload-byte-left": r"sections of \d+ bytes, expected \d+",
     "layer-1-steps-alone": "key 3 is there, expected no such key",
     "layer-1-scales-missing": "key 4 is missing",
-    "scales-channels-differ": "1 channels, expected 2 as in scale 0",
+    "scales-channels-differ": "1 channels, expected 2 as in the first scale",
     "networks-entry-empty": "an empty network entry, expected an id and widths",
     "networks-two": "expected .'opacity', 'covariance', 'color'",
     "networks-trunk-alone": "expected 'trunk' and at least one head",

@@ -79,7 +79,7 @@ def test_npz_keys_and_symbols():
     plain = to_npz_dict(scene)
     assert {"anchor", "feature", "scaling_log", "offset", "mask_0", "mask_1", "mask_2"} <= set(plain)
     assert {"mlp.opacity.weight.0", "mlp.color.bias.1"} <= set(plain)
-    assert {"mlp.global.trunk.weight.0", "mlp.local.mean.bias.0"} <= set(plain)
+    assert {"mlp.global.trunk.weight.0", "mlp.local.position.bias.0"} <= set(plain)
     assert {"planes.global.0.xy", "planes.local.0.zt"} <= set(plain)
     assert not any(name.endswith(("_q", "_step")) for name in plain)
     data = [name for name in plain if not name.startswith("meta_")]

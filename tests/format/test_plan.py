@@ -7,29 +7,31 @@ import numpy as np
 import pytest
 from strategies import make_scene
 
+from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format import encoder
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.deformation import sample_planes
 from pd4dgs_codec.format.plan import head_bounds, plan
 from pd4dgs_codec.format.registry import LAYER_KINDS
-from pd4dgs_codec.scene import GLOBAL_HEADS, LENGTH_HEADS, LOCAL_HEADS, PLANES, Deformation, Widths, deformation_unit
+from pd4dgs_codec.scene import HEADS, LENGTH_HEADS, PLANES, Deformation, Widths, deformation_unit
 
 VOXEL = 0.0078125
 encode, encode_with_report = (partial(f, effort=1) for f in (encoder.encode, encoder.encode_with_report))
 FINE = 2.0**-23  #: a step of weights that keeps 1e-7 and 1
 
 
-def constant_deformation(heads, value, time_of=None):
-    """Residuals equal to `value` (of some heads, else 1) at all points, or only near the time row `time_of` of 5."""
+def constant_deformation(value, time_of=None, layers=1):
+    """Residuals equal to `value` (of some heads, else 1) at all points, or only near the time row `time_of` of 5.
+    layers: the number of those whose planes the trunk reads."""
     planes = {n: np.ones((1, 5 if b == 3 else 2, 2), np.float32) for n, _, b in PLANES}
     if time_of is not None:
         for name in ("xt", "yt", "zt"):
             planes[name][:] = 0
             planes[name][:, time_of] = 1
     planes["xy"][:] *= 16
-    trunk = ((np.full((1, 1), 1 / 16, np.float32), np.zeros(1, np.float32)),)
+    trunk = ((np.full((1, layers), 1 / 16 / layers, np.float32), np.zeros(1, np.float32)),)
     networks = {"trunk": trunk}
-    for name, outputs in heads.items():
+    for name, outputs in Widths().heads.items():
         weight = np.full((outputs, 1), value if np.isscalar(value) else value.get(name, 1.0), np.float32)
         networks[name] = ((weight, np.zeros(outputs, np.float32)),)
     return Deformation((planes,), networks)
@@ -40,9 +42,10 @@ def scene_with(global_value=None, local_value=None, weights_step=FINE, **options
     scene = make_scene(4, anchors=30, heads=({}, {}))
     fields = {"steps": replace(scene.steps, weights_global=weights_step, weights_local=weights_step)}
     if global_value is not None:
-        fields["global_deformation"] = constant_deformation(Widths().global_heads, global_value, **options)
+        fields["global_deformation"] = constant_deformation(global_value, **options)
     if local_value is not None:
-        fields["local_deformation"] = constant_deformation(LOCAL_HEADS, local_value, **options)
+        layers = 1 if global_value is None else 2
+        fields["local_deformation"] = constant_deformation(local_value, layers=layers, **options)
     return replace(scene, **fields)
 
 
@@ -54,7 +57,7 @@ def active_codes(scene, index):
 
 @pytest.mark.parametrize(
     "given_values,kept",
-    [((1.0, 1.0), (0, 1, 2)), ((1.0, 1e-7), (0, 1)), ((1e-7, 1.0), (0, 2)), ((1e-7, 1e-7), (0,)), ((None, None), (0,))],
+    [((1.0, 1.0), (0, 1, 2)), ((1.0, 1e-7), (0, 1)), ((None, 1.0), (0, 2)), ((1e-7, 1e-7), (0,)), ((None, None), (0,))],
 )
 def test_layers_go_with_their_deformation_and_the_highest_masks_stay(given_values, kept):
     scene = scene_with(*given_values)
@@ -72,6 +75,33 @@ def test_layers_go_with_their_deformation_and_the_highest_masks_stay(given_value
             assert gone[name]["bytes"] > 50 and "negligible" in gone[name]["why"]
 
 
+@pytest.mark.parametrize("value", [1e-7, 0.0])
+def test_a_layer_1_whose_planes_layer_2_reads_keeps_them_and_one_head(value):
+    scene = scene_with(value, 1.0)
+    data, report = encode_with_report(scene)
+    got = decode(data)
+    assert got.layers == (0, 1, 2) and encode(got) == data
+    (given,), (kept,) = scene.global_deformation.planes, got.global_deformation.planes
+    assert all(np.array_equal(kept[name], given[name]) for name in given)
+    heads = [f"global_deformation head {head}" for head in HEADS if head not in got.global_deformation.networks]
+    assert len(heads) == len(HEADS) - 1 and set(heads) <= {row["what"] for row in report.left_out}
+
+
+def test_a_layer_1_below_a_layer_2_needs_a_head():
+    scene = scene_with(1.0, 1.0)
+    field = scene.global_deformation
+    without = replace(field, networks={"trunk": field.networks["trunk"]})
+    with pytest.raises(EncodeError, match="global_deformation has no head"):
+        encode(replace(scene, global_deformation=without))
+
+
+def test_the_layers_have_equally_many_channels():
+    scene = scene_with(1.0, 1.0)
+    planes = tuple({name: np.tile(x, (2, 1, 1)) for name, x in s.items()} for s in scene.local_deformation.planes)
+    with pytest.raises(EncodeError, match="local_deformation scale 0: 2 channels, expected 1 as in the first scale"):
+        encode(replace(scene, local_deformation=replace(scene.local_deformation, planes=planes)))
+
+
 def test_inactive_anchors_are_dropped_and_reported():
     scene = make_scene(4, anchors=30, layers=(0,))
     inactive = int((scene.mask[0] == 0).sum())
@@ -84,19 +114,18 @@ def test_inactive_anchors_are_dropped_and_reported():
 @pytest.mark.parametrize("layer", [1, 2])
 def test_each_head_is_judged_by_its_own_bound(layer):
     kind = LAYER_KINDS[layer]
-    heads = kind.heads(Widths())
-    bounds = head_bounds(scene_with(), kind)
-    assert set(bounds) == set(heads) and bounds["position" if layer == 1 else "mean"] == 1e-3 * VOXEL
+    bounds = head_bounds(scene_with())
+    assert set(bounds) == set(HEADS) and bounds["position"] == 1e-3 * VOXEL
     unit = float(deformation_unit(scene_with().info.box))
     outputs = {name: bound / (unit if name in LENGTH_HEADS else 1.0) for name, bound in bounds.items()}
-    for alive in heads:
+    for alive in HEADS:
         values = {name: (1.01 if name == alive else 0.99) * output for name, output in outputs.items()}
         scene = scene_with(weights_step=2.0**-26, **{"global_value" if layer == 1 else "local_value": values})
         planned, left_out = plan(scene)
         networks = planned.tensors(layer).networks
         assert set(networks) == {"trunk", alive}
         gone = {item.what for item in left_out if item.kind}
-        assert gone == {f"{kind.name} head {h}" for h in heads if h != alive}
+        assert gone == {f"{kind.name} head {h}" for h in HEADS if h != alive}
 
 
 def test_a_short_event_is_seen():
@@ -109,7 +138,7 @@ def test_a_short_event_is_seen():
 def test_heads_that_quantise_to_zero_go_even_when_layers_are_asked_for():
     scene = scene_with(global_value={"feature": 1e-4}, weights_step=2.0**-6)
     got = decode(encode(scene, layers=2))
-    assert set(got.global_deformation.networks) == {"trunk", *GLOBAL_HEADS} - {"feature"}
+    assert set(got.global_deformation.networks) == {"trunk", *HEADS} - {"feature"}
     assert got.layers == (0, 1, 2) and got.local_deformation is None
     assert encode(got, layers=2) == encode(scene, layers=2)
 
@@ -130,7 +159,7 @@ def test_explicit_layers_cut_the_prefix_as_it_is():
 
 def test_auto_is_stable():
     """Encoding a decoded file again leaves out the same things and gives the same bytes."""
-    for values in ((1.0, 1.0), (1e-7, 1.0), (1.0, None)):
+    for values in ((1.0, 1.0), (None, 1.0), (1.0, None)):
         data = encode(scene_with(*values))
         assert encode(decode(data)) == data
 

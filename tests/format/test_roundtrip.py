@@ -13,7 +13,7 @@ from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format import encoder
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.morton import morton_codes
-from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS, Widths
+from pd4dgs_codec.scene import HEADS, Widths
 
 encode, encode_with_report = (partial(f, effort=1) for f in (encoder.encode, encoder.encode_with_report))
 MODES = ("ans", "lzma")
@@ -255,12 +255,19 @@ def _sent(scene):
     return replace(scene, feature=scene.feature[scene.mask[-1] > 0])
 
 
-@given(st.sampled_from(sorted(GLOBAL_HEADS)), st.sampled_from(sorted(LOCAL_HEADS)))
+@given(*[st.sampled_from(sorted(HEADS))] * 2)
 @settings(max_examples=3)
-def test_single_heads(global_head, local_head):
-    heads = ({global_head: Widths().global_heads[global_head]}, {local_head: LOCAL_HEADS[local_head]})
-    scene = make_scene(0, heads=heads)
+def test_single_heads(*heads):
+    scene = make_scene(0, heads=tuple({head: Widths().heads[head]} for head in heads))
     decoded = decode(encode(scene, layers=2))
     assert_same_scene(decoded, decode(encode(decoded, layers=2)))
-    assert set(decoded.global_deformation.networks) == {"trunk", global_head}
-    assert set(decoded.local_deformation.networks) == {"trunk", local_head}
+    for layer, head in enumerate(heads, 1):
+        assert set(decoded.deformation(layer).networks) == {"trunk", head}
+
+
+def test_layer_2_may_stand_without_layer_1():
+    scene = make_scene(0, layers=(0, 2))
+    decoded = decode(encode(scene, layers=2, omit="nothing"))
+    assert decoded.layers == (0, 2)
+    assert_same_networks(decoded.local_deformation.networks, scene.local_deformation.networks)
+    assert_same_scene(decoded, decode(encode(decoded, layers=2, omit="nothing")))

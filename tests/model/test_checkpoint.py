@@ -221,7 +221,7 @@ def reshaped(name, change):
     return lambda content: content["state"].update({name: change(content["state"][name])})
 
 
-LAST_OF_MEAN = ("local_deformation.heads.mean.linears.0.weight", "local_deformation.heads.mean.linears.0.bias")
+LAST_OF_POSITION = tuple(f"local_deformation.heads.position.linears.0.{part}" for part in ("weight", "bias"))
 MISSHAPEN = {
     "no state": lambda content: content.pop("state"),
     "no info": lambda content: content.pop("info"),
@@ -252,7 +252,7 @@ MISSHAPEN = {
     "cells between the cells": reshaped("anchor_q", lambda a: a + 0.5),
     "cells beyond int32": reshaped("anchor_q", lambda a: a.long() + 2**33),
     "a weight too wide": reshaped("networks.color.linears.0.weight", lambda a: torch.cat([a, a[:, :1]], dim=1)),
-    "an output short": lambda c: [c["state"].update({k: c["state"][k][1:]}) for k in LAST_OF_MEAN],
+    "an output short": lambda c: [c["state"].update({k: c["state"][k][1:]}) for k in LAST_OF_POSITION],
     "planes of another resolution": lambda content: content["deformations"].update(local=[[60_000, 60_000, 1, 1]]),
     "a step of zero": lambda content: content["steps"].update(feature=0.0),
     "a step in words": lambda content: content["steps"].update(feature="fine"),

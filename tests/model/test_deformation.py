@@ -92,25 +92,17 @@ def test_arrays_round_trip():
     assert torch.equal(other(points, 0.2), plane(points, 0.2))
 
 
-@pytest.mark.parametrize("spacing", [1, 3, None])
-def test_start_values(spacing):
-    step, generator = 1 / 16, torch.Generator().manual_seed(3)
-    plane = HexPlane(BOX, scales((5, 4, 6, 3), (1, 2)), 8)
-    plane.start(spacing, step, generator)
+def test_start_values():
+    plane = HexPlane(BOX, scales((9, 10, 12, 3), (1, 2)), 8)
+    plane.start(torch.Generator().manual_seed(3))
     for scale in plane.arrays():
         for name, array in scale.items():
             if "t" in name:
                 assert (array == 1).all()
                 continue
-            assert 0.5 - step / 2 <= array.min() < array.max() <= 1.5 + step / 2
-            whole = np.round(array / step)
-            if spacing is None:  # cells that nothing reaches cost no bits, and round independently
-                assert (whole == whole[:, :1, :1]).all() and len(np.unique(array)) > 0.9 * array.size
-            else:
-                assert len(np.unique(whole)) > 8
-            if spacing == 3:  # linear between draws, up to the ends
-                ratio = np.abs(np.diff(array, 2, axis=1)).mean() / np.abs(np.diff(array, axis=1)).mean()
-                assert ratio < 0.6
+            assert 0.5 <= array.min() < array.max() <= 1.5 and len(np.unique(array[:, 0, 0])) == 8
+            ratio = np.abs(np.diff(array, 2, axis=1)).mean() / np.abs(np.diff(array, axis=1)).mean()
+            assert ratio < 0.6  # linear between draws, up to the ends
 
 
 @pytest.mark.parametrize("channels", [8, 5])

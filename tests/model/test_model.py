@@ -17,12 +17,11 @@ from pd4dgs_codec.model.config import DeformationConfig
 from pd4dgs_codec.model.convert import from_scene, to_scene
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model, fresh_networks
-from pd4dgs_codec.model.networks import level_mask, mask_logits
+from pd4dgs_codec.model.networks import EXACT, level_mask, mask_logits
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.scene import (
     DEFAULT_WIDTHS,
-    GLOBAL_HEADS,
-    LOCAL_HEADS,
+    HEADS,
     MASK_STEP,
     MASK_THRESHOLD,
     Camera,
@@ -40,7 +39,7 @@ CAMERA = Camera(VIEWMAT, np.array([[40.0, 0, 19.5], [0, 40.0, 15.5], [0, 0, 1]],
 FLAT = (200, 200, 200)  #: one mask at all levels
 
 
-ALL_HEADS = (GLOBAL_HEADS, tuple(LOCAL_HEADS))
+ALL_HEADS = (tuple(HEADS), tuple(HEADS))
 
 
 def small_model(
@@ -56,10 +55,10 @@ def small_model(
     info = SceneInfo(VOXEL, BOX, (0.0, 1.0), (0.25, 0.5, 0.75), 0.125, 64.0, (0.0, -1.0, 0.0), 0.0, CAMERA)
     networks = fresh_networks(widths, 16)
     torch.nn.init.constant_(networks["opacity"].linears[-1].bias, opacity)
-    config = DeformationConfig(5, 4, channels, (1, 2), 8, ())
+    config = DeformationConfig(5, 4, channels, 8, (1, 2))
     fields = [
-        DeformationField.fresh(replace(config, heads=names), BOX, outputs, None, 0.02) if names else None
-        for names, outputs in zip(heads, (widths.global_heads, LOCAL_HEADS), strict=True)
+        DeformationField.fresh(replace(config, heads=names), BOX, widths.heads, None, below) if names else None
+        for names, below in zip(heads, (0, 2 * channels if heads[0] else 0), strict=True)
     ]
     codes = np.broadcast_to(np.asarray(masks, np.float64), (anchors, 3)) * MASK_STEP
     values = [0.5 * rng.normal(size=(anchors, *shape)) for shape in widths.attributes.values()]
@@ -131,6 +130,13 @@ def test_masks_never_fall_from_level_to_level(logits):
     assert (masks[1:] >= masks[:-1]).all()
 
 
+@pytest.mark.parametrize("level,reached", [(0, [0]), (1, [1]), (2, [1, 2])])
+def test_above_level_0_no_gradient_reaches_its_mask(level, reached):
+    logits = torch.zeros(4, 3, requires_grad=True)
+    level_mask(logits, level).sum().backward()
+    assert logits.grad.any(0).nonzero()[:, 0].tolist() == reached
+
+
 @given(hnp.arrays(np.float64, (5, 3), elements=st.floats(0, 1)))
 @settings(max_examples=40)
 def test_mask_logits_invert_level_mask(masks):
@@ -148,28 +154,40 @@ def test_only_anchors_above_the_threshold_take_part():
         assert evaluated == [i for i in range(80) if codes[i, level] * MASK_STEP > MASK_THRESHOLD]
 
 
-# -- global deformation ------------------------------------------------------------------------------------------------
+# -- deformations ------------------------------------------------------------------------------------------------------
 
 
+def deformed_at(level: int, head: str) -> tuple[Model, torch.Tensor]:
+    """A model with one constant residual at `level`, and that; residuals of another level vary."""
+    model = stir(small_model(), 0.1)
+    bias = set_bias(model.deformations[level], head)
+    with torch.no_grad():
+        for name, net in model.deformations[level].heads.items():
+            net.linears[0].weight.zero_()
+            net.linears[0].bias.mul_(name == head)
+    return model, bias
+
+
+@pytest.mark.parametrize("level", [1, 2])
 @pytest.mark.parametrize("head", ["feature", "offset", "scaling"])
-def test_a_global_residual_is_added_to_its_attribute(head):
-    model, plain = small_model(), small_model()
-    bias = set_bias(model.global_deformation, head)
+def test_a_residual_is_added_to_its_attribute_in_place_of_that_below(level, head):
+    plain, (model, bias) = small_model(), deformed_at(level, head)
     attribute = plain.scaling_log if head == "scaling" else getattr(plain, head)
     with torch.no_grad():
         attribute += bias.view(attribute.shape[1:])
-    got, expected = gaussians(model, 1), gaussians(plain, 0)
+    got, expected = gaussians(model, level), gaussians(plain, 0)
     assert torch.equal(got.slots, expected.slots)
     for name in ("means", "quats", "scales", "opacities", "colors"):
         torch.testing.assert_close(getattr(got, name), getattr(expected, name), rtol=1e-5, atol=1e-5)
-    assert not np.allclose(picture(model, 1), picture(model, 0), atol=1e-3)
+    assert not np.allclose(picture(model, level), picture(model, 0), atol=1e-3)
 
 
-def test_the_global_position_residual_moves_anchors_and_the_view_direction():
+@pytest.mark.parametrize("level", [1, 2])
+def test_the_position_residual_moves_anchors_and_the_view_direction(level):
     """Moving every anchor by b is moving the camera by -b, the networks' view direction included."""
-    model = small_model()
-    bias = set_bias(model.global_deformation, "position") * model.global_deformation.unit
-    moved = gaussians(model, 1)
+    model, bias = deformed_at(level, "position")
+    bias = bias * model.deformations[level].unit
+    moved = gaussians(model, level)
     viewmat = VIEWMAT.copy()
     viewmat[:3, 3] += viewmat[:3, :3] @ bias.numpy()
     camera = replace(CAMERA, viewmat=viewmat)
@@ -178,69 +196,33 @@ def test_the_global_position_residual_moves_anchors_and_the_view_direction():
     torch.testing.assert_close(moved.means, expected.means + bias, rtol=0, atol=1e-6)
     for name in ("quats", "scales", "opacities", "colors"):
         torch.testing.assert_close(getattr(moved, name), getattr(expected, name), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(picture(model, 1), picture(model, 0, camera=camera), atol=1e-4)
+    np.testing.assert_allclose(picture(model, level), picture(model, 0, camera=camera), atol=1e-4)
     assert (gaussians(model, 0).colors - moved.colors).abs().max() > 1e-4
 
 
-# -- local deformation -------------------------------------------------------------------------------------------------
-
-ACTIVATIONS = {
-    "mean": ("means", lambda x: x),
-    "scale": ("scales", lambda x: x.clamp(min=0)),
-    "quat": ("quats", lambda x: x / x.norm(dim=1, keepdim=True)),
-    "opacity": ("opacities", lambda x: x.clamp(0, 1)),
-    "color": ("colors", lambda x: x.clamp(0, 1)),
-}
-
-
-@pytest.mark.parametrize("head", LOCAL_HEADS)
-@pytest.mark.parametrize("alone", [False, True])
-def test_a_local_residual_changes_its_own_quantity_before_the_gate(head, alone):
-    """After the global deformation, and with `alone` in a model that has no other local head."""
-    model = stir(small_model((GLOBAL_HEADS, (head,) if alone else tuple(LOCAL_HEADS))), 0.1)
+@pytest.mark.parametrize("columns", [slice(0, 16), slice(16, 32)])
+def test_level_2_reads_the_planes_of_both_layers(columns):
+    model = stir(small_model(), 0.3)
+    before = picture(model, 1), picture(model, 2)
     with torch.no_grad():
-        for name, net in model.local_deformation.heads.items():
-            for parameter in net.parameters():
-                parameter.mul_(0 if name != head else 1)
-    assert set(model.local_deformation.heads) == ({head} if alone else set(LOCAL_HEADS))
-    before, after = gaussians(model, 1), gaussians(model, 2)
-    assert torch.equal(before.slots, after.slots)
-    gate = 200 / 255
-    with torch.no_grad():
-        residual = model.local_deformation(before.means, 0.3)[head]
-    for name, (quantity, activate) in ACTIVATIONS.items():
-        expected = getattr(before, quantity)
-        if name == head:
-            gated = gate if quantity in ("scales", "opacities") else 1.0
-            expected = activate(expected / gated + residual.view(expected.shape)) * gated
-            assert (expected - getattr(before, quantity)).abs().max() > 1e-3
-        torch.testing.assert_close(getattr(after, quantity), expected, rtol=1e-4, atol=1e-5)
+        weight = model.local_deformation.trunk.linears[0].weight
+        assert weight.shape[1] == 32
+        weight[:, columns] = 0
+    np.testing.assert_array_equal(picture(model, 1), before[0])
+    assert not np.allclose(picture(model, 2), before[1], atol=1e-3)
 
 
-def test_the_gate_comes_after_the_local_residuals():
-    """Residuals that push opacity and scale past their bounds: the gate must still scale what the clamps leave."""
-    model = small_model(masks=(51, 51, 51))
-    with torch.no_grad():
-        model.local_deformation.heads["opacity"].linears[0].bias.fill_(5.0)
-        model.local_deformation.heads["scale"].linears[0].bias.copy_(torch.tensor([-100.0, 0.0, 3.0]))
-    got, before = gaussians(model, 2), gaussians(model, 1)
-    torch.testing.assert_close(got.opacities, torch.full_like(got.opacities, 0.2), rtol=1e-5, atol=0)
-    assert (got.scales[:, 0] == 0).all()
-    torch.testing.assert_close(got.scales[:, 1], before.scales[:, 1])
-    grown = before.scales[:, 2] + 0.6 * model.local_deformation.unit
-    torch.testing.assert_close(got.scales[:, 2], grown, rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("head", GLOBAL_HEADS)
-def test_each_global_head_can_stand_alone(head):
-    model = stir(small_model(((head,), ())), 0.3)
-    assert set(model.global_deformation.heads) == {head} and model.level == 1
-    assert not np.allclose(picture(model, 1), picture(model, 0), atol=1e-3)
-    np.testing.assert_array_equal(picture(model, 2), picture(model, 1))
+@pytest.mark.parametrize("level", [1, 2])
+@pytest.mark.parametrize("head", HEADS)
+def test_each_head_can_stand_alone(head, level):
+    model = stir(small_model(tuple((head,) if layer == level else () for layer in (1, 2))), 0.3)
+    assert set(model.deformations[level].heads) == {head} and model.level == level
+    assert not np.allclose(picture(model, level), picture(model, level - 1), atol=1e-3)
+    np.testing.assert_array_equal(picture(model, 2), picture(model, level))
 
 
 def test_a_level_without_deformation_is_the_level_below():
-    model = stir(small_model(((), tuple(LOCAL_HEADS))), 0.1)
+    model = stir(small_model(((), tuple(HEADS))), 0.1)
     np.testing.assert_array_equal(picture(model, 1), picture(model, 0))
     assert not np.allclose(picture(model, 2), picture(model, 1), atol=1e-3)
     assert small_model(((), ())).level == 0
@@ -272,8 +254,7 @@ def test_culling_changes_no_pixel(level, monkeypatch):
 
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_faint_gaussians_left_out_change_no_pixel(level, monkeypatch):
-    """At level 2 without the opacity head, which could raise them: the set is fixed before the residuals."""
-    model = stir(small_model((GLOBAL_HEADS, ("mean", "scale", "quat", "color")), opacity=0.0), 0.05)
+    model = stir(small_model(opacity=0.0), 0.05)
     with torch.no_grad():  # from clearly negative over just visible to opaque
         model.networks["opacity"].linears[-1].bias.copy_(torch.linspace(-0.3, 0.4, 10))
     image, kept = picture(model, level), len(gaussians(model, level).slots)
@@ -286,19 +267,22 @@ def test_faint_gaussians_left_out_change_no_pixel(level, monkeypatch):
 
 
 @pytest.mark.parametrize("channels", [8, 3])
-def test_the_numpy_evaluation_equals_the_torch_field(channels):
+def test_the_numpy_evaluation_equals_the_model(channels):
     """Inside the box, on its corners, outside it; at and beyond both ends of time."""
     model = stir(small_model(channels=channels), 0.7)
     points = np.random.default_rng(4).uniform(-2, 2, (200, 3)).astype(np.float32)
     points[:2] = BOX
-    for field in (model.global_deformation, model.local_deformation):
+    widths, scene = model.widths.heads, to_scene(model)
+    rows = torch.zeros(len(points), sum(widths.values()))
+    rows[:, :3] = torch.from_numpy(points)
+    for level in (1, 2):
         for t in (-0.5, 0.0, 0.123, 0.5, 1.0, 2.0):
             with torch.no_grad():
-                expected = field(torch.from_numpy(points), t)
-            got = residuals(field.arrays(), BOX, points, t)
-            assert set(got) == set(expected)
-            for name in got:
-                np.testing.assert_allclose(got[name], expected[name].numpy(), rtol=0, atol=1e-5, err_msg=name)
+                moved = model._moved(level, rows, t, EXACT, channels == 8) - rows
+            got = residuals(scene.motion(level), BOX, points, t)
+            assert list(got) == list(widths)
+            for name, expected in zip(widths, moved.split([*widths.values()], dim=1), strict=True):
+                np.testing.assert_allclose(got[name], expected.numpy(), rtol=0, atol=1e-5, err_msg=name)
                 assert np.abs(got[name]).max() > 0.1
 
 
@@ -308,9 +292,9 @@ MIXED = np.sort(np.random.default_rng(9).choice(np.array([0, 3, 4, 90, 255]), (8
 @pytest.mark.parametrize(
     "heads,layers",
     [
-        ((("position",), ("mean", "color")), (0, 1, 2)),
-        (((), ("scale",)), (0, 2)),
-        ((GLOBAL_HEADS, ()), (0, 1)),
+        ((("position",), ("position", "feature")), (0, 1, 2)),
+        (((), ("scaling",)), (0, 2)),
+        ((tuple(HEADS), ()), (0, 1)),
         (((), ()), (0,)),
     ],
 )

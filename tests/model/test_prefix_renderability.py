@@ -126,14 +126,14 @@ def test_log_scalings_beyond_float32_leave_pictures_finite(seed):
             shoot(model, layer, t, camera_at(scene))
 
 
-def test_local_colours_that_overflow_hide_their_gaussians():
+def test_features_that_overflow_hide_their_gaussians():
     """Planes of 2e6 multiply to 6e37, the trunk takes them to infinity, and infinity times a weight of 0 is NaN."""
     scene = visible_scene((0, 2), 2)
     field = scene.local_deformation
     assert field is not None
     planes = tuple({name: np.full_like(plane, 2e6) for name, plane in scale.items()} for scale in field.planes)
-    (weight, bias), (color, shift) = field.networks["trunk"][0], field.networks["color"][0]
-    networks = {"trunk": ((np.full_like(weight, 1000), bias),), "color": ((0 * color, np.full_like(shift, 0.5)),)}
+    (weight, bias), (feature, shift) = field.networks["trunk"][0], field.networks["feature"][0]
+    networks = {"trunk": ((np.full_like(weight, 1000), bias),), "feature": ((0 * feature, np.full_like(shift, 0.5)),)}
     data = encode(replace(scene, local_deformation=Deformation(planes, networks)), layers=2, effort=1)
     base, top = (from_scene(prefix) for _, prefix in prefixes(data))
     camera = camera_at(scene)

@@ -34,10 +34,9 @@ def test_the_still_start_sees_views_near_the_key_instant_alone(dataset):
     assert len({next_view(state, 1) for _ in range(len(state.views))}) > len(near), "level 1 takes every view in turn"
 
 
-@pytest.mark.parametrize("share, odds", [(0.2, (0.15, 0.85, 0.0)), (0.6, (0.15, 0.517, 0.333))])
-def test_most_steps_train_what_moves(dataset, share, odds):
-    state = learner(dataset)
-    state.iteration = round(1000 * share)
+def test_most_steps_train_the_highest_level(dataset):
+    state, odds = learner(dataset), (0.15, 0.1, 0.75)
+    state.iteration = 500
     drawn = [draw_levels(state) for _ in range(300)]
     assert drawn[0][1] == pytest.approx(odds, abs=1e-3)
     counts = [sum(levels == (level,) for levels, _ in drawn) / 300 for level in range(3)]
@@ -45,18 +44,18 @@ def test_most_steps_train_what_moves(dataset, share, odds):
 
 
 @torch.no_grad()
-def test_level_0_learns_nothing_where_layer_1_changes_the_picture(dataset, monkeypatch):
+def test_level_0_learns_nothing_where_motion_changes_the_picture(dataset, monkeypatch):
     monkeypatch.setattr(rollout, "STILL_CONTRAST", 0.01)  # a fresh model is faint
     state = learner(dataset)
     state.iteration = 500
     state.model.mask_logits[:, 1:] = TIED  # the levels have the same anchors
-    field = state.model.global_deformation
+    field = state.model.local_deformation
     field.planes.grid.mul_(torch.rand(len(field.planes.grid), 1) + 0.5)
     for head in field.heads.values():
         head.layers[-1].weight.uniform_(-1, 1)
     view = state.views[0]
     place = view.view.time, view.view.camera
-    still, moved = (render(state.model, level, *place).image for level in (0, 1))
+    still, moved = (render(state.model, level, *place).image for level in (0, 2))
     differs = (still - moved).abs().amax(-1) >= rollout.STILL_CONTRAST
     assert differs.any() and not differs.all()
     taught = as_taught(state, view, 0).weights
