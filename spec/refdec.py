@@ -481,8 +481,8 @@ def plane_shapes(layer):
 
 
 # 6.3 Planes and networks: "Linear layer i is a weight [o_i, o_{i−1}] and a bias [o_i]; o_0 is the network's input
-# width." "The input width is D in layer 0, but D + 3 (feature D, view direction 3) for network i if bit i of V is set. A
-# trunk reads the scales of its own layer behind those of the layers before it in the file"
+# width." "The input width is D in layer 0, but D + 3 (feature D, view direction 3) for network i if bit i of V is set.
+# A trunk reads the scales of its own layer behind those of the layers before it in the file"
 def weight_shapes(layer):
     shapes, (feature, _, viewing) = [], layer.header[15]
     for key, widths in layer.networks.items():

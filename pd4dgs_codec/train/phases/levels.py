@@ -30,8 +30,8 @@ MIN_VIEWS = 4
 MIN_GAIN = 0.5
 #: ... in the pixels in which it changes some colour by so much, if there are so many of them, ...
 MIN_CONTRAST, MIN_PIXELS = 0.02, 32
-#: ... than the level below after so many further steps, as a share of the run.
-PRACTICE = 1 / 20
+#: ... than the level below after so many further steps: a share of the run, and so many at least.
+PRACTICE, MIN_PRACTICE = 1 / 20, 75
 
 
 class StartLevel2(phases.Phase):
@@ -87,7 +87,7 @@ class SelectLevels(phases.Phase):
         before, logits = state.snapshot(), state.model.mask_logits
         with torch.no_grad():
             logits[:, below] += softplus(logits[:, level])  # the anchors of the level, without its motion
-        self._practise(below, round(PRACTICE * (state.schedule.iterations or 0)))
+        self._practise(below, max(MIN_PRACTICE, round(PRACTICE * (state.schedule.iterations or 0))))
 
         def measure() -> float:
             errors = [0.0, 0.0]
