@@ -35,8 +35,8 @@ PRACTICE, MIN_PRACTICE = 1 / 20, 75
 
 
 class StartLevel2(phases.Phase):
-    """With a key instant, level 2 starts where level 1 stands: the fine planes would find motion later than the coarse
-    ones alone, or not at all."""
+    """With a key instant, level 2 starts where level 1 stands: what is fine in time finds motion later than what is
+    coarse, or not at all."""
 
     def due(self, state: TrainState) -> bool:
         """At `Schedule.local`."""
@@ -45,7 +45,7 @@ class StartLevel2(phases.Phase):
         )
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
-        """Copies the networks."""
+        """Copies planes and networks."""
         state.model.deformations[2].start_as(state.model.deformations[1])
 
 
