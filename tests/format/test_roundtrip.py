@@ -255,9 +255,9 @@ def _sent(scene):
     return replace(scene, feature=scene.feature[scene.mask[-1] > 0])
 
 
-@given(*[st.sampled_from(sorted(HEADS))] * 2)
+@given(st.tuples(*[st.sampled_from(sorted(HEADS))] * 2))
 @settings(max_examples=3)
-def test_single_heads(*heads):
+def test_single_heads(heads):
     scene = make_scene(0, heads=tuple({head: Widths().heads[head]} for head in heads))
     decoded = decode(encode(scene, layers=2))
     assert_same_scene(decoded, decode(encode(decoded, layers=2)))
