@@ -56,22 +56,6 @@ class DeformationField(nn.Module):
         heads = {name: MLP((config.width, head_widths[name]), zero_last=True) for name in config.heads}
         return DeformationField(planes, trunk, heads, key)
 
-    @torch.no_grad()
-    def start_as(self, below: DeformationField) -> None:
-        """Makes the residuals those of the field `below`, but for interpolation: each of the planes becomes that of the
-        finest scale below at its own resolution, and the first scale is read in its place."""
-        self.planes.interpolate(below.planes)
-        (first, *rest), (given, *rest_given) = self.trunk.layers, below.trunk.layers
-        same, channels = given.in_features - below.planes.grid.shape[1], below.planes.grid.shape[1]
-        first.weight.zero_()[:, :same] = given.weight[:, :same]
-        first.weight[:, given.in_features : given.in_features + channels] = given.weight[:, same:]
-        first.bias.copy_(given.bias)
-        pairs = list(zip(rest, rest_given, strict=True))
-        for name, head in self._named_heads():
-            pairs += zip(head.layers, cast(MLP, below.heads[name]).layers, strict=True)
-        for layer, other in pairs:
-            layer.load_state_dict(other.state_dict())
-
     @staticmethod
     def from_arrays(deformation: scene.Deformation, box: np.ndarray) -> DeformationField:
         """The field of a decoded scene."""

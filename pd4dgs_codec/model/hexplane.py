@@ -117,17 +117,6 @@ class HexPlane(nn.Module):
                 if b != TIME_AXIS:
                     scale[name].copy_(_start(scale[name].shape, generator))
 
-    @torch.no_grad()
-    def interpolate(self, other: HexPlane) -> None:
-        """Takes the values of the last scale of `other`, which has as many channels, into all scales, between its
-        cells."""
-        given = other.layout.views(other.grid)[-1]
-        for scale in self.layout.views(self.grid):
-            for name, plane in scale.items():
-                field = given[name].permute(2, 0, 1)[None]
-                found = F.interpolate(field, size=plane.shape[:2], mode="bilinear", align_corners=True)
-                plane.copy_(found[0].permute(1, 2, 0))
-
     @property
     def fusible(self) -> bool:
         """Whether the kernels can sample the planes."""

@@ -20,7 +20,7 @@ from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.losses import ModelLoss
 from pd4dgs_codec.train.phases import Phase
 from pd4dgs_codec.train.phases.grow import Grow
-from pd4dgs_codec.train.phases.levels import SelectLevels, StartLevel2
+from pd4dgs_codec.train.phases.levels import SelectLevels
 from pd4dgs_codec.train.phases.prefixes import Prefixes
 from pd4dgs_codec.train.phases.prune import Prune
 from pd4dgs_codec.train.phases.quantisation import FitQuantisation
@@ -52,7 +52,7 @@ class Learner(TrainState):
         self.model_loss = ModelLoss(config, self.generator)
         self.levels, self.prefixes, self.grow = SelectLevels(self.practise), Prefixes(), Grow()
         pruning = (Prune(turn) for turn in range(PRUNING_ROUNDS))
-        self.before_step: list[Phase] = [StartLevel2(), self.levels, FitQuantisation(), *pruning, self.prefixes]
+        self.before_step: list[Phase] = [self.levels, FitQuantisation(), *pruning, self.prefixes]
 
     def step(self) -> dict[str, Any]:
         """One training step; returns its log record with every term unweighted."""

@@ -40,8 +40,7 @@ def draw_levels(state: TrainState) -> tuple[tuple[int, ...], Probabilities]:
     if rollout == "top":
         probabilities = TOP
     elif rollout == "key":
-        above = 1 - STILL_ODDS - GLOBAL_ODDS if state.position >= state.schedule.local else 0.0
-        probabilities = STILL_ODDS, 1 - STILL_ODDS - above, above
+        probabilities = STILL_ODDS, GLOBAL_ODDS, 1 - STILL_ODDS - GLOBAL_ODDS
     elif rollout == "uniform" or state.position < state.schedule.progressive:
         probabilities = UNIFORM
     else:

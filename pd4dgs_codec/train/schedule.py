@@ -27,7 +27,6 @@ class Schedule:
     every later phase begins at infinity, and nothing is grown or pruned.
     coarse_end: before it only level 0 is trained; from it on, quantisation noise is added.
     moving: transparent anchors are pruned from here on; before it, what moves may not have been found yet.
-    local: with a key instant level 2 is trained from here on, from a copy of level 1.
     progressive: the rate term, TMC and the average rho start here (T_progressive; T_warm is within the coarse phase).
     rho_every: iterations between updates of rho (K).
     rounding: planes and weights are rounded straight-through from here on.
@@ -42,7 +41,7 @@ class Schedule:
 
         self.iterations = iterations
         self.coarse_end, self.progressive, self.rho_every = at(COARSE_SHARE), at(1 / 3), max(1, at(1 / 150))
-        self.moving, self.local = at(2 * COARSE_SHARE), at(1 / 4)
+        self.moving = at(2 * COARSE_SHARE)
         self.rounding, self.exact_rounding = at(2 / 3), at(9 / 10)
         self.grow = self.prune = range(0)
         if iterations is not None:

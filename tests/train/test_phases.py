@@ -1,6 +1,7 @@
 """The phases of a run: pruning, selection of levels, step classes, whitening and prefixes."""
 
 import json
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -17,14 +18,13 @@ from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.model.networks import EXACT
 from pd4dgs_codec.model.picture import render, render_image
 from pd4dgs_codec.model.sensitivity import rounding_error
-from pd4dgs_codec.quality import TRAIN_MIN_DB, TRAIN_MIN_DB_PER_MEGABYTE
 from pd4dgs_codec.quality.measure import train_rate_bits
 from pd4dgs_codec.scene import ATTRIBUTES, MASK_THRESHOLD, MAX_CLASS
 from pd4dgs_codec.train import learner, losses, phases
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.loop import Trainer
 from pd4dgs_codec.train.phases import levels, prefixes, prune, quantisation
-from pd4dgs_codec.train.phases.levels import drop_level, held_back_views, levels_without_gain
+from pd4dgs_codec.train.phases.levels import held_back_views
 from pd4dgs_codec.train.phases.prefixes import draw_prefix, rank_anchors
 from pd4dgs_codec.train.phases.prune import Prune, added_error, least, round_of
 from pd4dgs_codec.train.phases.quantisation import classes_within, whiten, whitening_transform
@@ -193,28 +193,44 @@ def test_a_scene_that_needs_no_anchor_keeps_some(dataset, monkeypatch, rollout):
 # -- selection of levels -----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "psnr, megabytes, gone",
-    [
-        ([30, 31, 32], 0, []),
-        ([30, 32, 31.9], 0, [2]),
-        ([30, 32, 32 + 0.9 * TRAIN_MIN_DB[2]], 0, [2]),
-        ([30, 29, 29], 0, [2, 1]),
-        ([30, 30.99, 30.83], 0, [2, 1]),  # a static scene
-        ([30, 29, 29.7], 0, []),  # level 2 gains, and depends on level 1
-        ([30], 0, []),
-        ([30, 32, 33], 0.9 / TRAIN_MIN_DB_PER_MEGABYTE, []),
-        ([30, 32, 33], 1.1 / TRAIN_MIN_DB_PER_MEGABYTE, [2]),
-    ],
-)
-def test_levels_go_from_the_top_while_they_gain_too_little(psnr, megabytes, gone):
-    assert [level for level, _ in levels_without_gain(psnr, [0.0, 0.0, 1e6 * megabytes])] == gone
+def judged(dataset, monkeypatch, least):
+    """(a learner after its levels were judged with `least` as MIN_GAIN, its parameters and moments before)."""
+    monkeypatch.setattr(levels, "MIN_GAIN", least)
+    monkeypatch.setattr(levels, "MIN_PRACTICE", 3)
+    learner = Trainer(TrainConfig(preset="tiny", iterations=30), replace(dataset, train=dataset.train * 12)).learner
+    with torch.no_grad():
+        for field in learner.model.deformations.values():
+            for parameter in field.weights:
+                parameter.add_(0.1)
+        learner.model.mask_logits[:, 0] -= 3.0
+    learner.iteration = 20
+    for _ in range(2):
+        learner.step()
+    before = [p.detach().clone() for p in learner.optimiser.parameters]
+    moments = [m["exp_avg"].clone() for m in learner.optimiser.moments.values()]
+    learner.levels.apply(learner, {})
+    return learner, before, moments
+
+
+@pytest.mark.usefixtures("short_runs_have_phases")
+def test_the_practice_of_a_level_below_one_that_stays_is_undone(dataset, monkeypatch):
+    learner, before, moments = judged(dataset, monkeypatch, -math.inf)
+    assert learner.model.level == 2 and learner.levels.left_out == []
+    assert all(map(torch.equal, learner.optimiser.parameters, before))
+    assert all(torch.equal(m["exp_avg"], b) for m, b in zip(learner.optimiser.moments.values(), moments, strict=True))
+
+
+@pytest.mark.usefixtures("short_runs_have_phases")
+def test_levels_without_gain_go_from_the_top_and_leave_their_anchors(dataset, monkeypatch):
+    learner, before, _ = judged(dataset, monkeypatch, math.inf)
+    assert [row["level"] for row in learner.levels.left_out] == [2, 1] and learner.model.level == 0
+    assert learner.model.masks(0).mean() > torch.sigmoid(before[3][:, 0]).mean() + 0.2
 
 
 @pytest.mark.usefixtures("short_runs_have_phases")
 def test_a_removed_level_stays_away(dataset, tmp_path, monkeypatch):
     """From the model, its optimiser, the log, the file and a resumed run."""
-    monkeypatch.setattr(levels, "levels_without_gain", lambda psnr, _: [(2, psnr[2] - psnr[1])])
+    monkeypatch.setattr(levels.SelectLevels, "_gain", lambda self, state, level, views: 0.0 if level == 2 else 9.0)
     views = replace(dataset, train=dataset.train * 12)
     config = TrainConfig(preset="tiny", iterations=30)
     trainer = Trainer(config, views)
@@ -362,17 +378,6 @@ def test_whitening_makes_files_smaller(dataset):
     plain = len(encode(to_scene(trainer.model), effort=1, omit="nothing", layers=0))
     whitened(trainer)
     assert len(encode(to_scene(trainer.model), effort=1, omit="nothing", layers=0)) < plain
-
-
-def test_without_its_deformation_level_0_has_the_anchors_of_level_1(dataset):
-    learner = Trainer(TrainConfig(preset="tiny", iterations=30), dataset).learner
-    with torch.no_grad():
-        learner.model.mask_logits[:, 0] = -3.0
-        learner.model.mask_logits[:, 1] = 4.0
-    before = learner.model.masks(1)
-    drop_level(learner.model, learner.optimiser, 1)
-    torch.testing.assert_close(learner.model.masks(0), before)
-    torch.testing.assert_close(learner.model.masks(1), before)
 
 
 # -- prefixes ----------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Levels come and go: level 2 starts as a copy of level 1; a level without use is removed for the rest of the run.
+"""Selection of levels: a level without use is removed for the rest of the run.
 
 Whether a level is of use shows on views held back from training, for on those it is trained on every level gains, and
 only after the level below, which has seen few steps of its own, has tried to do without it: on a static scene level 1
@@ -34,21 +34,6 @@ MIN_CONTRAST, MIN_PIXELS = 0.02, 32
 PRACTICE, MIN_PRACTICE = 1 / 20, 75
 
 
-class StartLevel2(phases.Phase):
-    """With a key instant, level 2 starts where level 1 stands: what is fine in time finds motion later than what is
-    coarse, or not at all."""
-
-    def due(self, state: TrainState) -> bool:
-        """At `Schedule.local`."""
-        return (
-            state.config.rollout == "key" and len(state.model.deformations) == 2 and state.reached(state.schedule.local)
-        )
-
-    def apply(self, state: TrainState, record: dict[str, Any]) -> None:
-        """Copies planes and networks."""
-        state.model.deformations[2].start_as(state.model.deformations[1])
-
-
 class SelectLevels(phases.Phase):
     """Where planes and weights begin to be rounded, removes the levels of little use.
 
@@ -75,6 +60,7 @@ class SelectLevels(phases.Phase):
                 break
             drop_level(state.model, state.optimiser, level)
             self.left_out.append({"level": level, "gain": gain, "views": len(views)})
+        record["left_out"] = self.left_out
 
     def _gain(self, state: TrainState, level: int, views: list[TrainingView]) -> float:
         """By how many dB `level` is better in the pixels that it changes than the level below after practice. The state

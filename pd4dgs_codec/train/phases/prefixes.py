@@ -28,8 +28,8 @@ from pd4dgs_codec.train.state import TrainState
 VIEWS = 8
 #: The fewest anchors of a prefix, about those of a first slice of 50 kB.
 FEWEST = 1500
-#: Share of the steps of level 0 that render a prefix.
-SHARE = 1 / 2
+#: Share of the steps of level 0 that render a prefix, and where it is the only level.
+SHARE, STILL_SHARE = 0.5, 0.15
 
 
 class Prefixes(Phase):
@@ -52,7 +52,8 @@ class Prefixes(Phase):
 
     def draw(self, state: TrainState, level: int) -> Tensor | None:
         """bool [N]: the anchors that the next step, of `level`, renders; None for all of them."""
-        if self.rank is None or level or float(torch.rand((), generator=state.generator)) >= SHARE:
+        share = SHARE if state.model.level else STILL_SHARE
+        if self.rank is None or level or float(torch.rand((), generator=state.generator)) >= share:
             return None
         return draw_prefix(self.rank, state.generator).to(state.device)
 
