@@ -144,7 +144,10 @@ def _residual_error(field: Deformation, times: Sequence[float]) -> Found:
     for t in times:
         hidden = np.maximum(_exact_samples(field.planes, BOX, places, t) @ trunk.T.astype(np.float64), 0)
         expected = hidden @ head.T.astype(np.float64) * float(deformation_unit(BOX))
-        model = module(torch.from_numpy(places), t)["position"].detach().numpy()
+        points = torch.from_numpy(places)
+        still = points.new_zeros(len(points), 3)
+        moved = module.moved_reference(still, lambda time: module.planes(points, time), {"position": 3}, t)  # noqa: B023
+        model = moved.detach().numpy()
         for found in (model, coded.residuals(field, BOX, places, t)["position"]):
             worst = largest([worst, float(np.abs(found - expected).max()) / scale])
     return f"{len(times)} instants", worst

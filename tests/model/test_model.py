@@ -55,7 +55,7 @@ def small_model(
     info = SceneInfo(VOXEL, BOX, (0.0, 1.0), (0.25, 0.5, 0.75), 0.125, 64.0, (0.0, -1.0, 0.0), 0.0, CAMERA)
     networks = fresh_networks(widths, 16)
     torch.nn.init.constant_(networks["opacity"].linears[-1].bias, opacity)
-    config = DeformationConfig(5, 4, channels, 8, (1, 2))
+    config = DeformationConfig(((5, 4), (10, 4)), channels, 8)
     fields = [
         DeformationField.fresh(replace(config, heads=names), BOX, widths.heads, None, below) if names else None
         for names, below in zip(heads, (0, 2 * channels if heads[0] else 0), strict=True)

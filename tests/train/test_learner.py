@@ -102,7 +102,7 @@ def test_a_step_gathers_the_gradients_of_all_its_terms(dataset, level):
         steps.step()
     index, state, noise = 0, steps.generator.get_state(), steps.noise.generator.get_state()
     record: dict = {}
-    steps._gather(index, level, record)
+    steps._gather(index, level, None, record)
     found = [None if p.grad is None else p.grad.clone() for p in steps.optimiser.parameters]
     steps.optimiser.zero_grad()
     steps.generator.set_state(state)

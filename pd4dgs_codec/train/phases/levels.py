@@ -68,11 +68,11 @@ class SelectLevels(phases.Phase):
         below = max(layer for layer in (0, *state.model.deformations) if layer < level)
         pictures = [_images(state, view, (below, level)) for view in views]
         acts = [(a - b).abs().amax(-1) >= MIN_CONTRAST for a, b in pictures]
-        if sum(int(mask.sum()) for mask in acts) < MIN_PIXELS:
-            return 0.0
         before, logits = state.snapshot(), state.model.mask_logits
         with torch.no_grad():
             logits[:, below] += softplus(logits[:, level])  # the anchors of the level, without its motion
+        if sum(int(mask.sum()) for mask in acts) < MIN_PIXELS:
+            return 0.0
         self._practise(below, max(MIN_PRACTICE, round(PRACTICE * (state.schedule.iterations or 0))))
 
         def measure() -> float:
