@@ -135,9 +135,11 @@ def test_layers_meet_their_targets_and_the_loss_grows_as_they_shrink(scene):
         targets = {layer: round(share * whole[layer]) for layer in (0, 2)}
         fitted, left_out, fits = fit(scene, targets, loss, harm, EncodeOptions(**FAST))
         data, report = encode_with_report(fitted, **FAST, left_out=left_out)
-        sizes = added(data)
+        whole_file = encode(fitted, **FAST, omit="nothing")  # at coarser steps more may be left out
+        assert len(data) <= len(whole_file)
+        sizes = added(whole_file)
         for row in fits:
-            assert sizes[row.layer] <= row.bytes <= sizes[row.layer] + 32 and row.bytes <= row.target
+            assert sizes[row.layer] <= row.bytes <= sizes[row.layer] + 16 and row.bytes <= row.target
             assert share > 1 or row.bytes >= (1 - SLACK) * row.target
             assert (not row.moved and set(row.factors.values()) == {1}) == (share > 1)
         losses.append(loss(decode(data)))
