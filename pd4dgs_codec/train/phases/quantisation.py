@@ -155,8 +155,8 @@ def _apply(model: Model, optimiser: Optimiser, transform: Tensor) -> None:
     optimiser.transform(model.feature, slice(None), transform.T)
     for name in SCAFFOLD_NETWORKS:
         optimiser.transform(model.network(name).layers[0].weight, slice(width), back)
-    field = model.global_deformation
-    last = None if field is None else field.head_layer("feature")
-    if last is not None:
-        optimiser.transform(last.weight, slice(None), transform.T, transposed=True)
-        optimiser.transform(last.bias, slice(None), transform.T)
+    for field in model.deformations.values():
+        last = field.head_layer("feature")
+        if last is not None:
+            optimiser.transform(last.weight, slice(None), transform.T, transposed=True)
+            optimiser.transform(last.bias, slice(None), transform.T)
