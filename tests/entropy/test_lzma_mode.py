@@ -1,6 +1,4 @@
-"""The LZMA mode: round trips, the recorded layout, bounded and checked decompression."""
-
-import lzma
+"""The LZMA mode: round trips, the choice of layout, bounded decompression."""
 
 import numpy as np
 import pytest
@@ -10,8 +8,7 @@ from hypothesis import strategies as st
 from pd4dgs_codec.entropy import lzma_mode
 from pd4dgs_codec.entropy.lzma_mode import decode_channels_lzma, encode_channels_lzma
 from pd4dgs_codec.entropy.priors import K_MAX
-from pd4dgs_codec.entropy.varint import put_varint
-from pd4dgs_codec.errors import DecodeError, EncodeError, LimitExceeded, Malformed
+from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
 
 bounded = st.integers(-100, 100) | st.integers(900, 1100) | st.integers(-K_MAX, K_MAX)
 
@@ -32,25 +29,6 @@ def test_more_effort_is_not_larger_here():
     assert sizes[2] <= sizes[1] < sizes[0]
 
 
-def test_every_cut_and_many_flips_give_our_errors_only():
-    rng = np.random.default_rng(2)
-    channels = [np.rint(rng.normal(0, s, 120)).astype(np.int32) for s in (2, 500)]
-    payload, counts = encode_channels_lzma(channels), [120, 120]
-    for size in range(len(payload)):
-        with pytest.raises(Malformed):
-            decode_channels_lzma(payload[:size], counts)
-    with pytest.raises(Malformed):
-        decode_channels_lzma(payload + b"\0", counts)
-    for bit in range(8 * len(payload)):
-        damaged = bytearray(payload)
-        damaged[bit // 8] ^= 1 << (bit % 8)
-        try:
-            decoded = decode_channels_lzma(bytes(damaged), counts)
-        except DecodeError:
-            continue
-        assert [len(d) for d in decoded] == counts
-
-
 def test_never_inflates_beyond_the_declared_counts():
     bomb = encode_channels_lzma([np.zeros(4_000_000, np.int32)], effort=1)
     assert len(bomb) < 2000
@@ -63,22 +41,6 @@ def test_never_inflates_beyond_the_declared_counts():
     wide = encode_channels_lzma([np.array([-K_MAX, K_MAX], np.int32)] * 9, effort=1)
     with pytest.raises(LimitExceeded, match="under LZMA"):
         decode_channels_lzma(wide, [1 << 26] * 9)
-
-
-def test_a_base_that_carries_symbols_past_the_limit_is_malformed():
-    payload = encode_channels_lzma([np.array([K_MAX, K_MAX - 9], np.int32)], effort=1)
-    head = bytearray()
-    put_varint(head, 8 * K_MAX)  # base K, integers of one byte
-    at = 2 + len(head)
-    assert payload[2:at] == bytes(head), "the encoder's own choice for symbols this high"
-    wrong = lzma_of(np.array([1, 0], np.int8))
-    with pytest.raises(Malformed, match="limit .k. <= 16777215"):
-        decode_channels_lzma(payload[:at] + wrong, [2])
-
-
-def lzma_of(numbers):
-    filters = [{"id": lzma.FILTER_LZMA2, "dict_size": 4096}]
-    return lzma.compress(numbers.tobytes(), format=lzma.FORMAT_RAW, filters=filters)
 
 
 def test_long_data_is_sampled_to_choose_a_layout():

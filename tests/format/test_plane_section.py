@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 
 from pd4dgs_codec.entropy.channels import encode_channels
 from pd4dgs_codec.entropy.priors import K_MAX
-from pd4dgs_codec.errors import DecodeError, LimitExceeded, Malformed, UnsupportedFeature
 from pd4dgs_codec.format import planes as module
 from pd4dgs_codec.format.planes import read_planes, write_planes
 from pd4dgs_codec.format.stages import PLAIN, STAGED
@@ -81,54 +80,3 @@ def test_the_largest_residuals_come_back(seed, channels):
     rng = np.random.default_rng(seed)
     planes = [rng.choice([-K_MAX, -1, 0, K_MAX], (channels, 9, 9)).astype(np.int32)]
     assert_same_planes(read_planes(written_in_stages(planes, 4), [planes[0].shape]), planes)
-
-
-def test_activity_is_the_sum_over_the_cells_around_with_the_border_repeated():
-    """Two classes, the activity of a lone 1 in the corner: the cells around it are class 1, all others class 0."""
-    planes = [np.zeros((3, 4, 5), np.int32)]
-    planes[0][0, 0, 0] = 1
-    planes[0][2, :3, :3] = 7
-    magnitude = np.zeros((4, 5), np.int64)
-    magnitude[0, 0] = 256 * 20 // 2
-    expected = 4 * magnitude
-    expected[0, 1] = expected[1, 0] = 2 * magnitude[0, 0]
-    expected[1, 1] = magnitude[0, 0]
-    with patch.object(module, "activity_classes", wraps=module.activity_classes) as classes:
-        written_in_stages(planes, 2)
-    np.testing.assert_array_equal(classes.call_args.args[0].reshape(4, 5), expected)
-
-
-SHAPES = [(5, 3, 4), (5, 1, 2)]
-
-
-@pytest.mark.parametrize(
-    ("begin", "error"),
-    [
-        (b"\2", UnsupportedFeature),
-        (b"", Malformed),
-        (b"\1\0", Malformed),  # class count 0
-        (b"\1\1\x09", LimitExceeded),  # class count 9
-        (b"\1\1\1\x7f", LimitExceeded),  # a stage of 127 bytes
-        (b"\1\1\1\1\1", Malformed),  # two stages of a byte, nothing left
-    ],
-)
-def test_a_faulty_block_is_refused(begin, error):
-    with pytest.raises(error):
-        read_planes(begin, SHAPES)
-
-
-def test_damage_raises_only_decode_errors():
-    planes = [busy(shape) for shape in ((5, 8, 9), (5, 10, 3))]
-    shapes = [plane.shape for plane in planes]
-    data = written_in_stages(planes, 3)
-    rng, refused = np.random.default_rng(2), 0
-    broken = [bytearray(data[:cut]) for cut in range(len(data))]
-    for _ in range(300):
-        broken.append(bytearray(data))
-        broken[-1][rng.integers(0, len(data))] ^= 1 << rng.integers(0, 8)
-    for section in broken:
-        try:
-            assert [plane.shape for plane in read_planes(bytes(section), shapes)] == shapes
-        except DecodeError:
-            refused += 1
-    assert refused > 0.9 * len(broken)  # a cut that leaves an empty ANS stream is a stream too

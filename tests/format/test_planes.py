@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.format.planes import PREDICTORS, choose_predictor, residual, restore
 from pd4dgs_codec.format.quantise import MAX_SYMBOL
 
@@ -71,12 +70,6 @@ def test_memory_is_linear_in_the_samples_of_any_shape(shape, predictor):
         assert tracemalloc.get_traced_memory()[1] < 40 * samples + (1 << 18)
     finally:
         tracemalloc.stop()
-
-
-@pytest.mark.parametrize("predictor", [p for p in PREDICTORS if p])
-def test_samples_over_the_limit_are_malformed(predictor):
-    with pytest.raises(Malformed, match="predictor"):
-        restore([(predictor, np.full((1, 3, 300), MAX_SYMBOL, np.int32))])
 
 
 def test_the_encoder_never_picks_residuals_over_the_limit():

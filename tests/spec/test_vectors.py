@@ -156,6 +156,7 @@ def test_the_package_says_where_each_fault_lies():
     def check(vector):
         with pytest.raises(DecodeError) as caught:
             hashes(read(vector))
+        assert str(caught.value).isprintable(), vector["file"]  # one line
         place = caught.value.chunk, caught.value.offset if "offset" in vector else None
         return None if place == (vector.get("chunk"), vector.get("offset")) else place
 
