@@ -93,10 +93,9 @@ export class LayerReader {
     let come = 0;
     const sums = chunks.map(({ type, length }) => (come += type < LAYER_TYPES ? length : 0));
     this._share = sums.map((sum) => sum / come);
-    const widths = { voxels: 3, anchor: 3, feature, scalingLog: 6, offset: 3 * slots };
-    for (const [name, width] of Object.entries(widths)) {
-      this._columns[name] = new Column(name === "voxels" ? Int32Array : Float32Array, width);
-    }
+    const widths = { anchor: 3, feature, scalingLog: 6, offset: 3 * slots };
+    this._columns = { voxels: new Column(Int32Array, 3) };
+    for (const [name, width] of Object.entries(widths)) this._columns[name] = new Column(Float32Array, width);
   }
 
   /** Whether the layer of the latest slice has no further ones. */
