@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import logging
 import math
 import os
 import subprocess
@@ -70,6 +71,7 @@ def open_video(path: Path, *, grey: bool = False, output: Sequence[str] = ()) ->
         raise DataError(f"{path}: found {'no file' if not path.exists() else 'no regular file'}, expected a video")
     from imageio_ffmpeg import read_frames  # of the extra `train`
 
+    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)  # else it warns of rotated and scaled ones
     reader = read_frames(str(path), output_params=list(output))
     try:
         with closing(reader):

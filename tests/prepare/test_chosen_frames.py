@@ -70,14 +70,15 @@ def remade(path, target, before=(), after=()):
     return target
 
 
-def test_a_video_held_upright_is_upright(recording, tmp_path):
-    """A phone writes its sensor's rows and a rotation."""
+def test_a_video_held_upright_is_upright(recording, tmp_path, caplog):
+    """A phone writes its sensor's rows and a rotation, which is no reason for a warning."""
     write_video(tmp_path / "flat.mp4", recording, FPS)
     path = remade(tmp_path / "flat.mp4", tmp_path / "up.mp4", ["-display_rotation:v:0", "90"], ["-c", "copy"])
     source = open_recording(path, FPS)
     assert source.size == (HEIGHT, WIDTH) and len(look(source, nothing)) == 16
     (found,) = source.pictures([3])
     np.testing.assert_array_equal(found, np.rot90(recording[3]))
+    assert not caplog.records
 
 
 def test_frames_of_a_varying_rate_have_their_times(recording, tmp_path):
