@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+#: Of pictures, pixels, unless another size is asked for.
 WIDTH, HEIGHT, FOCAL = 320, 240, 260.0
 
 
@@ -31,10 +32,17 @@ def pose(step: float) -> np.ndarray:
     return view
 
 
-def picture(view: np.ndarray, textures: list[np.ndarray], patch: float | None = None) -> np.ndarray:
-    """uint8 [HEIGHT, WIDTH, 3] of a wall, a floor, a box's front, and a square that stands at x = patch if given."""
-    u, v = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
-    rays = np.stack([(u - WIDTH / 2) / FOCAL, (v - HEIGHT / 2) / FOCAL, np.ones_like(u)], axis=-1) @ view[:3, :3]
+def picture(
+    view: np.ndarray,
+    textures: list[np.ndarray],
+    patch: float | None = None,
+    size: tuple[int, int] = (WIDTH, HEIGHT),
+    focal: float = FOCAL,
+) -> np.ndarray:
+    """uint8 [height, width, 3] of a wall, a floor, a box's front, and a square that stands at x = patch if given; size:
+    (width, height)."""
+    u, v = np.meshgrid(*(np.arange(side) + 0.5 - side / 2 for side in size))
+    rays = np.stack([u / focal, v / focal, np.ones_like(u)], axis=-1) @ view[:3, :3]
     eye = -view[:3, :3].T @ view[:3, 3]
     # point, normal, two axes, half sizes
     planes = [
@@ -44,8 +52,8 @@ def picture(view: np.ndarray, textures: list[np.ndarray], patch: float | None = 
     ]
     if patch is not None:
         planes.append(((patch, -0.2, 3.5), (0, 0, 1.0), (1, 0, 0), (0, 1, 0), (0.5, 0.5)))
-    result = np.zeros((HEIGHT, WIDTH, 3), np.float32)
-    nearest = np.full((HEIGHT, WIDTH), np.inf)
+    result = np.zeros(rays.shape, np.float32)
+    nearest = np.full(u.shape, np.inf)
     for image, (point, normal, a, b, half) in zip(textures, planes, strict=False):
         facing = rays @ np.array(normal)
         depth = (np.array(point) - eye) @ np.array(normal) / np.where(np.abs(facing) < 1e-9, np.inf, facing)
