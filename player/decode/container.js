@@ -1,7 +1,7 @@
 // Clause 3: preamble and chunk frames.
 
 import { DecodeError } from "./errors.js";
-import { crc32, hex, Sha256 } from "./digests.js";
+import { crc32, hex, sha256 } from "./digests.js";
 import { MAX_HEADER, MAX_PAYLOAD } from "./limits.js";
 
 const SIGNATURE = [0x89, 0x50, 0x44, 0x34, 0x0d, 0x0a, 0x1a, 0x0a];
@@ -97,7 +97,7 @@ export function readChunk(bytes, { listed, sceneId, offset, index }) {
 
 /** The scene id (3.3) in hexadecimal. @param {Uint8Array} described the header's bytes behind its chunk list */
 export function sceneIdOf(described) {
-  return hex(new Sha256().update(described).digest().subarray(0, SCENE_ID_SIZE));
+  return hex(sha256(described).subarray(0, SCENE_ID_SIZE));
 }
 
 /** @param {Uint8Array} bytes @param {number} size @param {string} what @param {number} offset

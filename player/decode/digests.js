@@ -1,4 +1,4 @@
-// Clause 2.1: CRC-32 of zlib, and SHA-256 of FIPS 180-4, both over bytes that may come in several runs.
+// Clause 2.1: CRC-32 of zlib, and SHA-256 of FIPS 180-4.
 
 /** Entry b is the CRC-32 of byte b, without the complements. */
 const CRC_TABLE = /* @__PURE__ */ Uint32Array.from({ length: 256 }, (_, c) => {
@@ -37,90 +37,63 @@ function primeRoots(/** @type {number} */ count, /** @type {number} */ power) {
 const ROUND_CONSTANTS = /* @__PURE__ */ primeRoots(64, 3);
 const START = /* @__PURE__ */ primeRoots(8, 2);
 
-/** A SHA-256 that takes its bytes piece by piece. */
-export class Sha256 {
-  constructor() {
-    this._state = START.slice();
-    this._words = new Int32Array(64);
-    this._block = new Uint8Array(64);
-    this._filled = 0;
-    this._length = 0;
-  }
+/** SHA-256. @param {Uint8Array} bytes @returns {Uint8Array} [32] */
+export function sha256(bytes) {
+  const whole = bytes.length - (bytes.length % 64);
+  const end = new Uint8Array(bytes.length - whole < 56 ? 64 : 128);
+  end.set(bytes.subarray(whole));
+  end[bytes.length - whole] = 128;
+  const view = new DataView(end.buffer);
+  view.setUint32(end.length - 8, Math.floor(bytes.length / 2 ** 29));
+  view.setUint32(end.length - 4, bytes.length << 3);
+  const state = START.slice();
+  compress(state, bytes.subarray(0, whole));
+  compress(state, end);
+  const out = new Uint8Array(32);
+  const words = new DataView(out.buffer);
+  state.forEach((word, i) => words.setInt32(4 * i, word));
+  return out;
+}
 
-  /** @param {Uint8Array} bytes @returns {this} */
-  update(bytes) {
-    this._length += bytes.length;
-    let at = 0;
-    if (this._filled) {
-      at = Math.min(64 - this._filled, bytes.length);
-      this._block.set(bytes.subarray(0, at), this._filled);
-      this._filled += at;
-      if (this._filled < 64) return this;
-      this._compress(this._block, 0, 1);
+/** @param {Int32Array} state [8], changed in place @param {Uint8Array} bytes whole blocks */
+function compress(state, bytes) {
+  const w = new Int32Array(64);
+  const k = ROUND_CONSTANTS;
+  for (let at = 0; at < bytes.length; ) {
+    for (let i = 0; i < 16; i++, at += 4) {
+      w[i] = (bytes[at] << 24) | (bytes[at + 1] << 16) | (bytes[at + 2] << 8) | bytes[at + 3];
     }
-    const blocks = (bytes.length - at) >>> 6;
-    this._compress(bytes, at, blocks);
-    at += 64 * blocks;
-    this._filled = bytes.length - at;
-    this._block.set(bytes.subarray(at));
-    return this;
-  }
-
-  /** The 32 bytes; nothing may be added afterwards. */
-  digest() {
-    const end = new Uint8Array(this._filled < 56 ? 64 - this._filled : 128 - this._filled);
-    const view = new DataView(end.buffer);
-    end[0] = 128;
-    view.setUint32(end.length - 8, Math.floor(this._length / 2 ** 29));
-    view.setUint32(end.length - 4, this._length << 3);
-    this.update(end);
-    const out = new Uint8Array(32);
-    const words = new DataView(out.buffer);
-    for (let i = 0; i < 8; i++) words.setInt32(4 * i, this._state[i]);
-    return out;
-  }
-
-  /** @param {Uint8Array} bytes @param {number} at @param {number} blocks */
-  _compress(bytes, at, blocks) {
-    const w = this._words;
-    const k = ROUND_CONSTANTS;
-    const state = this._state;
-    for (; blocks > 0; blocks--) {
-      for (let i = 0; i < 16; i++, at += 4) {
-        w[i] = (bytes[at] << 24) | (bytes[at + 1] << 16) | (bytes[at + 2] << 8) | bytes[at + 3];
-      }
-      for (let i = 16; i < 64; i++) {
-        const x = w[i - 15];
-        const y = w[i - 2];
-        const s0 = ((x >>> 7) | (x << 25)) ^ ((x >>> 18) | (x << 14)) ^ (x >>> 3);
-        const s1 = ((y >>> 17) | (y << 15)) ^ ((y >>> 19) | (y << 13)) ^ (y >>> 10);
-        w[i] = (w[i - 16] + s0 + w[i - 7] + s1) | 0;
-      }
-      let a = state[0], b = state[1], c = state[2], d = state[3];
-      let e = state[4], f = state[5], g = state[6], h = state[7];
-      for (let i = 0; i < 64; i++) {
-        const s1 = ((e >>> 6) | (e << 26)) ^ ((e >>> 11) | (e << 21)) ^ ((e >>> 25) | (e << 7));
-        const t1 = (h + s1 + (g ^ (e & (f ^ g))) + k[i] + w[i]) | 0;
-        const s0 = ((a >>> 2) | (a << 30)) ^ ((a >>> 13) | (a << 19)) ^ ((a >>> 22) | (a << 10));
-        const t2 = (s0 + ((a & b) | (c & (a | b)))) | 0;
-        h = g;
-        g = f;
-        f = e;
-        e = (d + t1) | 0;
-        d = c;
-        c = b;
-        b = a;
-        a = (t1 + t2) | 0;
-      }
-      state[0] += a;
-      state[1] += b;
-      state[2] += c;
-      state[3] += d;
-      state[4] += e;
-      state[5] += f;
-      state[6] += g;
-      state[7] += h;
+    for (let i = 16; i < 64; i++) {
+      const x = w[i - 15];
+      const y = w[i - 2];
+      const s0 = ((x >>> 7) | (x << 25)) ^ ((x >>> 18) | (x << 14)) ^ (x >>> 3);
+      const s1 = ((y >>> 17) | (y << 15)) ^ ((y >>> 19) | (y << 13)) ^ (y >>> 10);
+      w[i] = (w[i - 16] + s0 + w[i - 7] + s1) | 0;
     }
+    let a = state[0], b = state[1], c = state[2], d = state[3];
+    let e = state[4], f = state[5], g = state[6], h = state[7];
+    for (let i = 0; i < 64; i++) {
+      const s1 = ((e >>> 6) | (e << 26)) ^ ((e >>> 11) | (e << 21)) ^ ((e >>> 25) | (e << 7));
+      const t1 = (h + s1 + (g ^ (e & (f ^ g))) + k[i] + w[i]) | 0;
+      const s0 = ((a >>> 2) | (a << 30)) ^ ((a >>> 13) | (a << 19)) ^ ((a >>> 22) | (a << 10));
+      const t2 = (s0 + ((a & b) | (c & (a | b)))) | 0;
+      h = g;
+      g = f;
+      f = e;
+      e = (d + t1) | 0;
+      d = c;
+      c = b;
+      b = a;
+      a = (t1 + t2) | 0;
+    }
+    state[0] += a;
+    state[1] += b;
+    state[2] += c;
+    state[3] += d;
+    state[4] += e;
+    state[5] += f;
+    state[6] += g;
+    state[7] += h;
   }
 }
 

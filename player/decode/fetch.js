@@ -78,8 +78,6 @@ export class SceneSource {
     this._requested = { at: 0, received: 0 };
     /** Where the file was fetched anew after damage. */
     this._repairedAt = -1;
-    /** How many slices end within the first `consumed` bytes. */
-    this._slices = { consumed: 0, next: 0 };
     /** Preamble of the file. */
     this._head = new Uint8Array(PREAMBLE_SIZE);
     signal?.addEventListener("abort", () => this._controller?.abort(signal.reason), { once: true });
@@ -151,16 +149,12 @@ export class SceneSource {
     if (ends[0].end > limit && bytes === undefined && maxLayer >= 0) {
       throw new DecodeError("LimitExceeded", `layer 0 ends at byte ${ends[0].end}, limit ${MOST_BYTES}`);
     }
-    if (consumed < this._slices.consumed) this._slices = { consumed: 0, next: 0 }; // it changed
-    let { next } = this._slices; // slices and their layers ascend
-    while (next < ends.length && ends[next].end <= consumed) next++;
-    this._slices = { consumed, next };
-    if (next === ends.length || ends[next].layer > maxLayer || ends[next].end > limit) return null;
-    const { end } = ends[next];
+    const next = ends.find((slice) => slice.end > consumed);
+    if (!next || next.layer > maxLayer || next.end > limit) return null;
     const { at, received } = this._requested;
     const rate = (this.received - received) / (now() - at);
-    const late = until < Infinity && rate > 0 && end - this.received > rate * (until - now());
-    return late && next > 0 ? null : end;
+    const late = until < Infinity && rate > 0 && next.end - this.received > rate * (until - now());
+    return late && next !== ends[0] ? null : next.end;
   }
 
   /** The scenes that a block completes. After damage the download goes back to the last valid chunk, once.

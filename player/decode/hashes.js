@@ -1,9 +1,12 @@
 // Clause 12.4: digests of what a file decodes to.
 
-import { Sha256, hex } from "./digests.js";
+import { hex, sha256 } from "./digests.js";
 import { channelCount } from "./header.js";
 import { readAll } from "./reader.js";
-import { joined, mortonOrder, reordered } from "./slices.js";
+import { PLANES } from "./scene.js";
+import { mortonOrder } from "./slices.js";
+/** @import { LayerSymbols } from "./layer.js" */
+/** @import { Scene } from "./scene.js" */
 
 /** In hexadecimal. @typedef {{layer: number, symbols: string, tensors: string}} LayerHashes */
 
@@ -11,16 +14,21 @@ const LITTLE_ENDIAN = new Uint8Array(Uint16Array.of(1).buffer)[0] === 1;
 
 /** @param {(Int32Array | Float32Array)[]} arrays */
 function digest(arrays) {
-  const hash = new Sha256();
-  for (const { buffer, byteOffset, byteLength } of arrays) {
-    let bytes = new Uint8Array(buffer, byteOffset, byteLength);
-    if (!LITTLE_ENDIAN) {
-      bytes = bytes.slice();
-      for (let at = 0; at < bytes.length; at += 4) bytes.subarray(at, at + 4).reverse();
-    }
-    hash.update(bytes);
+  const bytes = joined(arrays.map(({ buffer, byteOffset, byteLength }) => new Uint8Array(buffer, byteOffset, byteLength)));
+  if (!LITTLE_ENDIAN) for (let at = 0; at < bytes.length; at += 4) bytes.subarray(at, at + 4).reverse();
+  return hex(sha256(bytes));
+}
+
+/** One behind the other. @template {Uint8Array | Int32Array} A @param {A[]} arrays at least one @returns {A} */
+function joined(arrays) {
+  const type = /** @type {new (length: number) => A} */ (arrays[0].constructor);
+  const all = new type(arrays.reduce((sum, { length }) => sum + length, 0));
+  let at = 0;
+  for (const array of arrays) {
+    all.set(array, at);
+    at += array.length;
   }
-  return hex(hash.digest());
+  return all;
 }
 
 /**
@@ -31,39 +39,44 @@ function digest(arrays) {
  * @returns {LayerHashes[]}
  */
 export function hashes(bytes, { maxLayer = null, allowPartial = false } = {}) {
-  /** @type {import("./reader.js").Slice[][]} */
-  const layers = [];
-  readAll(bytes, maxLayer, allowPartial, (slice) => {
-    if (slice.later) layers[layers.length - 1].push(slice);
-    else layers.push([slice]);
-  });
-  return layers.map(hashesOf);
+  /** @type {LayerSymbols[]} */
+  const slices = [];
+  const scene = readAll(bytes, maxLayer, allowPartial, (slice) => slices.push(slice));
+  return scene.layers.map((layer, i) => ({
+    layer,
+    symbols: digest(symbolsOf(scene, i, slices.filter(({ kind }) => kind.layer === layer))),
+    tensors: digest(tensorsOf(scene, i)),
+  }));
 }
 
-/** @param {import("./reader.js").Slice[]} slices of one layer @returns {LayerHashes} */
-function hashesOf(slices) {
-  const [{ symbols, tensors }] = slices;
-  const voxels = joined(slices.map((slice) => slice.symbols.voxels));
-  const order = slices.length > 1 ? mortonOrder(voxels) : null;
-  /** The rows of all slices. @template {Int32Array | Float32Array} A @param {A[]} arrays */
-  const sorted = (arrays) => (order ? reordered(joined(arrays), order) : arrays[0]);
-  const channels = channelCount(symbols.kind.widths);
-  const attributes = Array.from({ length: channels }, (_, c) =>
-    sorted(
-      slices.map(({ symbols: { attributes: all, parameters } }) =>
-        all.subarray(c * parameters.rows, (c + 1) * parameters.rows),
-      ),
-    ),
-  );
-  /** @param {"anchor" | "feature" | "scalingLog" | "offset"} name */
-  const values = (name) => sorted(slices.map((slice) => slice.tensors[name]));
-  const codes = sorted(slices.map((slice) => slice.symbols.codes));
-  const classes = symbols.kind.stepClasses ? [sorted(slices.map((slice) => slice.symbols.stepClasses))] : [];
-  const rows = [sorted([voxels]), symbols.rises, codes, ...classes, ...attributes];
-  const own = [values("anchor"), values("feature"), values("scalingLog"), values("offset")];
-  return {
-    layer: symbols.kind.layer,
-    symbols: digest([...rows, ...symbols.planes, ...symbols.weights]),
-    tensors: digest([...own, ...tensors.planes, ...tensors.weights]),
+/** @param {Scene} scene @param {number} i index of the layer @param {LayerSymbols[]} slices of it */
+function symbolsOf(scene, i, slices) {
+  const [{ kind, rises, planes, weights }] = slices;
+  const order = slices.length > 1 ? mortonOrder(joined(slices.map(({ voxels }) => voxels))) : null;
+  /** A channel of all slices. @param {(slice: LayerSymbols) => Int32Array} of */
+  const rows = (of) => {
+    const all = joined(slices.map(of));
+    return order ? Int32Array.from(order, (row) => all[row]) : all;
   };
+  const first = scene.rows[i - 1] ?? 0;
+  const codes = Int32Array.from(scene.mask[i].subarray(first));
+  const classes = kind.stepClasses ? [rows((slice) => slice.stepClasses)] : [];
+  const channels = Array.from({ length: channelCount(kind.widths) }, (_, c) =>
+    rows((slice) => slice.attributes.subarray(c * slice.codes.length, (c + 1) * slice.codes.length)),
+  );
+  const voxels = scene.anchorQ.subarray(3 * first, 3 * scene.rows[i]);
+  return [voxels, rises, codes, ...classes, ...channels, ...planes, ...weights];
+}
+
+/** @param {Scene} scene @param {number} i index of the layer */
+function tensorsOf(scene, i) {
+  const deformation = [null, scene.globalDeformation, scene.localDeformation][scene.layers[i]];
+  const networks = scene.layers[i] ? (deformation?.networks ?? {}) : scene.networks;
+  const all = scene.rows[scene.rows.length - 1];
+  const rows = [scene.anchor, scene.feature, scene.scalingLog, scene.offset].map((values) => {
+    const width = values.length / all;
+    return values.subarray(width * (scene.rows[i - 1] ?? 0), width * scene.rows[i]);
+  });
+  const planes = deformation?.planes.flatMap((scale) => PLANES.map((name) => scale[name].data)) ?? [];
+  return [...rows, ...planes, ...Object.values(networks).flat().flatMap(({ weight, bias }) => [weight, bias])];
 }

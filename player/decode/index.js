@@ -7,7 +7,7 @@
  */
 
 import { readAll } from "./reader.js";
-import { Stream, checkMaxLayer } from "./stream.js";
+import { Stream } from "./stream.js";
 
 export { DecodeError } from "./errors.js";
 export { hashes } from "./hashes.js";
@@ -34,9 +34,7 @@ export { Stream } from "./stream.js";
  */
 export function decode(bytes, { maxLayer = null, allowPartial = false } = {}) {
   const data = bytes instanceof Uint8Array ? bytes : new Uint8Array(bytes);
-  const reader = readAll(data, checkMaxLayer(maxLayer), allowPartial);
-  reader.sort();
-  return reader.scene();
+  return readAll(data, maxLayer, allowPartial);
 }
 
 /**

@@ -9,38 +9,39 @@ import { layerKind } from "./parameters.js";
 import { PLANES } from "./scene.js";
 import { Continuation, mortonOrder } from "./slices.js";
 import { VoxelTable } from "./voxels.js";
-/** @import { Header, ListedChunk } from "./header.js" */
+/** @import { Header } from "./header.js" */
 /** @import { LayerSymbols } from "./layer.js" */
 /** @import { Declared, NetworkShape, PlaneShape } from "./parameters.js" */
 /** @import { Deformation, Network, Plane, PlaneName, Scene, Steps } from "./scene.js" */
-
-/** The float32 values of one slice's own rows and networks.
- * @typedef {Omit<Own, "voxels" | "codes"> & {planes: Float32Array[], weights: Float32Array[]}} LayerTensors */
-
-/** later: whether slices of the same layer came before.
- * @typedef {{symbols: LayerSymbols, tensors: LayerTensors, later: boolean}} Slice */
 
 /**
  * Reads a whole file, or its layers up to maxLayer; of a cut file, if allowPartial, the slices that are there, at least
  * one. Raises DecodeError.
  *
  * @param {Uint8Array} bytes @param {number | null} maxLayer @param {boolean} allowPartial
- * @param {(slice: Slice) => void} [take] is given each slice
+ * @param {(slice: LayerSymbols) => void} [take] is given each slice
+ * @returns {Scene}
  */
 export function readAll(bytes, maxLayer, allowPartial, take) {
-  const reader = new LayerReader();
+  const reader = new LayerReader(maxLayer);
   try {
-    for (let slice; (slice = reader.next(bytes.subarray(reader.offset), maxLayer)); ) take?.(slice);
+    for (let slice; (slice = reader.next(bytes.subarray(reader.offset))); ) take?.(slice);
   } catch (error) {
     const cut = error instanceof DecodeError && error.kind === "Truncated";
     if (!cut || !allowPartial || !reader.count) throw error;
   }
-  return reader;
+  reader.sort();
+  return reader.scene();
 }
 
 /** Reads a file slice by slice. It keeps no bytes but the header's: every call gets what follows those it consumed. */
 export class LayerReader {
-  constructor() {
+  /** @param {number | null} maxLayer layers above it are not read; null: all are */
+  constructor(maxLayer) {
+    if (maxLayer !== null && !(Number.isInteger(maxLayer) && maxLayer >= 0)) {
+      throw new RangeError(`maxLayer is ${maxLayer}, expected 0 or more`);
+    }
+    this.maxLayer = maxLayer;
     /** @type {Header | null} */
     this.header = null;
     /** Of the next chunk, or of the header before it is read. */
@@ -63,9 +64,11 @@ export class LayerReader {
     this._loose = [];
   }
 
-  /** Whether every chunk that the header lists has been read. */
+  /** Whether every layer that was asked for has been read, and without maxLayer every chunk. */
   get complete() {
-    return this.header !== null && this._index === this.header.chunks.length;
+    if (!this.header) return false;
+    if (this.maxLayer === null) return this._index === this.header.chunks.length;
+    return (this._following[this._index] ?? Infinity) > this.maxLayer;
   }
 
   /**
@@ -87,9 +90,8 @@ export class LayerReader {
   _begin({ chunks, widths: { feature, slots } }) {
     this._following = [null];
     for (const { type } of [...chunks].reverse()) {
-      this._following.push(type < LAYER_TYPES ? type : this._following[this._following.length - 1]);
+      this._following.unshift(type < LAYER_TYPES ? type : this._following[0]);
     }
-    this._following.reverse();
     let come = 0;
     const sums = chunks.map(({ type, length }) => (come += type < LAYER_TYPES ? length : 0));
     this._share = sums.map((sum) => sum / come);
@@ -104,82 +106,78 @@ export class LayerReader {
   }
 
   /**
-   * Reads on to the end of one more slice of a layer of at most maxLayer; null if the file has no more.
+   * Reads on to the end of one more slice; null if the file has no more that were asked for.
    *
-   * Raises Truncated if the bytes end before: what was consumed until then stays so. Of a file that is read whole
-   * (maxLayer null), bytes behind the last chunk are Malformed.
+   * Raises Truncated if the bytes end before: what was consumed until then stays so. Of a file that is read whole,
+   * bytes behind the last chunk are Malformed.
    *
    * @param {Uint8Array} bytes the file from byte `offset` of it on, where this reader stands
-   * @param {number | null} maxLayer
-   * @returns {Slice | null}
+   * @returns {LayerSymbols | null}
    */
-  next(bytes, maxLayer) {
+  next(bytes) {
     const start = this.offset;
-    const { chunks } = this.readHeader(bytes);
-    while (this._index < chunks.length) {
-      const following = this._following[this._index];
-      if (maxLayer !== null && (following === null || following > maxLayer)) return null;
-      const slice = this._readChunk(bytes.subarray(this.offset - start), chunks[this._index]);
+    const header = this.readHeader(bytes);
+    while (!this.complete) {
+      const slice = this._readChunk(bytes.subarray(this.offset - start), header);
       if (slice) return slice;
     }
     const left = start + bytes.length - this.offset;
-    if (maxLayer === null && left > 0) {
+    if (this.maxLayer === null && left > 0) {
       const message = `${left} bytes follow the last chunk, expected none`;
       throw new DecodeError("Malformed", message, { offset: this.offset });
     }
     return null;
   }
 
-  /** @param {Uint8Array} bytes from the chunk on @param {ListedChunk} listed */
-  _readChunk(bytes, listed) {
-    const { header, offset } = this;
-    const index = this._index;
-    if (!header) throw new TypeError("no header");
+  /** @param {Uint8Array} bytes from the chunk on @param {Header} header */
+  _readChunk(bytes, header) {
+    const { offset, _index: index } = this;
+    const listed = header.chunks[index];
     const chunk = readChunk(bytes, { listed, sceneId: header.sceneId, offset, index });
-    /** @param {DecodeError} error @param {number} at */
-    const located = (error, at) => new DecodeError(error.kind, error.reason, { offset: offset + at, chunk: index });
-    const isLayer = listed.type < LAYER_TYPES;
-    if (!isLayer && !chunk.ancillary) throw located(unsupported(`critical chunk of unknown type ${listed.type}`), 0);
-    if (isLayer && chunk.ancillary) throw located(malformed(`layer ${listed.type} is flagged ancillary`), 0);
+    const undo = this._mark();
     let slice = null;
-    if (isLayer) {
-      const latest = this._layers[this._layers.length - 1];
-      const later = latest?.layer === listed.type;
-      const expected = later ? latest.slices : 0;
-      if (chunk.number !== expected) throw located(malformed(`slice ${chunk.number}, expected ${expected}`), 2);
-      const next = this._following[index + 1];
-      if (next !== null && chunk.more !== (next === listed.type)) {
-        const said = chunk.more ? "further slices" : "no further slice";
-        throw located(malformed(`layer ${listed.type} has ${said}, and layer ${next} follows`), 2);
-      }
-      const continuation = later ? latest.continuation : new Continuation();
-      const forget = continuation.mark();
-      const undo = this._mark();
-      try {
-        const symbols = decodeLayer(chunk.payload, layerKind(listed.type, header), this._declared, continuation, later);
-        slice = { symbols, tensors: this._accept(symbols, continuation, later), later };
-        this._declared = symbols.parameters.declared;
-      } catch (error) {
-        forget();
-        undo();
-        // What an engine says where it cannot allocate an array.
-        const full = error instanceof RangeError && /allocation|array length|buffer length/i.test(error.message);
-        const fault = full ? limitExceeded(`layer ${listed.type} takes more memory than there is`) : error;
-        throw fault instanceof DecodeError ? located(fault, 0) : fault;
-      }
-      this.count++;
+    try {
+      if (listed.type < LAYER_TYPES) slice = this._readSlice(chunk, listed.type, header);
+      else if (!chunk.ancillary) throw unsupported(`critical chunk of unknown type ${listed.type}`);
+    } catch (error) {
+      undo();
+      // What an engine says where it cannot allocate an array.
+      const full = error instanceof RangeError && /allocation|array length|buffer length/i.test(error.message);
+      const fault = full ? limitExceeded(`layer ${listed.type} takes more memory than there is`) : error;
+      if (!(fault instanceof DecodeError)) throw fault;
+      throw new DecodeError(fault.kind, fault.reason, { offset: offset + (fault.offset ?? 0), chunk: index });
     }
     this._index++;
     this.offset += CHUNK_OVERHEAD + listed.length;
     return slice;
   }
 
+  /** A slice, which is added to its layer. Offsets in its faults count from the chunk.
+   * @param {ReturnType<typeof readChunk>} chunk @param {number} layer @param {Header} header */
+  _readSlice({ ancillary, more, number, payload }, layer, header) {
+    if (ancillary) throw malformed(`layer ${layer} is flagged ancillary`);
+    const latest = this._layers[this._layers.length - 1];
+    const later = latest?.layer === layer;
+    const expected = later ? latest.slices : 0;
+    const next = this._following[this._index + 1];
+    const flagged = (/** @type {string} */ reason) => new DecodeError("Malformed", reason, { offset: 2 });
+    if (number !== expected) throw flagged(`slice ${number}, expected ${expected}`);
+    if (next !== null && more !== (next === layer)) {
+      throw flagged(`layer ${layer} has ${more ? "further slices" : "no further slice"}, and layer ${next} follows`);
+    }
+    const continuation = later ? latest.continuation : new Continuation();
+    const symbols = decodeLayer(payload, layerKind(layer, header), this._declared, continuation, later);
+    this._accept(symbols, continuation, later, header);
+    this._declared = symbols.parameters.declared;
+    this.count++;
+    return symbols;
+  }
+
   /** The rules of 12.1 that need header and earlier slices, then dequantisation.
-   * @param {LayerSymbols} symbols @param {Continuation} continuation @param {boolean} later @returns {LayerTensors} */
-  _accept(symbols, continuation, later) {
+   * @param {LayerSymbols} symbols @param {Continuation} continuation @param {boolean} later @param {Header} header */
+  _accept(symbols, continuation, later, header) {
     const { kind, parameters, voxels, rises } = symbols;
     const { steps, planes, networks, key } = parameters;
-    const header = /** @type {Header} */ (this.header);
     const where = `layer ${kind.layer}`;
     const latest = this._layers[this._layers.length - 1];
     const before = rises.length ? latest.codes.values : rises; // of a whole layer, in order
@@ -190,8 +188,7 @@ export class LayerReader {
       earlier[i] = code;
     }
     this._checkVoxels(voxels);
-    const anchor = dequantise(voxels, header.info.voxelSize);
-    const attributes = attributesOf(symbols, header);
+    const rows = { voxels, anchor: dequantise(voxels, header.info.voxelSize), ...attributesOf(symbols, header) };
     const tensors = {
       planes: symbols.planes.map((plane) => dequantise(plane, steps[0])),
       weights: symbols.weights.map((weight) => dequantise(weight, steps[steps.length - 1])),
@@ -200,31 +197,31 @@ export class LayerReader {
       if (!header.bounds.has(number)) throw malformed(`${where}: the header has no error bound of class ${number}`);
     }
     this._loose.push(voxels);
-    const growth = this._following[this._index + 1] === null ? 1 : Math.max(1.5, 1.25 / this._share[this._index]);
+    const following = this._following[this._index + 1];
+    const growth = following === null ? 1 : Math.max(1.5, 1.25 / this._share[this._index]);
     if (!later) {
       const codes = new Column(Uint8Array, 1);
       codes.append(earlier, (growth * (earlier.length + symbols.codes.length)) / Math.max(1, earlier.length));
-      const first = this._columns.voxels.rows;
-      const none = { slices: 0, first, sorted: true };
+      const none = { slices: 0, first: this._columns.voxels.rows, sorted: true };
       this._layers.push({ layer: kind.layer, ...none, steps, planes, networks, key, tensors, codes, continuation });
     }
     const layer = this._layers[this._layers.length - 1];
     layer.slices++;
     layer.codes.append(symbols.codes, growth);
-    const rows = { voxels, anchor, ...attributes };
     for (const [name, values] of Object.entries(rows)) this._columns[name].append(values, growth);
     layer.sorted = !later || (layer.sorted && !voxels.length);
-    if (this._following[this._index + 1] !== kind.layer) this.sort(growth);
-    return { anchor, ...attributes, ...tensors };
+    if (following !== kind.layer) this.sort(growth);
   }
 
-  /** Returns a function that undoes later additions of rows. */
+  /** Returns a function that undoes a slice, of which a part may have been added: it may be fetched again. */
   _mark() {
     const { length } = this._layers;
+    const forget = this._layers[length - 1]?.continuation.mark();
     const columns = [...Object.values(this._columns), ...this._layers.map(({ codes }) => codes)];
     const counts = columns.map(({ rows }) => rows);
     const loose = [...this._loose];
     return () => {
+      forget?.();
       this._layers.length = length;
       columns.forEach((column, i) => (column.rows = counts[i]));
       this._loose = loose;
@@ -296,18 +293,6 @@ export class LayerReader {
 }
 
 /**
- * The rows that a slice adds.
- *
- * @typedef {object} Own
- * @property {Int32Array} voxels
- * @property {Uint8Array} codes of the mask
- * @property {Float32Array} anchor
- * @property {Float32Array} feature
- * @property {Float32Array} scalingLog
- * @property {Float32Array} offset
- */
-
-/**
  * A layer as far as it has been read.
  *
  * @typedef {object} LayerParts
@@ -317,7 +302,7 @@ export class LayerReader {
  * @property {PlaneShape[]} planes
  * @property {NetworkShape[]} networks
  * @property {number | null} key
- * @property {Pick<LayerTensors, "planes" | "weights">} tensors
+ * @property {{planes: Float32Array[], weights: Float32Array[]}} tensors
  * @property {number} first row of its own
  * @property {boolean} sorted whether its rows are
  * @property {Column<Uint8Array>} codes of the mask, of all rows up to its own

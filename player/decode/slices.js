@@ -58,38 +58,3 @@ export function mortonOrder(voxels) {
     return offsets[3 * a + axis] - offsets[3 * b + axis];
   });
 }
-
-/**
- * The rows of an array in another order.
- *
- * @template {Int32Array | Float32Array | Uint8Array} A
- * @param {A} values @param {Uint32Array} order
- * @returns {A}
- */
-export function reordered(values, order) {
-  const out = /** @type {A} */ (values.slice());
-  const width = values.length / order.length;
-  if (width === 1) order.forEach((row, i) => (out[i] = values[row]));
-  else order.forEach((row, i) => out.set(values.subarray(width * row, width * (row + 1)), width * i));
-  return out;
-}
-
-/**
- * The arrays one behind the other; the only one that is not empty as it is.
- *
- * @template {Int32Array | Float32Array | Uint8Array} A
- * @param {A[]} arrays at least one
- * @returns {A}
- */
-export function joined(arrays) {
-  const filled = arrays.filter((array) => array.length);
-  if (filled.length <= 1) return filled[0] ?? arrays[0];
-  const type = /** @type {new (length: number) => A} */ (arrays[0].constructor);
-  const all = new type(filled.reduce((sum, array) => sum + array.length, 0));
-  let at = 0;
-  for (const array of filled) {
-    all.set(array, at);
-    at += array.length;
-  }
-  return all;
-}

@@ -8,19 +8,11 @@ import { LayerReader } from "./reader.js";
 
 const SMALLEST_BUFFER = 1 << 16;
 
-/** The least and the last layer of a prefix, or null for all layers. @param {number | null | undefined} maxLayer */
-export function checkMaxLayer(maxLayer) {
-  if (maxLayer == null) return null;
-  if (!Number.isInteger(maxLayer) || maxLayer < 0) throw new RangeError(`maxLayer is ${maxLayer}, expected 0 or more`);
-  return maxLayer;
-}
-
 /** A decoder that takes a file in pieces of any size. Its scenes do not depend on where the pieces are cut. */
 export class Stream {
   /** @param {{maxLayer?: number | null}} [options] layers above maxLayer are not looked at */
   constructor({ maxLayer = null } = {}) {
-    this._maxLayer = checkMaxLayer(maxLayer);
-    this._reader = new LayerReader();
+    this._reader = new LayerReader(maxLayer);
     this._buffer = new Uint8Array(0);
     /** The bytes of the file from `consumed` on stand here in the buffer. */
     this._start = 0;
@@ -29,14 +21,13 @@ export class Stream {
     this._needs = 0;
     /** @type {DecodeError | null} */
     this._error = null;
-    this._done = false;
     /** @type {{layer: number, end: number}[]} */
     this._ends = [];
   }
 
   /** Whether every layer that was asked for has arrived. */
   get complete() {
-    return this._done || this._reader.complete;
+    return this._reader.complete;
   }
 
   /** How many bytes of the file are decoded and no longer held: where a fetch that begins anew may go on. */
@@ -69,7 +60,7 @@ export class Stream {
    */
   feed(bytes) {
     if (this._error) throw this._error;
-    if (this._done) return [];
+    if (this.complete && this._reader.maxLayer !== null) return [];
     this._append(bytes);
     if (this.consumed + this._filled - this._start < this._needs) return [];
     /** @type {Scene[]} */
@@ -95,7 +86,7 @@ export class Stream {
   /** Says that no bytes follow: raises the pending fault, or Truncated if a slice is missing. */
   finish() {
     if (this._error) throw this._error;
-    if (!this._done) this._next();
+    this._next();
   }
 
   /** Forgets a fault and the bytes that are not decoded: feed the file from byte `consumed` on next. */
@@ -109,9 +100,7 @@ export class Stream {
   _next() {
     const before = this._reader.offset;
     try {
-      const layer = this._reader.next(this._buffer.subarray(this._start, this._filled), this._maxLayer);
-      this._done = layer === null && this._maxLayer !== null;
-      return layer !== null;
+      return this._reader.next(this._buffer.subarray(this._start, this._filled)) !== null;
     } finally {
       this._drop(this._reader.offset - before);
     }
