@@ -142,7 +142,7 @@ export class Pd4 extends Script {
 
   /** The scene's global properties (clause 5.1), null before `ready`. */
   get info() {
-    return this._playback?.begun ? this._playback.info : null;
+    return this._playback?.info ?? null;
   }
 
   /**
@@ -171,7 +171,7 @@ export class Pd4 extends Script {
   update(dt) {
     const camera = this.camera ?? this.app.systems.camera?.cameras[0]?.entity;
     const playback = this._playback;
-    if (!playback?.begun || !camera) return;
+    if (!playback?.info || !camera) return;
     const toScene = new Mat4().copy(this.entity.getWorldTransform()).invert();
     const { x, y, z } = toScene.transformPoint(camera.getPosition());
     playback.loop = this.loop;

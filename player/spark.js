@@ -52,6 +52,11 @@ export class Pd4Splats extends Playback {
     this._lastFrame = performance.now();
   }
 
+  /** The scene's global properties (clause 5.1). */
+  get info() {
+    return this._sceneThere().info;
+  }
+
   /** The colour behind the scene, for `scene.background`. */
   get background() {
     return new this._three.Color().setRGB(...this.info.background, this._three.SRGBColorSpace);
@@ -97,7 +102,7 @@ export class Pd4Splats extends Playback {
 
   /** Ends the workers and frees the mesh, which the page takes out of its scene. */
   close() {
-    if (!this._closed) this.mesh.dispose();
+    if (!this.closed) this.mesh.dispose();
     super.close();
   }
 

@@ -1,51 +1,32 @@
-// The evaluator without a GPU, in a worker: for machines that cannot render to float textures, and for networks that
-// shaders do not take.
+// The evaluator without a GPU, in a worker: for machines that cannot render to float textures, for networks that shaders
+// do not take, and for other programs' renderers.
 
-import { SPLAT_BLOCKS } from "./evaluator.js";
 import { Remote } from "./remote.js";
-/** @import { Gpu } from "./gl.js" */
+/** @import { Scene } from "../decode/scene.js" */
+/** @import { State } from "./level.js" */
 
-/** Gaussians in the layout of `Splats`. @typedef {{data: Float32Array, width: number, height: number}} Packed */
-
-/** The worker, which may be started before there is a scene. */
-export const startWorker = () => new Remote(new URL("./evaluate-worker.js", import.meta.url));
+/**
+ * Gaussians as texels, [4, height, width, 4], of which the first `count` are filled: columns 4·b to 4·b + 3 of a record
+ * in block b.
+ *
+ * @typedef {{count: number, data: Float32Array, width: number, height: number}} Packed
+ */
 
 export class CpuEvaluator {
-  /** @param {Gpu} gpu @param {import("../decode/scene.js").Scene} scene @param {Remote} [worker] which it then owns */
-  constructor(gpu, scene, worker = startWorker()) {
-    this._gpu = gpu;
-    this._remote = worker;
-    this.setScene(scene);
+  constructor() {
+    this._remote = new Remote(new URL("./evaluate-worker.js", import.meta.url));
+    /** What the worker has. @type {Scene | null} */
+    this._scene = null;
   }
 
-  /** @param {import("../decode/scene.js").Scene} scene that is evaluated from now on */
-  setScene(scene) {
-    this.scene = scene;
-    this._ready = this._remote.call("setScene", [scene]);
-    this._ready.catch(() => {}); // a worker that fails says so to the next call as well
+  /** @param {State} state @returns {Promise<Packed>} */
+  evaluate({ scene, level, t, eye }) {
+    const next = scene === this._scene ? null : scene;
+    this._scene = scene;
+    return this._remote.call("evaluate", [level, t, eye, next]);
   }
 
-  /**
-   * As GpuEvaluator's.
-   *
-   * @param {number} level @param {number} t @param {number[]} eye
-   * @param {import("./evaluator.js").Splats | null} into
-   * @returns {Promise<import("./evaluator.js").Evaluated>}
-   */
-  async evaluate(level, t, eye, into) {
-    await this._ready;
-    const { data, width, height } = /** @type {Packed} */ (await this._remote.call("evaluate", [level, t, eye]));
-    let field = into?.field;
-    if (!field || field.width !== width || field.height !== height) {
-      this._gpu.free(field);
-      field = this._gpu.field(width, height, SPLAT_BLOCKS);
-    }
-    this._gpu.write(field, data);
-    const texels = width * height;
-    return { splats: { field, texels }, means: data.slice(0, 4 * texels) };
-  }
-
-  free() {
+  close() {
     this._remote.close();
   }
 }

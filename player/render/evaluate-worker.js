@@ -7,19 +7,15 @@ import { serve } from "./remote.js";
 let scene;
 
 serve({
-  /** @param {import("../decode/scene.js").Scene} next */
-  setScene(next) {
-    scene = next;
-  },
-  /** @param {number} level @param {number} t @param {number[]} eye */
-  evaluate(level, t, eye) {
+  /** @param {number} level @param {number} t @param {number[]} eye @param {typeof scene | null} next a new scene */
+  evaluate(level, t, eye, next) {
+    scene = next ?? scene;
     const result = texels(evaluate(scene, level, t, eye));
     return { result, transfer: [result.data.buffer] };
   },
 });
 
-/** Records as texels, block after block; a texel without a Gaussian has opacity −1.
- * @param {import("./evaluate.js").Gaussians} gaussians @returns {import("./cpu.js").Packed} */
+/** @param {import("./evaluate.js").Gaussians} gaussians @returns {import("./cpu.js").Packed} */
 function texels({ count, records }) {
   const width = 2 ** Math.max(4, Math.ceil(Math.log2(Math.sqrt(count + 1))));
   const height = Math.max(1, Math.ceil(count / width));
@@ -28,6 +24,5 @@ function texels({ count, records }) {
   for (let i = 0; i < count; i++) {
     for (let k = 0; k < 16; k++) data[(k >> 2) * block + 4 * i + (k & 3)] = records[16 * i + k];
   }
-  for (let i = count; i < width * height; i++) data[4 * i + 3] = -1;
-  return { data, width, height };
+  return { count, data, width, height };
 }

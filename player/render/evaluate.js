@@ -8,8 +8,8 @@ import { SPATIAL, sliceAt, TEMPORAL } from "./level.js";
 /** @import { Deformation, Network, Plane, PlaneName, Scene } from "../decode/scene.js" */
 
 /**
- * The visible Gaussians in ascending order of their slot, anchor · slots + i. records: [count, GAUSSIAN_COLUMNS].
- * Opacity and scale include the anchor's gate.
+ * The visible Gaussians in ascending order of their slot, anchor · slots + i. records: [count, GAUSSIAN_COLUMNS], all
+ * finite. Opacity and scale include the anchor's gate.
  *
  * @typedef {{count: number, slot: Uint32Array, records: Float32Array}} Gaussians
  */
@@ -342,7 +342,7 @@ class Evaluator {
         record[3] = opacity * gate;
         for (let k = 0; k < 4; k++) record[8 + k] = floats[v + 3 + k];
         normaliseQuaternion(record, 8);
-        kept.add(S * anchors[r] + i, record);
+        if (record.every(Number.isFinite)) kept.add(S * anchors[r] + i, record);
       }
     });
   }

@@ -9,14 +9,16 @@ import { anchorColumns } from "../decode/heads.js";
 import { FieldPass } from "./field.js";
 import { blocksOf, Linear, pack, repeat, targets, TooLarge } from "./layers.js";
 import { eachAttribute, GAUSSIAN_COLUMNS, levelOf } from "./level.js";
+import { ANCHOR_BITS, NO_ENTRY } from "./sort.js";
 /** @import { Deformation, Network, Scene } from "../decode/scene.js" */
 /** @import { Field, Gpu } from "./gl.js" */
+/** @import { List, Lister } from "./sort.js" */
 
 /**
  * Visible Gaussians for the renderer: their records in texels of SPLAT_BLOCKS blocks. A texel without a Gaussian has
  * opacity −1. shapes: stands for the time and the list of which they have the opacities and shapes.
  *
- * @typedef {{field: Field, texels: number, shapes?: object}} Splats
+ * @typedef {{field: Field, shapes?: object}} Splats
  */
 
 /**
@@ -33,11 +35,6 @@ const COLOR_BLOCK = 3;
 export const SPLAT_BLOCKS = GAUSSIAN_COLUMNS / 4;
 /** Limit of the textures of all anchors, bytes: beyond it devices fail in ways that cannot be distinguished. */
 const MAX_BYTES = 2 ** 30;
-/** A list's texel without a Gaussian. */
-export const NO_ENTRY = 0xffffffff;
-/** Bits of an anchor's number in an entry of a list; the slot lies above. */
-export const ANCHOR_BITS = 24;
-
 /** A texture's width for `n` texels. @param {number} n */
 const widthFor = (n) => 2 ** Math.max(4, Math.ceil(Math.log2(Math.sqrt(n))));
 
@@ -294,13 +291,6 @@ void main() {
     return { splats, means: gaussiansMoved ? await gpu.read(splats.field, 0, 1, this._listed.rows) : null };
   }
 
-  /** The Gaussians of the last evaluation: anchor · slots + i of each texel, NO_ENTRY where there is none. */
-  slotsOfTexels() {
-    return this._listed.entries.map((e) =>
-      e === NO_ENTRY ? NO_ENTRY : (e & (2 ** ANCHOR_BITS - 1)) * this._slots + (e >>> ANCHOR_BITS),
-    );
-  }
-
   /** First layers. @param {number} lines */
   _runFirst(lines) {
     const gpu = this._gpu;
@@ -320,9 +310,14 @@ ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i};`)}}`,
 
   /** Source that reads anchors' attributes, moved if something moves them. */
   _anchorSource() {
-    return `uniform sampler2DArray anchors${this._motion ? ", residual" : ""};
+    return `uniform vec3 eye;
+uniform sampler2DArray anchors${this._motion ? ", residual" : ""};
 vec4 anchorBlock(ivec2 p, int block) {
   return texelFetch(anchors, ivec3(p, block), 0)${this._motion ? " + texelFetch(residual, ivec3(p, block), 0)" : ""};
+}
+vec3 directionTo(ivec2 p) {
+  vec3 d = anchorBlock(p, 0).xyz - eye;
+  return d / max(length(d), 1e-30);
 }
 `;
   }
@@ -344,11 +339,9 @@ vec4 anchorBlock(ivec2 p, int block) {
         this._anchorSource() +
         `uniform sampler2DArray before;
 uniform sampler2D codes;
-uniform vec3 eye;
 void main() {
 ivec2 p = ivec2(gl_FragCoord.xy);
-vec3 d = anchorBlock(p, 0).xyz - eye;
-d /= max(length(d), 1e-30);
+vec3 d = directionTo(p);
 ${this._opacity.compute(1, "x")}
 ${linear.apply(false)}
 float gate = texelFetch(codes, p, 0).r;
@@ -378,14 +371,10 @@ ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i} * vec4(greaterThanEqual(y${
     const { gl } = gpu;
     const { width, starts, rows } = this._listed;
     const height = Math.max(this._listed.entries.length / width, 1);
-    let field = into?.field;
-    if (!field || field.width !== width || field.height !== height) {
-      gpu.free(field);
-      field = gpu.field(width, height, SPLAT_BLOCKS);
-    }
+    const field = gpu.renewed(into?.field, width, height, SPLAT_BLOCKS);
     const blind = !this._opacity.views && !this._covariance.views;
     const kept = blind && into?.field === field && into.shapes === this._shape;
-    const splats = { field, texels: rows * width, shapes: this._shape };
+    const splats = { field, shapes: this._shape };
     if (!rows || !this._list || !this._codes) return splats;
     const shapes = this._shapes;
     const program = gpu.program(kept ? this._colorSource() : this._shapeSource());
@@ -453,13 +442,13 @@ void main() {
   /** What both take. */
   _listedSource() {
     const L = this._color.blocks;
-    return `${this._anchorSource() + entrySource(this._width) + this._color.declare(2)}
+    return `${this._anchorSource() + this._color.declare(2)}
 layout(std140) uniform U4 { vec4 b4; mat4 w4[${L}]; };
 uniform sampler2DArray before;
-uniform vec3 eye;
-vec3 directionTo(ivec2 p) {
-  vec3 d = anchorBlock(p, 0).xyz - eye;
-  return d / max(length(d), 1e-30);
+uniform usampler2D list;
+ivec2 anchorOf(uint entry) {
+  int a = int(entry & ${2 ** ANCHOR_BITS - 1}u);
+  return ivec2(a % ${this._width}, a / ${this._width});
 }
 vec4 colorOf(ivec2 p, vec3 d) {
 ${this._color.compute(2, "c")}
@@ -490,25 +479,3 @@ function rowsOf({ weight, bias, inputs }, first, count) {
   };
 }
 
-/** Source that reads the list of kept Gaussians. @param {number} width of the anchors' textures */
-function entrySource(width) {
-  return `uniform usampler2D list;
-ivec2 anchorOf(uint entry) {
-  int a = int(entry & ${2 ** ANCHOR_BITS - 1}u);
-  return ivec2(a % ${width}, a / ${width});
-}
-`;
-}
-
-/**
- * The kept Gaussians, slot after slot. entries: [height, width] texels, an anchor's number and above it the slot, or
- * NO_ENTRY. starts: the row of texels where each slot starts, and where the last one ends. rows: that end.
- *
- * @typedef {{width: number, rows: number, entries: Uint32Array, starts: Uint32Array, count: number}} List
- */
-
-/**
- * Calls listGaussians of sort.js, in a worker.
- *
- * @typedef {(...args: Parameters<typeof import("./sort.js").listGaussians>) => Promise<List | null>} Lister
- */

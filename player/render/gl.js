@@ -142,6 +142,18 @@ export class Gpu {
     return field;
   }
 
+  /**
+   * `had` if it has this size, else a field in its place.
+   *
+   * @param {Field | null | undefined} had @param {number} width @param {number} height @param {number} blocks
+   * @param {number} [format] as in `field`
+   */
+  renewed(had, width, height, blocks, format) {
+    if (had?.width === width && had.height === height) return had;
+    this.free(had);
+    return this.field(width, height, blocks, null, format);
+  }
+
   /** Overwrites a field of floats. @param {Field} field @param {Float32Array} data [blocks, height, width, 4] */
   write({ texture, width, height, blocks }, data) {
     const { gl } = this;

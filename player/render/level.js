@@ -120,18 +120,6 @@ export function sameState(a, b) {
   return a.scene === b.scene && a.level === b.level && a.t === b.t && eyes();
 }
 
-/**
- * Where playing arrives. ended: whether that is the end, which it does not leave.
- *
- * @param {number} time @param {number} elapsed seconds @param {[number, number]} range @param {boolean} loop
- */
-export function timeAfter(time, elapsed, [start, end], loop) {
-  const next = time + elapsed;
-  if (next < end) return { time: next, ended: false };
-  if (loop && end > start) return { time: start + ((next - start) % (end - start)), ended: false };
-  return { time: end, ended: true };
-}
-
 /** Normalised time of `seconds` (clause 13.1). @param {Scene["info"]} info @param {number} seconds */
 function normalisedTime({ timeRange: [start, end] }, seconds) {
   const t = (seconds - start) / (end - start);

@@ -120,7 +120,7 @@ export class Painter {
     const nothing = gpu.field(1, 1, 4);
     this.setOrder(new Uint32Array(1));
     const K = new Float32Array([1, 0, 1, 0, 1, 1, 0, 0, 1]);
-    this.draw({ field: nothing, texels: 1 }, [{ viewmat: new Float32Array(16), K, width: 2, height: 2 }], [0, 0, 0], 1);
+    this.draw({ field: nothing }, [{ viewmat: new Float32Array(16), K, width: 2, height: 2 }], [0, 0, 0], 1);
     this.count = 0;
     gpu.free(nothing);
     gl.flush();
@@ -160,10 +160,7 @@ export class Painter {
     const height = target?.framebufferHeight ?? views[0].height;
     const framebuffer = target?.framebuffer ?? null;
     if (gpu.pictureFormat) {
-      if (this._picture?.width !== width || this._picture.height !== height) {
-        gpu.free(this._picture);
-        this._picture = gpu.field(width, height, 1, null, gpu.pictureFormat);
-      }
+      this._picture = gpu.renewed(this._picture, width, height, 1, gpu.pictureFormat);
       gpu.bindTarget(this._picture, 0, 1);
     } else {
       gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);

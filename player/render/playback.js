@@ -2,10 +2,10 @@
 // are evaluated in a worker.
 
 import { centreOf } from "./camera.js";
-import { startWorker } from "./cpu.js";
-import { levelOf, sameState, stateOf, timeAfter } from "./level.js";
-import { Emitter, startLoader } from "./loader.js";
-/** @import { Camera, Scene } from "../decode/scene.js" */
+import { CpuEvaluator } from "./cpu.js";
+import { levelOf, sameState, stateOf } from "./level.js";
+import { Clip } from "./loader.js";
+/** @import { Camera } from "../decode/scene.js" */
 /** @import { State } from "./level.js" */
 
 /**
@@ -38,36 +38,25 @@ export function poseOf(view) {
 /**
  * Loads a scene, keeps its time, and hands Gaussians to a renderer whenever they change.
  *
- * Events: `upgrade` {level, anchors, gaussians} when a higher level, or more anchors of it, is with the renderer;
- * `loaded` {bytes, complete}; `error` {message, kind}, after which what was valid stays.
+ * Events: those of `Clip`, of which `error` leaves what was valid; `upgrade` {level, anchors, gaussians} when a higher
+ * level, or more anchors of it, is with the renderer.
  */
-export class Playback extends Emitter {
+export class Playback extends Clip {
   /** @param {PlaybackOptions} options @param {(gaussians: Gaussians) => void | Promise<void>} fill takes Gaussians;
    * the next ones come when it is done */
   constructor({ time, loop = true }, fill) {
-    super();
+    super({ time, loop });
     this._fill = fill;
     /** The highest level to show of what is loaded, null: all. @type {number | null} */
     this.level = null;
-    /** Whether playing begins anew at the end. */
-    this.loop = loop;
-    /** @type {Scene | null} */
-    this._scene = null;
-    this._time = time;
-    this._playing = false;
-    /** Whether `play` was called since the last `advance`. */
-    this._resumed = false;
     this._resolve = () => {};
-    this._loader = startLoader((news) => this._told(news));
-    this._evaluator = startWorker();
-    /** What the evaluator has. @type {Scene | null} */
-    this._evaluatorScene = null;
+    this._reject = (/** @type {unknown} */ _reason) => {};
+    this._evaluator = new CpuEvaluator();
     /** @type {State | null} */
     this._wanted = null;
     /** What the renderer has. @type {State | null} */
     this._shown = null;
     this._evaluating = false;
-    this._closed = false;
   }
 
   /**
@@ -77,88 +66,30 @@ export class Playback extends Emitter {
    * @returns {Promise<this>} as soon as the first layer, or slice of it, is there
    * @throws {Error} with `kind`, a name of clause 15 or FetchError, if it never is
    */
-  load(source, options) {
+  load(source, { level, bytes, seconds }) {
+    this._open(source);
+    this._load({ maxLayer: level ?? Infinity, bytes, seconds }).then(() => this.stopLoading());
     return new Promise((resolve, reject) => {
       this._resolve = () => resolve(this);
-      this._load(source, options).catch((error) => {
-        if (this._scene) this._fail(error);
-        else {
-          this.close();
-          reject(error);
-        }
-      });
+      this._reject = reject;
     });
-  }
-
-  /** @param {string | URL | Blob} source @param {PlaybackOptions} options */
-  async _load(source, { level, bytes, seconds }) {
-    const from = source instanceof Blob ? source : new URL(source, document.baseURI).href;
-    await this._loader.call("open", [from]);
-    const result = await this._loader.call("load", [{ maxLayer: level ?? Infinity, bytes, seconds }]);
-    this._loader.close();
-    this._emit("loaded", result);
-  }
-
-  /** @param {import("./loader-worker.js").News} news */
-  _told({ scene }) {
-    if (!scene) return;
-    this._scene = scene;
-    this.time = this.time; // into the scene's range
-    this._resolve();
-  }
-
-  /** Whether there is something to show. */
-  get begun() {
-    return !!this._scene;
-  }
-
-  /** The scene's global properties (clause 5.1). */
-  get info() {
-    return this._sceneThere().info;
   }
 
   /** The layers that have arrived. */
   get levels() {
-    return this._sceneThere().layers;
-  }
-
-  /** Seconds of the scene's time. */
-  get time() {
-    return this._time ?? this.info.timeRange[0];
-  }
-
-  set time(seconds) {
-    const [start, end] = this.info.timeRange;
-    this._time = Math.min(Math.max(seconds, start), Math.max(start, end));
-  }
-
-  get paused() {
-    return !this._playing;
-  }
-
-  play() {
-    if (this.time >= this.info.timeRange[1]) this.time = this.info.timeRange[0];
-    this._playing = this._resumed = true;
-  }
-
-  pause() {
-    this._playing = false;
+    return this._scene?.layers ?? [];
   }
 
   /**
    * Advances time if the scene plays, and brings the Gaussians of time, level and eye to the renderer as soon as they
    * are evaluated. A slow evaluation skips frames, not time.
    *
-   * @param {number} elapsed seconds since the last call, of which the first after `play` has none @param {number[]} eye the camera's centre, scene units
+   * @param {number} elapsed seconds since the last call, of which the first after `play` has none @param {number[]} eye
+   * the camera's centre, scene units
    */
   advance(elapsed, eye) {
     const scene = this._sceneThere();
-    if (this._playing) {
-      const { time, ended } = timeAfter(this.time, this._resumed ? 0 : elapsed, scene.info.timeRange, this.loop);
-      this._time = time;
-      this._playing = !ended;
-    }
-    this._resumed = false;
+    this._advance(elapsed);
     this._wanted = stateOf(scene, Math.max(this.level ?? Infinity, 0), this.time, eye);
     this._evaluate();
   }
@@ -170,15 +101,31 @@ export class Playback extends Emitter {
 
   /** Ends the workers. */
   close() {
-    this._closed = true;
-    this._loader.close();
+    super.close();
     this._evaluator.close();
-    this._scene = this._evaluatorScene = this._wanted = this._shown = null;
+    this._reject(new Error("the scene is closed"));
+    this._wanted = this._shown = null;
   }
 
   _sceneThere() {
     if (!this._scene) throw new Error("the scene is closed");
     return this._scene;
+  }
+
+  /** @param {import("./loader-worker.js").News} news */
+  _told(news) {
+    const first = super._told(news);
+    if (first) this._resolve();
+    return first;
+  }
+
+  /** @param {unknown} error */
+  _fail(error) {
+    if (this._scene) super._fail(error);
+    else {
+      this._reject(error);
+      this.close();
+    }
   }
 
   /** Evaluates until the renderer has the wanted state; intermediate ones are skipped. */
@@ -188,18 +135,18 @@ export class Playback extends Emitter {
     try {
       while (this._wanted && !this.settled) {
         const state = this._wanted;
-        if (state.scene !== this._evaluatorScene) await this._evaluator.call("setScene", [state.scene]);
-        this._evaluatorScene = state.scene;
-        const gaussians = gaussiansOf(await this._evaluator.call("evaluate", [state.level, state.t, state.eye]));
-        if (this._closed) return;
-        await this._fill(gaussians);
-        if (this._closed) return;
-        this._tell(state, gaussians.count);
+        const { count, data } = await this._evaluator.evaluate(state);
+        if (this.closed) return;
+        const at = data.length / 4;
+        const [means, scales, quaternions, colors] = [0, 1, 2, 3].map((b) => data.subarray(b * at, b * at + 4 * count));
+        await this._fill({ count, means, scales, quaternions, colors });
+        if (this.closed) return;
+        this._tell(state, count);
         this._shown = state;
       }
       this._evaluating = false;
     } catch (error) {
-      if (!this._closed) this._fail(error); // and nothing is evaluated any more
+      if (!this.closed) this._fail(error); // and nothing is evaluated any more
     }
   }
 
@@ -210,19 +157,4 @@ export class Playback extends Emitter {
     if (had && level <= had.level && anchors <= levelOf(had.scene, had.level).rows) return;
     this._emit("upgrade", { level, anchors, gaussians });
   }
-}
-
-/** Leaves out, in place, what cannot be seen. @param {import("./cpu.js").Packed} packed @returns {Gaussians} */
-function gaussiansOf({ data, width, height }) {
-  const block = 4 * width * height;
-  let end = 0;
-  for (let at = 0; at < block; at += 4) {
-    let sum = 0;
-    for (let k = 0; k < 16; k++) sum += data[(k >> 2) * block + at + (k & 3)];
-    if (!(data[at + 3] > 0 && Number.isFinite(sum))) continue;
-    for (let k = 0; k < 16; k++) data[(k >> 2) * block + end + (k & 3)] = data[(k >> 2) * block + at + (k & 3)];
-    end += 4;
-  }
-  const [means, scales, quaternions, colors] = [0, 1, 2, 3].map((b) => data.subarray(b * block, b * block + end));
-  return { count: end / 4, means, scales, quaternions, colors };
 }

@@ -1,16 +1,16 @@
 // A player on a canvas. It loads, evaluates, sorts and draws, each step only when its inputs have changed.
 
 import { centreOf, defaultCamera, fitted } from "./camera.js";
-import { CpuEvaluator, startWorker } from "./cpu.js";
-import { GpuEvaluator } from "./evaluator.js";
+import { CpuEvaluator } from "./cpu.js";
+import { GpuEvaluator, SPLAT_BLOCKS } from "./evaluator.js";
 import { ContextLost, Gpu } from "./gl.js";
-import { levelOf, sameState, stateOf, timeAfter } from "./level.js";
+import { levelOf, sameState, stateOf } from "./level.js";
+import { Clip } from "./loader.js";
 import { Pace } from "./pace.js";
 import { Painter } from "./painter.js";
 import { Remote } from "./remote.js";
-import { Emitter, startLoader } from "./loader.js";
 /** @import { Camera, Scene } from "../decode/scene.js" */
-/** @import { Splats } from "./evaluator.js" */
+/** @import { Evaluated, Splats } from "./evaluator.js" */
 /** @import { State } from "./level.js" */
 
 /**
@@ -51,31 +51,24 @@ const SOFTWARE_ANCHORS = 30_000;
 const SOFTWARE_STEP = 2;
 
 /**
- * Events: `progress` {bytes, total}, `firstpicture` and `upgrade` {level, bytes, seconds, arrived, decoded},
- * `loaded` {bytes, complete}, `timeupdate` {time}, `statechange` (play or pause), `error` {message, kind}. Seconds
- * count from `load`: to the picture, to the last byte that it is made of, and to the end of their decoding.
+ * Events: those of `Clip`; `progress` {bytes, total}; `firstpicture` and `upgrade` {level, bytes, seconds, arrived,
+ * decoded}. Seconds count from `load`: to the picture, to the last byte that it is made of, and to the end of their
+ * decoding.
  */
-export class Player extends Emitter {
+export class Player extends Clip {
   /** @param {HTMLCanvasElement} canvas @param {Options} [options] */
   constructor(canvas, options = {}) {
-    super();
+    super(options);
     this.canvas = canvas;
     this._options = options;
-    /** @type {Scene | null} */
-    this._scene = null;
     /** @type {Camera | null} */
     this._camera = null;
     /** The camera of a headset, which draws meanwhile. @type {Camera | null} */
     this._head = null;
     /** @type {number | null} */
     this._level = options.level ?? null;
-    /** Seconds of the scene's time, null: its start. @type {number | null} */
-    this._time = options.time ?? null;
-    this._playing = false;
     this._pace = new Pace();
     this._sorter = new Remote(new URL("./sort-worker.js", import.meta.url));
-    /** @type {Remote | null} */
-    this._loader = null;
     /** The highest level that loading went for. */
     this._loadedLevel = Infinity;
     /** @type {Pick<Status, "bytes" | "total" | "loading" | "ends">} */
@@ -85,18 +78,17 @@ export class Player extends Emitter {
     this._gpu = null;
     /** @type {Painter | null} */
     this._painter = null;
-    /** @type {GpuEvaluator | CpuEvaluator | null} */
+    /** @type {GpuEvaluator | null} */
     this._evaluator = null;
-    this._useCpu = options.evaluator === "cpu";
-    /** For the first picture. @type {Remote | null} */
-    this._cpuWorker = null;
+    /** @type {CpuEvaluator | null} */
+    this._cpu = null;
+    /** Whether shaders do not take the file's networks. */
+    this._unfit = false;
     /** The Gaussians on show, and their state. @type {{splats: Splats, state: State} | null} */
     this._front = null;
     /** @type {Splats | null} */
     this._spare = null;
     this._evaluating = false;
-    /** Whether the sorter may hold means that are not on show yet. */
-    this._swapping = false;
     this._sorting = false;
     this._drawing = false;
     /** Row of the view matrix that the order is for. @type {ArrayLike<number> | null} */
@@ -116,8 +108,6 @@ export class Player extends Emitter {
     this._came = new WeakMap();
     /** Pictures drawn and evaluations made so far. */
     this.counts = { drawn: 0, evaluated: 0 };
-    this._closed = false;
-
     this._listening = new AbortController();
     const { signal } = this._listening;
     const lost = (/** @type {Event} */ event) => {
@@ -130,7 +120,7 @@ export class Player extends Emitter {
     };
     canvas.addEventListener("webglcontextlost", lost, { signal });
     canvas.addEventListener("webglcontextrestored", restored, { signal });
-    this._resize = new ResizeObserver(() => this._touch());
+    this._resize = new ResizeObserver(() => this._changed());
     this._resize.observe(canvas);
     this._visible = true;
     this._seen = new IntersectionObserver(([entry]) => {
@@ -138,8 +128,6 @@ export class Player extends Emitter {
       this._wake();
     });
     this._seen.observe(canvas);
-    /** Whether something was loaded before. */
-    this._loaded = false;
   }
 
   // --- public
@@ -151,13 +139,8 @@ export class Player extends Emitter {
    * @returns {Promise<void>} settles when no more is loaded; errors are events
    */
   async load(source) {
-    if (this._closed) return;
-    this.stopLoading();
-    const from = source instanceof Blob ? source : new URL(source, document.baseURI).href;
-    const loader = startLoader((news) => {
-      if (loader === this._loader) this._told(news);
-    }, from);
-    this._loader = loader;
+    if (this.closed) return;
+    this._open(source);
     this._scene = null;
     this._shownLevel = null;
     this._camera = null;
@@ -169,90 +152,33 @@ export class Player extends Emitter {
     this._time = this._options.time ?? null;
     this._status = { bytes: 0, total: null, loading: true, ends: [] };
     this._started = performance.now();
-    this._touch();
-    loader.call("open", [from]).catch(() => {}); // a worker that fails says so to the next call as well
-    const loading = this._loadOn(loader);
-    if (!this._loaded) this._startGpu(); // which takes longer than to ask a server
-    this._loaded = true;
-    this._useCpu = this._options.evaluator === "cpu" || !(this._gpu?.floats ?? true);
-    if (this._useCpu || (this._gpu?.software && this._options.evaluator !== "gpu")) this._cpuWorker ??= startWorker();
+    this._changed();
+    this._unfit = false;
+    const loading = this._loadOn();
+    if (!this._gpu) this._startGpu(); // which takes longer than to ask a server
+    if (this._options.evaluator === "cpu" || this._gpu?.software) this._cpu ??= new CpuEvaluator();
     await loading;
   }
 
-  /** Loads as much as options and level allow. @param {Remote} loader */
-  async _loadOn(loader) {
+  /** Loads as much as options and level allow. */
+  async _loadOn() {
     const { bytes, seconds } = this._options;
-    const maxLayer = this._level ?? Infinity;
-    this._loadedLevel = maxLayer;
+    const loader = this._loader;
+    this._loadedLevel = this._level ?? Infinity;
     this._status.loading = true;
-    try {
-      const budget = { maxLayer, bytes: bytes ?? undefined, seconds: seconds ?? undefined };
-      const result = await loader.call("load", [budget]);
-      if (loader !== this._loader) return;
-      if (result.complete) this.stopLoading();
-      this._emit("loaded", result);
-    } catch (error) {
-      if (loader !== this._loader) return;
-      this.stopLoading();
-      this._fail(error);
-    } finally {
-      if (loader === this._loader) this._status.loading = false;
-    }
+    await this._load({ maxLayer: this._loadedLevel, bytes: bytes ?? undefined, seconds: seconds ?? undefined });
+    if (loader === this._loader) this._status.loading = false;
   }
 
   /** Stops loading; layers that have arrived stay. */
   stopLoading() {
-    this._loader?.close();
-    this._loader = null;
+    super.stopLoading();
     this._status.loading = false;
-  }
-
-  /** The scene's global properties, null before the first layer. */
-  get info() {
-    return this._scene?.info ?? null;
   }
 
   /** The scene as far as it has arrived. */
   get scene() {
     return this._scene;
-  }
-
-  /** Seconds of the scene's time at its start and end. @returns {[number, number]} */
-  get timeRange() {
-    return this._scene?.info.timeRange ?? [0, 0];
-  }
-
-  /** Seconds of the scene's time. */
-  get time() {
-    return this._time ?? this.timeRange[0];
-  }
-
-  /** Goes to a time. @param {number} seconds of the scene's time */
-  seek(seconds) {
-    const [start, end] = this.timeRange;
-    this._time = this._scene ? Math.min(Math.max(seconds, start), Math.max(start, end)) : seconds;
-    this._touch();
-    this._emit("timeupdate", { time: this.time });
-  }
-
-  get paused() {
-    return !this._playing;
-  }
-
-  play() {
-    if (this._playing) return;
-    this._playing = true;
-    if (this.time >= this.timeRange[1]) this._time = this.timeRange[0];
-    this._lastFrame = 0;
-    this._wake();
-    this._emit("statechange", {});
-  }
-
-  pause() {
-    if (!this._playing) return;
-    this._playing = false;
-    this._touch();
-    this._emit("statechange", {});
   }
 
   /** The highest level to show, null: the highest there is. */
@@ -263,8 +189,8 @@ export class Player extends Emitter {
   set level(level) {
     this._level = level;
     const more = (level ?? Infinity) > this._loadedLevel;
-    if (more && this._loader && !this._status.loading) this._loadOn(this._loader);
-    this._touch();
+    if (more && this._loader && !this._status.loading) this._loadOn();
+    this._changed();
   }
 
   /** The camera in use; assign null for the scene's own. @returns {Camera | null} */
@@ -274,7 +200,7 @@ export class Player extends Emitter {
 
   set camera(camera) {
     this._camera = camera;
-    this._touch();
+    this._changed();
   }
 
   /** @returns {Status} */
@@ -299,7 +225,7 @@ export class Player extends Emitter {
 
   /** Waits until the picture is complete and at full quality. */
   async settled() {
-    while (!this._closed && !(this._scene && this._isSettled())) {
+    while (!this.closed && !(this._scene && this._isSettled())) {
       await new Promise((resolve) => setTimeout(resolve, 5));
     }
   }
@@ -336,51 +262,41 @@ export class Player extends Emitter {
   release() {
     this._head = null;
     this._lastFrame = 0;
-    this._touch();
-  }
-
-  get closed() {
-    return this._closed;
+    this._changed();
   }
 
   /** Frees everything; the player cannot be used again. */
   close() {
-    if (this._closed) return;
-    this._closed = true;
-    this._playing = false;
+    if (this.closed) return;
+    super.close();
     cancelAnimationFrame(this._frameRequest);
     this._resize.disconnect();
     this._seen.disconnect();
     this._listening.abort();
-    this.stopLoading();
     this._sorter.close();
-    this._cpuWorker?.close();
+    this._cpu?.close();
     const gl = this._gpu?.gl;
     this._dropGpu();
     gl?.getExtension("WEBGL_lose_context")?.loseContext(); // browsers keep few contexts alive
-    this._scene = null;
     this.canvas.width = this.canvas.height = 1;
   }
 
   // --- loading
 
   /** @param {import("./loader-worker.js").News} news */
-  _told({ scene, arrived, decoded, ...status }) {
+  _told(news) {
+    const { scene, arrived, decoded, ...status } = news;
     Object.assign(this._status, status);
-    const { bytes, total } = status;
-    this._emit("progress", { bytes, total });
-    if (!scene) return;
-    const first = !this._scene;
-    this._scene = scene;
-    const start = performance.timeOrigin + this._started;
-    this._came.set(scene, { arrived: (arrived - start) / 1000, decoded: (decoded - start) / 1000 });
-    if (first) {
-      this.seek(this.time);
-      if (this._options.autoplay) this.play();
+    this._emit("progress", { bytes: status.bytes, total: status.total });
+    if (scene) {
+      const start = performance.timeOrigin + this._started;
+      this._came.set(scene, { arrived: (arrived - start) / 1000, decoded: (decoded - start) / 1000 });
     }
-    this._touch();
+    const first = super._told(news);
+    if (first && this._options.autoplay) this.play();
+    if (scene) this._changed();
+    return first;
   }
-
 
   // --- the GPU
 
@@ -398,7 +314,6 @@ export class Player extends Emitter {
     if (gl.isContextLost()) return;
     this._gpu = new Gpu(gl);
     this._pace = new Pace(this._gpu.software ? SOFTWARE_STEP : 0);
-    if (!this._gpu.floats) this._useCpu = true;
     this._painter = new Painter(this._gpu);
     this._dirty = true;
   }
@@ -413,14 +328,14 @@ export class Player extends Emitter {
   // --- the loop
 
   /** The picture has to change. */
-  _touch() {
+  _changed() {
     this._dirty = true;
     this._lastMoved = performance.now();
     this._wake();
   }
 
   _wake() {
-    if (this._frameRequest || this._closed || this._head) return;
+    if (this._frameRequest || this.closed || this._head) return;
     this._frameRequest = requestAnimationFrame((now) => {
       this._frameRequest = 0;
       this._frame(now);
@@ -452,20 +367,13 @@ export class Player extends Emitter {
 
   /** Brings time, Gaussians and their order on. @param {number} now */
   _step(now) {
-    if (this._playing) this._advance(now);
+    if (this._playing) {
+      this._advance(this._lastFrame ? Math.min((now - this._lastFrame) / 1000, 0.25) : 0);
+      this._lastFrame = now;
+    }
     const undrawn = this._front && this._shownLevel === null; // the first picture does not wait for the second
     if (!this._evaluating && !undrawn && !this._isEvaluated()) this._evaluate();
     this._sort();
-  }
-
-  /** @param {number} now */
-  _advance(now) {
-    const elapsed = this._lastFrame ? Math.min((now - this._lastFrame) / 1000, 0.25) : 0;
-    this._lastFrame = now;
-    const { time, ended } = timeAfter(this.time, elapsed, this.timeRange, !!this._options.loop);
-    if (ended) this.pause();
-    this._time = time;
-    this._emit("timeupdate", { time });
   }
 
   /** The state to show. @returns {State} */
@@ -514,80 +422,86 @@ export class Player extends Emitter {
     const started = performance.now();
     this._evaluating = true;
     try {
-      const evaluator = this._evaluatorFor(gpu, state.scene);
       const spare = this._spare;
       this._spare = null;
-      /** @type {import("./evaluator.js").Lister} */
-      const lister = (opacities, ...rest) => this._sorter.call("list", [opacities, ...rest], [opacities.buffer]);
-      const { splats, means } = await evaluator.evaluate(state.level, state.t, state.eye, spare, lister);
+      const { splats, means } = await this._gaussians(gpu, state, spare);
       this._spare = splats;
-      this._swapping = true;
-      while (this._sorting) await new Promise((resolve) => setTimeout(resolve, 1));
-      if (means) await this._sorter.call("setMeans", [means], [means.buffer]);
       if (gpu !== this._gpu) return;
-      if ((means || !this._isSorted()) && !(await this._order(state.scene))) return;
+      if ((means || !this._isSorted()) && !(await this._order(state.scene, means))) return;
       this._spare = this._front?.splats ?? null;
       this._front = { splats, state };
       this.counts.evaluated++;
       this._dirty = true;
       if (playing) this._pace.evaluated(state.level, performance.now() - started, performance.now());
     } catch (error) {
-      if (this._closed || error instanceof ContextLost || gpu !== this._gpu) return;
-      if (this._useCpu) {
+      if (this.closed || error instanceof ContextLost || gpu !== this._gpu) return;
+      if (this._onCpu(gpu, state.scene)) {
         this._fail(error);
         this._scene = null;
         return;
       }
-      this._useCpu = true; // networks that shaders cannot hold, or a driver that cannot compile them
+      this._unfit = true; // networks that shaders cannot hold, or a driver that cannot compile them
       this._evaluator?.free();
       this._evaluator = null;
     } finally {
       this._evaluating = false;
-      this._swapping = false;
       this._wake();
     }
   }
 
   /** @param {Gpu} gpu @param {Scene} scene */
-  _evaluatorFor(gpu, scene) {
+  _onCpu(gpu, scene) {
+    const { evaluator } = this._options;
     const few = gpu.software && scene.anchor.length <= 3 * SOFTWARE_ANCHORS;
-    const onCpu = this._useCpu || (few && this._options.evaluator !== "gpu");
-    const had = this._evaluator;
-    if (had && had instanceof CpuEvaluator === onCpu) {
-      if (had.scene === scene) return had;
-      if (had instanceof CpuEvaluator) {
-        had.setScene(scene);
-        return had;
-      }
-    }
-    had?.free();
-    this._evaluator = null;
-    if (onCpu) {
-      this._evaluator = new CpuEvaluator(gpu, scene, this._cpuWorker ?? undefined);
-      this._cpuWorker = null;
-    } else this._evaluator = new GpuEvaluator(gpu, scene);
-    return this._evaluator;
+    return evaluator === "cpu" || this._unfit || !gpu.floats || (few && evaluator !== "gpu");
   }
 
-  /** Brings the order to the camera, if the Gaussians on show are the sorter's. */
+  /** @param {Gpu} gpu @param {State} state @param {Splats | null} into what may be overwritten
+   * @returns {Promise<Evaluated>} */
+  async _gaussians(gpu, state, into) {
+    const { scene, level, t, eye } = state;
+    const onCpu = this._onCpu(gpu, scene);
+    if (onCpu || this._evaluator?.scene !== scene) {
+      this._evaluator?.free();
+      this._evaluator = null;
+    }
+    if (onCpu) {
+      this._cpu ??= new CpuEvaluator();
+      const { count, data, width, height } = await this._cpu.evaluate(state);
+      const field = gpu.renewed(into?.field, width, height, SPLAT_BLOCKS);
+      gpu.write(field, data);
+      return { splats: { field }, means: data.slice(0, 4 * count) };
+    }
+    this._evaluator ??= new GpuEvaluator(gpu, scene);
+    return this._evaluator.evaluate(level, t, eye, into, (opacities, ...rest) =>
+      this._sorter.call("list", [opacities, ...rest], [opacities.buffer]),
+    );
+  }
+
+  /** Brings the order to the camera. */
   async _sort() {
-    if (!this._front || this._swapping || this._sorting || this._isSorted()) return;
+    if (!this._front || this._sorting || this._isSorted()) return;
     this._sorting = true;
     try {
-      if (await this._order(this._front.state.scene)) this._dirty = true;
+      if (await this._order(this._front.state.scene, null)) this._dirty = true;
     } catch (error) {
-      if (!this._closed) this._fail(error);
+      if (!this.closed) this._fail(error);
     } finally {
       this._sorting = false;
       this._wake();
     }
   }
 
-  /** Sorts the sorter's Gaussians for the camera. @param {Scene} scene @returns whether the GPU is still there */
-  async _order({ info }) {
+  /**
+   * Sorts Gaussians for the camera: others than before, or the sorter's. It answers calls in their order, so that an
+   * order on its way is for the Gaussians that are on show when it arrives.
+   *
+   * @param {Scene} scene @param {Float32Array | null} means @returns whether the GPU is still there
+   */
+  async _order({ info }, means) {
     const gpu = this._gpu;
     const row = this._row();
-    const order = await this._sorter.call("sort", [row, info.near]);
+    const order = await this._sorter.call("sort", [row, info.near, means], means ? [means.buffer] : []);
     if (gpu !== this._gpu) return false;
     this._painter?.setOrder(order);
     this._sortedRow = row;
@@ -628,7 +542,7 @@ export class Player extends Emitter {
       if (alone && moving) this._pace.drew(now - started);
       this._shown(state, now);
     } catch (error) {
-      if (!(error instanceof ContextLost) && !this._closed) this._fail(error);
+      if (!(error instanceof ContextLost) && !this.closed) this._fail(error);
     } finally {
       this._drawing = false;
       this._wake();

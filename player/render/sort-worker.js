@@ -12,12 +12,9 @@ serve({
   list(...args) {
     return listGaussians(...args);
   },
-  /** @param {Float32Array} next [n, 4], mean and opacity */
-  setMeans(next) {
-    means = next;
-  },
-  /** @param {ArrayLike<number>} row @param {number} near */
-  sort(row, near) {
+  /** @param {ArrayLike<number>} row @param {number} near @param {Float32Array | null} next new means */
+  sort(row, near, next) {
+    means = next ?? means;
     const order = sorter.sort(means, row, near);
     return { result: order, transfer: [order.buffer] };
   },

@@ -1,10 +1,19 @@
 // Lists and orders of Gaussians: plain loops that run in a worker.
 
-/** @import { List } from "./evaluator.js" */
+/** A list's texel without a Gaussian. */
+export const NO_ENTRY = 0xffffffff;
+/** Bits of an anchor's number in an entry of a list; the slot lies above. */
+export const ANCHOR_BITS = 24;
 
-// as in evaluator.js, which a worker has no need to load
-const NO_ENTRY = 0xffffffff;
-const ANCHOR_BITS = 24;
+/**
+ * Visible Gaussians, slot after slot. entries: [height, width] texels, an anchor's number and above it the slot, or
+ * NO_ENTRY. starts: the row of texels where each slot starts, and where the last one ends. rows: that end.
+ *
+ * @typedef {{width: number, rows: number, entries: Uint32Array, starts: Uint32Array, count: number}} List
+ */
+
+/** Calls listGaussians, in a worker.
+ * @typedef {(...args: Parameters<typeof listGaussians>) => Promise<List | null>} Lister */
 
 /**
  * The list of Gaussians whose opacity is above 0, or that `previous` has; null if it would be `previous`.

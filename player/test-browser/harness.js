@@ -3,9 +3,9 @@
 import { decode } from "../decode/index.js";
 import { Player } from "../element.js";
 import { evaluate } from "../render/evaluate.js";
-import { GpuEvaluator, NO_ENTRY } from "../render/evaluator.js";
+import { GpuEvaluator } from "../render/evaluator.js";
 import { Gpu } from "../render/gl.js";
-import { listGaussians } from "../render/sort.js";
+import { ANCHOR_BITS, listGaussians, NO_ENTRY } from "../render/sort.js";
 
 /** @param {string} url */
 async function sceneOf(url) {
@@ -35,12 +35,16 @@ async function compare(url, cases, bandPoints) {
   for (const { level, t, eye } of cases) {
     const evaluated = await evaluator.evaluate(level, t, eye, splats, lister);
     ({ splats } = evaluated);
-    const n = splats.texels;
-    const texels = n ? await gpu.read(splats.field, 0, 4, n / splats.field.width) : new Float32Array(0);
+    const { entries, rows, width } = evaluator._listed;
+    const n = rows * width;
+    const texels = n ? await gpu.read(splats.field, 0, 4, rows) : new Float32Array(0);
     const { count, slot: slots, records } = evaluate(scene, level, t, eye);
     /** @type {Map<number, number>} texels by their slot */
     const at = new Map();
-    evaluator.slotsOfTexels().forEach((slot, i) => slot !== NO_ENTRY && i < n && at.set(slot, i));
+    entries.subarray(0, n).forEach((entry, i) => {
+      const anchor = entry & (2 ** ANCHOR_BITS - 1);
+      if (entry !== NO_ENTRY) at.set(anchor * scene.widths.slots + (entry >>> ANCHOR_BITS), i);
+    });
     /** @param {number} i @param {number} g @param {number} k */
     const difference = (i, g, k) => Math.abs(records[16 * i + k] - texels[4 * ((k >> 2) * n + g) + (k & 3)]);
     const worst = Object.entries(QUANTITIES).map(([name, columns]) => {

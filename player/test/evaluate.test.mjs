@@ -104,9 +104,9 @@ test("Gaussians are sorted back to front; of equal depths the later ones come fi
 test("a list holds the visible Gaussians slot by slot, and those of the list before", () => {
   const opacities = new Float32Array(3 * 40 * 4);
   for (const [anchor, slot] of [[3, 0], [5, 0], [39, 9]]) opacities[((slot >> 2) * 40 + anchor) * 4 + (slot & 3)] = 0.5;
-  /** @param {Float32Array} from @param {import("../render/evaluator.js").List | null} previous */
+  /** @param {Float32Array} from @param {import("../render/sort.js").List | null} previous */
   const list = (from, previous) => listGaussians(from, 10, 40, previous);
-  const entries = (/** @type {import("../render/evaluator.js").List | null} */ found) =>
+  const entries = (/** @type {import("../render/sort.js").List | null} */ found) =>
     [...(found?.entries ?? [])].filter((e) => e !== 0xffffffff).map((e) => [e >>> 24, e & 0xffffff]);
   const first = list(opacities, null);
   assert.deepEqual(entries(first), [[0, 3], [0, 5], [9, 39]]);
