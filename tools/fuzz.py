@@ -10,11 +10,13 @@ that its writer says. Of the others, three of five have their fields, sections, 
 lengths, CRC-32 and scene id, and two keep the CRCs of before. Input i of a run over the same files is the same on every
 machine. A crash, an exception that is no DecodeError, too much time or memory, damage that decodes, and a decoder that
 accepts what another refuses or yields other hashes are findings; they are saved in --out, and the exit code is 1.
+Ctrl-C ends the run with what was found.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import multiprocessing
 import random
@@ -45,7 +47,8 @@ from fuzzing.mutate import make_case  # noqa: E402
 DECODERS = ("python", "refdec", "javascript")
 COMPARED = {"refdec": 10, "javascript": 2}  #: every so many inputs, and every legal one
 MEASURED = 25  #: every so many inputs the peak memory is traced, which takes twice the time
-STUCK_SECONDS = 30.0  #: of wall time on one input; then the process is ended
+STUCK_SECONDS = 300.0  #: of wall time on one input, on a busy machine; then the process is ended
+BATCH = 500  #: inputs of a process
 
 
 @dataclass
@@ -178,7 +181,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(make_case(files, args.seed, args.input).recipe)
         figures = run_inputs(files, args.seed, [args.input], make_decoders(names))
     else:
-        figures = run_safely(files, args.seed, range(args.inputs), names)
+        figures = Figures()
+        with contextlib.suppress(KeyboardInterrupt):
+            for first in range(0, args.inputs, BATCH):
+                batch = range(first, min(first + BATCH, args.inputs))
+                figures.add(run_safely(files, args.seed, batch, names))
     for row in figures.findings:
         args.out.mkdir(parents=True, exist_ok=True)
         path = args.out / f"{args.seed}-{row['input']}-{row['kind']}.pd4"

@@ -43,7 +43,7 @@ def models_of_each(cums: np.ndarray, sizes: np.ndarray) -> list[Model | None]:
     """`model_of` of concatenated tables, int64 [sum of sizes + 1], in one pass."""
     ends = np.cumsum(sizes + 1)
     firsts = ends - sizes - 1
-    frequencies = np.empty(len(cums))
+    frequencies = np.zeros(len(cums))  # its last number is none of a table, and junk there could make numpy warn
     np.subtract(cums[1:], cums[:-1], out=frequencies[:-1])
     frequencies -= 1
     frequencies[ends - 1] = 0  # the difference between two tables
