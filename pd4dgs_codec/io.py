@@ -59,7 +59,7 @@ def whole_file(path: str | Path, overwrite: bool) -> Iterator[Path]:
             yield Path(path)
         return
     target = Path(os.path.realpath(path))
-    with _temporary_folder(target.parent, path) as folder:
+    with _naming(path), temporary_folder(target.parent) as folder:  # on the same disk, so that the rename is one step
         yield folder / target.name
         _flush(folder / target.name)
         check_output(path, overwrite)  # it may have appeared meanwhile
@@ -79,7 +79,7 @@ def whole_files(pattern: str, names: Sequence[str], overwrite: bool) -> Iterator
     existing = next(p for p in (parent, *parent.parents) if p.exists())
     if not existing.is_dir():
         raise DataError(f"{existing}: is a file, expected a folder to write into")
-    with _temporary_folder(existing, pattern) as folder:
+    with _naming(pattern), temporary_folder(existing) as folder:
         temporaries = [folder / Path(name).name for name in names]
         yield temporaries
         for temporary in temporaries:
@@ -88,6 +88,15 @@ def whole_files(pattern: str, names: Sequence[str], overwrite: bool) -> Iterator
             parent.mkdir(parents=True, exist_ok=True)
             for temporary, name in zip(temporaries, names, strict=True):
                 _move(temporary, Path(name))
+
+
+def read_source(path: str | Path) -> bytes:
+    """All bytes of a file, or of a pipe until its writer closes it. Raises OSError, and DataError for a device, whose
+    bytes may never end."""
+    mode = os.stat(path).st_mode
+    if stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
+        raise DataError(f"{path}: is a device, expected a file")
+    return Path(path).read_bytes()
 
 
 def remove_leftovers(path: str | Path) -> None:
@@ -126,15 +135,14 @@ def _naming(path: str | Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _temporary_folder(parent: Path, path: str | Path) -> Iterator[Path]:
-    """A folder on the same disk as the output, so that the rename is one step."""
+def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
+    """A new folder, in `parent` or where the system has them, that no failure and no signal leaves behind."""
     folder = None
     try:
-        with _naming(path):
-            with held():
-                folder = Path(tempfile.mkdtemp(dir=parent, prefix=PREFIX))
-                _FOLDERS.add(folder)
-            yield folder
+        with held():
+            folder = Path(tempfile.mkdtemp(dir=parent, prefix=PREFIX))
+            _FOLDERS.add(folder)
+        yield folder
     finally:
         if folder is not None:
             shutil.rmtree(folder, ignore_errors=True)

@@ -50,6 +50,24 @@ def test_a_signal_at_any_call_leaves_one_whole_file(tmp_path, number):
     assert b"old" in left and last > 8 and target.read_bytes() == b"new"
 
 
+@pytest.mark.parametrize("number", ENDING)
+def test_a_signal_at_any_call_leaves_no_folder(tmp_path, number):
+    def work():
+        with io.temporary_folder(tmp_path) as folder:
+            (folder / "x").write_bytes(b"1")
+
+    for last in count(1):
+        try:
+            with interruptible():
+                _calls_of_the_system(lambda at, last=last: signal.raise_signal(number) if at == last else None, work)
+        except KeyboardInterrupt:
+            io.remove_temporaries()
+            assert os.listdir(tmp_path) == []
+        else:
+            break
+    assert last > 4
+
+
 def test_files_that_belong_together_are_moved_together(tmp_path, monkeypatch):
     replace, names = os.replace, [str(tmp_path / "out" / f"{i}.png") for i in range(3)]
     monkeypatch.setattr(os, "replace", lambda *paths: (signal.raise_signal(signal.SIGTERM), replace(*paths)))
@@ -113,7 +131,8 @@ def test_no_traceback_from_the_first_import_to_the_last_line(when, number):
     script = PROGRAM.replace("WHEN", repr(when)).replace("NUMBER", str(int(number)))
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
     if when == "middle":
-        assert done.returncode == 1 and done.stderr == "pd4dgs-info: error: interrupted; nothing was written\n"
+        told = "pd4dgs-info: error: interrupted; what was not finished is removed\n"
+        assert done.returncode == 1 and done.stderr == told
     else:
         assert done.returncode == -number and done.stderr == ""
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import resource
-import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -18,7 +17,7 @@ from pd4dgs_codec.batch import store
 from pd4dgs_codec.batch.manifest import OPS, Line, arguments
 from pd4dgs_codec.data.dataset import SYNTHETIC
 from pd4dgs_codec.errors import DataError, Pd4Error, one_line
-from pd4dgs_codec.io import remove_temporaries
+from pd4dgs_codec.io import remove_temporaries, temporary_folder
 from pd4dgs_codec.signals import ignore_more, interruptible
 
 LOG_BYTES = 1 << 16  #: kept of a command's log
@@ -158,9 +157,9 @@ def _run(
 def _temporary_folder() -> Iterator[Path]:
     """A new folder, the working folder meanwhile."""
     before = os.getcwd()
-    with tempfile.TemporaryDirectory(prefix="pd4dgs-batch-") as name:
-        os.chdir(name)
+    with temporary_folder() as folder:
+        os.chdir(folder)
         try:
-            yield Path(name)
+            yield folder
         finally:
             os.chdir(before)

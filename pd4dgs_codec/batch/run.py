@@ -27,6 +27,7 @@ from typing import Any
 
 from pd4dgs_codec.batch.job import ALREADY, DONE, FAILED, Command, Job, Outcome, run_job
 from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.io import remove_temporaries
 
 Work = Callable[[Job], Outcome]
 GRACE_SECONDS = 5.0  #: that a process has to clear up before it is killed
@@ -215,6 +216,7 @@ def _follow_parent(folder: str) -> None:
 
     def follow() -> None:
         parent.join()
+        remove_temporaries()
         shutil.rmtree(folder, ignore_errors=True)
         os._exit(1)
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from pd4dgs_codec.errors import DataError, one_line
-from pd4dgs_codec.io import write_bytes
+from pd4dgs_codec.io import is_device, write_bytes
 from pd4dgs_codec.web.headers import media_type
 
 RECORD = ".done.json"
@@ -98,8 +98,11 @@ def names(folder: str) -> list[str]:
 
 
 def stamp(place: str) -> str:
-    """A text that changes with a file, or with any file of a folder, found without reading them. Raises OSError."""
-    system, path, _ = _system(place)
+    """A text that changes with a file, or with any file of a folder, found without reading them. Raises OSError, and
+    DataError for what a reader could wait for."""
+    system, path, local = _system(place)
+    if local and is_device(Path(path)):
+        raise DataError(f"{place}: is a pipe or a device, expected a file or a folder")
     with _naming(place):
         entry = system.info(path)
         found = {"": entry} if entry["type"] == "file" else system.find(path, detail=True)

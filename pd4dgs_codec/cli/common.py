@@ -16,7 +16,6 @@ import os
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
 from pd4dgs_codec.errors import DamageWarning, DecodeError, EncodeError, Pd4Error, one_line, printable
@@ -134,7 +133,9 @@ def shown_name(path: str, stream: str = "stdin") -> str:
 def read_bytes(path: str) -> bytes:
     """All bytes of a file, or of stdin for `-`. Raises OSError naming the path, UsageError if stdin is a terminal."""
     if path != STDIO:
-        return Path(path).read_bytes()
+        from pd4dgs_codec.io import read_source
+
+        return read_source(path)
     if sys.stdin is None or sys.stdin.isatty():
         raise UsageError("nothing is piped to stdin; name a file")
     return sys.stdin.buffer.read()
@@ -226,7 +227,7 @@ def run(parser: argparse.ArgumentParser, action: Action, argv: Sequence[str] | N
             ignore_more()
             if writing := sys.modules.get("pd4dgs_codec.io"):
                 writing.remove_temporaries()
-            return _fail(parser.prog, error, "interrupted; nothing was written", "--json" in arguments)
+            return _fail(parser.prog, error, "interrupted; what was not finished is removed", "--json" in arguments)
 
 
 @contextlib.contextmanager

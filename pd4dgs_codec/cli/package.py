@@ -11,7 +11,7 @@ from pd4dgs_codec.cli import options
 from pd4dgs_codec.cli.common import OK, STDIO, Console, command, number, read_bytes, table
 from pd4dgs_codec.cli.progress import progress_bar
 from pd4dgs_codec.errors import DeliveryError, RenderError
-from pd4dgs_codec.io import whole_files
+from pd4dgs_codec.io import temporary_folder, whole_files
 
 if TYPE_CHECKING:
     import numpy as np
@@ -112,8 +112,6 @@ def _reason(error: RenderError | ModuleNotFoundError) -> str:
 
 
 def _render(scene: Scene, fps: float) -> Video:
-    import tempfile
-
     from pd4dgs_codec.quality.frames import own_frames
     from pd4dgs_codec.quality.levels import level_of
     from pd4dgs_codec.quality.movie import check_mp4, write_mp4
@@ -130,8 +128,8 @@ def _render(scene: Scene, fps: float) -> Video:
     camera = frames[0].camera
     if min(camera.width, camera.height) < 2:
         raise RenderError(f"the file's camera has {camera.width}x{camera.height} pixels, a video takes 2x2 or more")
-    with tempfile.TemporaryDirectory(prefix="pd4dgs-") as folder, progress_bar(len(frames), "frames", "video") as step:
-        path = Path(folder) / "video.mp4"
+    with temporary_folder() as folder, progress_bar(len(frames), "frames", "video") as step:
+        path = folder / "video.mp4"
         write_mp4(_pictures(frames, level_of(scene), step), path, fps, fragment=max(1, round(FRAGMENT_SECONDS * fps)))
         size = camera.width // 2 * 2, camera.height // 2 * 2
         poster = _poster(next(_pictures(frames[len(frames) // 2 :], level_of(scene))))

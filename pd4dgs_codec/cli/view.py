@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import tempfile
-from pathlib import Path
 from urllib.parse import quote
 
 from pd4dgs_codec.cli import options
 from pd4dgs_codec.cli.common import OK, Console, checkpoint_scene, command, is_pd4, read_bytes
 from pd4dgs_codec.cli.serve import add_link, set_by_signals
-from pd4dgs_codec.io import check_output, write_bytes
+from pd4dgs_codec.io import check_output, temporary_folder, write_bytes
 
 DETAILS = """\
 SCENE is a .pd4 file, a checkpoint (which is encoded fast first) or the URL of a .pd4 file.
@@ -54,8 +52,8 @@ def _view(args: argparse.Namespace, console: Console) -> int:
         write_bytes(args.output, page(content).encode(), args.overwrite)
         console.result({"output": args.output, "input": args.input}, args.output)
         return OK
-    with tempfile.TemporaryDirectory(prefix="pd4dgs-view-") as name:
-        folder, source = Path(name), args.input
+    with temporary_folder() as folder:
+        source = args.input
         (folder / PAGE).write_bytes(page().encode())
         if not is_url(source):
             (folder / SCENE).write_bytes(_packed(source, console))

@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import contextlib
 import io
+import re
 import time
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -42,6 +45,20 @@ class _Shown:
     at: float = float("-inf")
 
 
+@contextlib.contextmanager
+def _own_pages_alone() -> Iterator[None]:
+    """Lets no page of another site connect to a server of viser that starts in this block: viser itself asks no page
+    where it comes from."""
+    from websockets.asyncio import server
+
+    serve, own = server.serve, re.compile(rf"http://({re.escape(HOST)}|localhost)(:\d+)?")
+    server.serve = partial(serve, origins=[None, own])  # type: ignore[assignment,misc]
+    try:
+        yield
+    finally:
+        server.serve = serve  # type: ignore[misc]
+
+
 class WatchedProgress(TrainingProgress):
     """The terminal's progress, and a page that shows the scene from the cameras of its viewers."""
 
@@ -55,7 +72,7 @@ class WatchedProgress(TrainingProgress):
                 "--view needs the package viser, which is not installed: pip install 'pd4dgs-codec[watch]'"
             ) from None
         try:
-            with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner; stdout is for results
+            with contextlib.redirect_stdout(io.StringIO()), _own_pages_alone():  # a banner; stdout is for results
                 self.server = viser.ViserServer(host=HOST, port=port, label="pd4dgs-train", verbose=False)
         except (OSError, RuntimeError) as error:
             raise TrainError(f"--view {port}: cannot listen on this port: {error}") from None

@@ -128,10 +128,12 @@ def _read(source: str | Path, downscale: int, holdout: int, background: Color | 
     if not folder.is_dir():
         found = "a file" if folder.exists() else "nothing"
         raise DataError(f"{folder}: found {found}, expected a dataset folder or {SYNTHETIC}NAME")
+    staying_inside = resolve_name("pd4dgs_codec.data.files:staying_inside")
     for reader in READERS:
         if reader.recognises(folder):
             try:
-                return reader.read(folder, downscale, holdout, background)
+                with staying_inside(folder):
+                    return reader.read(folder, downscale, holdout, background)
             except (DataError, ImportError, MemoryError):
                 raise
             except Exception as error:  # what no check foresaw in somebody else's files

@@ -6,7 +6,8 @@ import contextlib
 import io
 import json
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,10 +35,28 @@ ORIENTATION, UPRIGHT = 0x0112, 1  #: EXIF's orientation tag, and its value for p
 GAMMA = (0.40, 0.51)  #: exponents that PNG files give for sRGB: 1/2.2 as encoders round it
 
 
+#: The folder of the dataset that is being read, without links.
+_FOLDER: ContextVar[Path | None] = ContextVar("_FOLDER", default=None)
+
+
+@contextlib.contextmanager
+def staying_inside(folder: Path) -> Iterator[None]:
+    """Within the block no file is read to which a link leads out of this folder, whoever chose its name."""
+    before = _FOLDER.set(folder.resolve())
+    try:
+        yield
+    finally:
+        _FOLDER.reset(before)
+
+
 def check_regular(path: Path) -> None:
-    """Raises DataError for pipes and devices, whose end may never come, and OSError or ValueError for odd names."""
+    """Raises DataError for pipes and devices, whose end may never come, and for what lies outside the dataset that is
+    being read; OSError or ValueError for odd names."""
     if path.exists() and not path.is_file():
         raise DataError(f"{path}: is not a regular file")
+    folder = _FOLDER.get()
+    if folder is not None and folder not in path.resolve().parents:
+        raise DataError(f"{path}: leads out of {folder}, expected the name of a file in this folder")
 
 
 def read_file(path: Path) -> bytes:

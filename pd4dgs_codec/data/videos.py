@@ -26,10 +26,11 @@ from typing import IO, Any
 import numpy as np
 
 from pd4dgs_codec.data.cameras import Lens, UnreadView, rectify
-from pd4dgs_codec.data.files import check_downscale, check_pixels, shrink_image, shrink_mask
+from pd4dgs_codec.data.files import check_downscale, check_pixels, check_regular, shrink_image, shrink_mask
 from pd4dgs_codec.data.posed import geometry, without_first_camera
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DamageWarning, DataError, one_line
+from pd4dgs_codec.io import temporary_folder
 
 #: Largest width or height, and frames per second: beyond them the header is wrong.
 MAX_SIDE, MAX_FPS = 16_384, 10_000.0
@@ -67,8 +68,9 @@ def open_video(path: Path, *, grey: bool = False, output: Sequence[str] = ()) ->
     Raises DataError of one line if it cannot be opened, and so do the pictures if they cannot be decoded, or end before
     the frames that the header speaks of. Other damage is a warning.
     """
-    if not path.is_file():
-        raise DataError(f"{path}: found {'no file' if not path.exists() else 'no regular file'}, expected a video")
+    if not path.exists():
+        raise DataError(f"{path}: found no file, expected a video")
+    check_regular(path)
     from imageio_ffmpeg import read_frames  # of the extra `train`
 
     logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)  # else it warns of rotated and scaled ones
@@ -194,6 +196,7 @@ def stored_frames(path: Path, how: str, treat: Callable[[np.ndarray], np.ndarray
     """
     folder = Path(os.environ.get(FOLDER) or Path.home() / ".cache" / "pd4dgs-frames")
     try:
+        check_regular(path)
         stat = path.stat()
     except OSError:
         raise DataError(f"{path}: found no file, expected a video") from None
@@ -221,8 +224,8 @@ def _stored(target: Path) -> StoredFrames | None:
 def _store(video: Video, target: Path, treat: Callable[[np.ndarray], np.ndarray]) -> StoredFrames:
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=target.parent, prefix=".pd4dgs-") as folder:
-            file = Path(folder) / "frames"
+        with temporary_folder(target.parent) as folder:
+            file = folder / "frames"
             frames = _compress(video, file, target.parent, treat)
             os.replace(file, target)
     except OSError as error:

@@ -20,7 +20,7 @@ import torch
 from pd4dgs_codec.archives import read_tensors
 from pd4dgs_codec.errors import DataError, one_line
 from pd4dgs_codec.format.check import check_scene
-from pd4dgs_codec.io import write_bytes
+from pd4dgs_codec.io import read_source, write_bytes
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model
@@ -66,7 +66,7 @@ def target(path: str | Path) -> Path:
 def load(path: str | Path | BinaryIO) -> tuple[Model, dict[str, Any]]:
     """(model, training) of a checkpoint. DataError, of one line, for any other or damaged file."""
     try:
-        raw = Path(path).read_bytes() if isinstance(path, (str, Path)) else path.read()
+        raw = read_source(path) if isinstance(path, (str, Path)) else path.read()
     except FileNotFoundError:
         raise DataError(f"{path}: no such checkpoint") from None
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name

@@ -17,6 +17,7 @@ from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.format.container import SIGNATURE
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.info import info
+from pd4dgs_codec.io import read_source
 from pd4dgs_codec.scene import MASK_THRESHOLD, Camera, Scene
 
 if TYPE_CHECKING:
@@ -90,7 +91,7 @@ def load_levels(
 
 def _read(file: str | Path) -> bytes:
     try:
-        return Path(file).read_bytes()
+        return read_source(file)
     except OSError as error:
         raise DataError(f"{file}: cannot be read: {error.strerror}") from None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 
 import pytest
 
@@ -151,6 +152,21 @@ def test_a_source_that_is_not_there_is_named(library):
     assert library.run().done == 1
     outcome, tries = library.outcomes["a.pd4"]
     assert tries == 1 and "a.pt" in outcome.message and "No such file" in outcome.message
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
+@pytest.mark.parametrize("kind", ["pipe", "device"])
+def test_a_source_for_which_a_reader_would_wait_is_named(library, kind):
+    library.add("a.pt", "x")
+    (library.folder / "in" / "a.pt").unlink()
+    if kind == "pipe":
+        os.mkfifo(library.folder / "in" / "a.pt")
+    else:
+        (library.folder / "in" / "a.pt").symlink_to("/dev/zero")
+    library.add("b.pt", "y")
+    assert library.run().done == 1
+    outcome, tries = library.outcomes["a.pd4"]
+    assert tries == 1 and "a.pt: is a pipe or a device, expected a file" in outcome.message
 
 
 @pytest.mark.parametrize("options", [{"output": "x"}, {"threads": 3}, {"-o": "x"}, {"a b": 1}, {"effort": {"a": 1}}])

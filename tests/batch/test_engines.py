@@ -6,13 +6,17 @@ import json
 import random
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from pd4dgs_codec.batch.run import _follow_parent
 from pd4dgs_codec.batch.store import Root
 from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.io import temporary_folder
 
 TEXTS = {f"{n}.pt": f"text {n}" for n in range(8)}
 
@@ -105,6 +109,17 @@ def test_workers_end_with_a_parent_that_was_killed(filled, tmp_path, temporary):
     before = len(filled.made())
     summary = filled.run(workers=1)
     assert summary.already == before and summary.done == 9 - before and len(filled.made()) == 9
+
+
+def test_a_worker_whose_parent_is_gone_removes_what_it_was_writing(tmp_path, monkeypatch):
+    ended = threading.Event()
+    monkeypatch.setattr("multiprocessing.parent_process", lambda: SimpleNamespace(join=lambda: None))
+    monkeypatch.setattr("os._exit", lambda code: ended.set())
+    monkeypatch.setattr("signal.signal", lambda *_: None)
+    monkeypatch.setattr("tempfile.tempdir", None)
+    with temporary_folder(tmp_path) as folder:
+        _follow_parent(str(tmp_path / "own"))
+        assert ended.wait(60) and not folder.exists()
 
 
 def test_a_store_that_fails_now_and_then_gets_every_output_once(filled, monkeypatch):

@@ -21,6 +21,7 @@ from pd4dgs_codec.__main__ import MODULES
 from pd4dgs_codec.cli import common
 from pd4dgs_codec.errors import DamageWarning, DataError
 from pd4dgs_codec.model import checkpoint
+from pd4dgs_codec.quality.levels import load_levels
 
 #: Exit code, command line, and a part of the message. SCENE, MODEL and DATA are a .pd4, a checkpoint and a dataset;
 #: others are files of `folder`.
@@ -327,3 +328,10 @@ def test_a_film_on_a_full_disk_is_one_line_and_no_file(cli, scene_pd4, tmp_path)
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     _check(result, "render", 1, "x.mp4: ffmpeg cannot write it: ")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="needs a device without an end")
+@pytest.mark.parametrize("read", [common.read_bytes, checkpoint.load, load_levels])
+def test_a_device_is_no_source(read):
+    with pytest.raises(DataError, match="/dev/zero: is a device, expected a file"):
+        read("/dev/zero")

@@ -108,6 +108,21 @@ def test_a_browser_sees_the_scene_from_its_camera(watched, trainer, dataset, mon
     assert watched.state.content.startswith("step 4 of 6")
 
 
+@pytest.mark.parametrize(
+    "origin", ["http://evil.example", "null", "http://127.0.0.1.evil.example", "https://localhost"]
+)
+def test_a_page_of_another_site_sees_nothing(watched, origin):
+    """A site can open a socket to this machine in its visitor's browser, which says whose page it is."""
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    address, version = watched.url.replace("http", "ws"), importlib.metadata.version("viser")
+    with pytest.raises(InvalidStatus) as refused:
+        connect(address, subprotocols=[f"viser-v{version}"], origin=origin)
+    assert refused.value.response.status_code == 403
+    connect(address, subprotocols=[f"viser-v{version}"], origin=watched.url).close()
+
+
 def test_nothing_is_drawn_while_nobody_looks(watched, trainer, monkeypatch):
     def never(*_: object) -> None:
         raise AssertionError("drawn for nobody")

@@ -20,6 +20,7 @@ from PIL import Image
 
 NAN = float("nan")
 FRAMES = [{"file_path": f"r_{i}", "time": i / 10, "transform_matrix": pose(0.2 * i)} for i in range(3)]
+UNREAD = ("frames", "rigs")  #: files of COLMAP's that no reader opens
 SOCKET = object()  #: a change of a file: it is none, as a pipe would be, for which a reader could wait
 XYZ = "property float x\nproperty float y\nproperty float z\n"
 
@@ -311,6 +312,22 @@ def test_broken_folders(layout, scene, tmp_path, refused):
         path.unlink(missing_ok=True)
         if whole is not None:
             path.write_bytes(whole)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_no_file_of_a_folder_is_a_link_out_of_it(layout, scene, tmp_path, refused):
+    """Whoever chose its name, the layout or another file: an archive of a stranger may hold links to anything."""
+    if layout in ("neu3d", "videos"):
+        pytest.importorskip("imageio_ffmpeg")
+    folder, elsewhere = LAYOUTS[layout](scene, tmp_path / "set"), tmp_path / "elsewhere"
+    every = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.stem not in UNREAD]
+    of_each_kind = {(path.parent, path.suffix in (".png", ".jpg") or path.name): path for path in every}
+    for path in of_each_kind.values():
+        path.rename(elsewhere)
+        path.symlink_to(elsewhere)
+        refused(folder, "the name of a file in this folder")
+        path.unlink()
+        elsewhere.rename(path)
 
 
 def test_other_faults_of_folders(tmp_path, blender, refused):

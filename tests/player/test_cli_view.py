@@ -6,6 +6,7 @@ import re
 import signal
 import subprocess
 import sys
+import urllib.error
 import urllib.request
 from pathlib import Path
 from typing import IO
@@ -19,6 +20,10 @@ from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.web.page import page as whole_page
 
 ROOT = Path(__file__).parents[2]
+
+
+#: How a browser asks to go on as a web socket.
+SOCKET = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": "AA=="}
 
 
 @pytest.fixture(scope="module")
@@ -41,6 +46,9 @@ def test_the_page_and_the_scene_come_from_one_address(scene_pd4):
     base = page.rsplit("/", 1)[0]
     assert fetch(f"{base}/scene.pd4") == scene_pd4.read_bytes()
     assert fetch(f"{base}/index.html").decode() == whole_page()
+    for header in ({"Host": "evil.example"}, {"Origin": "http://evil.example"}, {**SOCKET, "Origin": "null"}):
+        with pytest.raises(urllib.error.HTTPError, match="421"):
+            urllib.request.urlopen(urllib.request.Request(f"{base}/scene.pd4", headers=header), timeout=60)
     process.send_signal(signal.SIGTERM)
     assert process.wait(60) == 0
 
