@@ -161,6 +161,16 @@ def run_safely(files: Sequence[Seed], run: int, inputs: range, names: Sequence[s
     return figures
 
 
+def _keep(figures: Figures, files: Sequence[Seed], args: argparse.Namespace) -> None:
+    """Saves what was found so far."""
+    for row in figures.findings:
+        args.out.mkdir(parents=True, exist_ok=True)
+        path = args.out / f"{args.seed}-{row['input']}-{row['kind']}.pd4"
+        path.write_bytes(make_case(files, args.seed, row["input"]).data)
+    if args.json:
+        args.json.write_text(json.dumps(vars(figures), indent=1) + "\n")
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     assert __doc__
@@ -171,7 +181,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     p.add_argument("--decoders", default=",".join(DECODERS), help="of python,refdec,javascript (default: all)")
     p.add_argument("--input", type=int, metavar="I", help="examine input I alone, in this process")
     p.add_argument("--out", type=Path, default=ROOT / "out" / "fuzz", help="folder for findings (default: out/fuzz)")
-    p.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
+    p.add_argument("--json", type=Path, metavar="FILE", help="write the figures, also of the batches so far")
     args = p.parse_args(argv)
     names = args.decoders.split(",")
     if unknown := set(names) - set(DECODERS):
@@ -186,13 +196,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             for first in range(0, args.inputs, BATCH):
                 batch = range(first, min(first + BATCH, args.inputs))
                 figures.add(run_safely(files, args.seed, batch, names))
-    for row in figures.findings:
-        args.out.mkdir(parents=True, exist_ok=True)
-        path = args.out / f"{args.seed}-{row['input']}-{row['kind']}.pd4"
-        path.write_bytes(make_case(files, args.seed, row["input"]).data)
+                _keep(figures, files, args)
+    _keep(figures, files, args)
     print(figures.text())
-    if args.json:
-        args.json.write_text(json.dumps(vars(figures), indent=1) + "\n")
     return 1 if figures.findings else 0
 
 
