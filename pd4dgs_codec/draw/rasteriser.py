@@ -8,9 +8,9 @@ order, whose result does not depend on the number of chunks or threads.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -84,23 +84,11 @@ def draw(
     Arrays of any float type are drawn in float32. A Gaussian with NaN or infinity in its position, rotation or scale is
     skipped. Raises RenderError for wrong shapes, NotFinite (a RenderError) for colours.
     """
-    _check_floats("means", means, None, 3)
-    for name, array, *width in (
-        ("quats", quats, 4),
-        ("scales", scales, 3),
-        ("opacities", opacities),
-        ("colors", colors, 3),
-    ):
-        _check_floats(name, array, len(means), *width)
-    behind = np.array(background, np.float32)
-    check_shape("background", behind.shape, 3)
-    check_camera(camera)
-    check_near_plane(near_plane)
+    given = means, quats, scales, opacities, colors
+    behind = check_input(given, camera, background, near_plane, _is_floats, lambda a: float(a.astype(np.float32).sum()))
     geometry = Geometry(*(np.ascontiguousarray(a, np.float32) for a in (means, quats, scales, opacities)))
-    colors = np.ascontiguousarray(colors, np.float32)
-    check_colors("colors", float(colors.sum()))
-    check_colors("background", float(behind.sum()))
-    picture, transmittance = composite(project(geometry, camera, near_plane), colors, behind)
+    projected = project(geometry, camera, near_plane)
+    picture, transmittance = composite(projected, np.ascontiguousarray(colors, np.float32), behind)
     return picture, 1.0 - transmittance
 
 
@@ -266,7 +254,43 @@ def fill_tiles(
 # -- checks ------------------------------------------------------------------------------------------------------------
 
 
-def check_shape(name: str, found: Sequence[int], *expected: int | None) -> None:
+#: The arguments of `draw` by name, with the shape of one Gaussian's value.
+SHAPES = {"means": (3,), "quats": (4,), "scales": (3,), "opacities": (), "colors": (3,)}
+
+
+def check_input(
+    given: Sequence[Any],
+    camera: Camera,
+    background: Sequence[float] | Array,
+    near_plane: float,
+    is_floats: Callable[[Any], bool],
+    total: Callable[[Any], float],
+) -> Array:
+    """The background, float32 [3]. Raises RenderError for wrong types, shapes and cameras, NotFinite for colours.
+
+    given: arrays or tensors, in the order of SHAPES. is_floats: whether one is an array of floats. total: the sum of
+    one in float32.
+    """
+    if not 0 <= near_plane < projection.FAR:
+        raise RenderError(f"near_plane is {near_plane}, expected 0 <= near_plane < {projection.FAR:g}")
+    check_camera(camera)
+    for (name, shape), array in zip(SHAPES.items(), given, strict=True):
+        if not is_floats(array):
+            raise RenderError(f"{name} is {getattr(array, 'dtype', type(array).__name__)}, expected an array of floats")
+        _check_shape(name, array.shape, None if name == "means" else len(given[0]), *shape)
+    behind = np.array(background, np.float32)
+    _check_shape("background", behind.shape, 3)
+    for name, value in (("colors", total(given[-1])), ("background", total(behind))):
+        if not math.isfinite(value):
+            raise NotFinite(f"{name} has a value that is not finite, or its sum overflows")
+    return behind
+
+
+def _is_floats(array: Any) -> bool:
+    return isinstance(array, np.ndarray) and array.dtype.kind == "f"
+
+
+def _check_shape(name: str, found: Sequence[int], *expected: int | None) -> None:
     """Raises RenderError unless the shape `found` is the expected one; None is any size."""
     if len(found) != len(expected) or any(b is not None and a != b for a, b in zip(found, expected, strict=True)):
         wanted = ", ".join("*" if size is None else str(size) for size in expected)
@@ -278,8 +302,10 @@ def check_camera(camera: Camera) -> None:
     for name, value in (("width", camera.width), ("height", camera.height)):
         if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MAX_SIDE:
             raise RenderError(f"{name} is {value!r}, expected an integer from 1 to {MAX_SIDE}")
-    _check_floats("viewmat", camera.viewmat, 4, 4)
-    _check_floats("K", camera.K, 3, 3)
+    for name, array, side in (("viewmat", camera.viewmat, 4), ("K", camera.K, 3)):
+        if not _is_floats(array):
+            raise RenderError(f"{name} is {getattr(array, 'dtype', type(array).__name__)}, expected an array of floats")
+        _check_shape(name, array.shape, side, side)
     viewmat, K = camera.viewmat.tolist(), camera.K.tolist()
     if not all(math.isfinite(v) for row in [*viewmat, *K] for v in row):
         raise RenderError("viewmat or K has a value that is not finite")
@@ -293,23 +319,3 @@ def check_camera(camera: Camera) -> None:
         raise RenderError(f"K is {K}, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] (no skew)")
     if not (K[0][0] > 0 and K[1][1] > 0):
         raise RenderError(f"focal lengths {K[0][0]} and {K[1][1]} in K, expected both positive")
-
-
-def check_near_plane(near_plane: float) -> None:
-    """Raises RenderError unless the near plane lies between the eye and FAR."""
-    if not 0 <= near_plane < projection.FAR:
-        raise RenderError(f"near_plane is {near_plane}, expected 0 <= near_plane < {projection.FAR:g}")
-
-
-def check_colors(name: str, total: float) -> None:
-    """Raises NotFinite if the sum of the colours `name` is not finite."""
-    if not math.isfinite(total):
-        raise NotFinite(f"{name} has a value that is not finite, or its sum overflows")
-
-
-def _check_floats(name: str, array: Array, *shape: int | None) -> None:
-    """Raises RenderError unless it is an array of floats of that shape; None is any size."""
-    if not isinstance(array, np.ndarray) or array.dtype.kind != "f":
-        found = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
-        raise RenderError(f"{name} is {found}, expected an array of floats")
-    check_shape(name, array.shape, *shape)

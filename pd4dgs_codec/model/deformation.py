@@ -127,32 +127,9 @@ class DeformationField(nn.Module):
 
     # -- residuals -----------------------------------------------------------------------------------------------------
 
-    def moved_reference(
-        self,
-        rows: Tensor,
-        features: Callable[[float], Tensor],
-        widths: Mapping[str, int],
-        t: float,
-        weight_step: float | None = None,
-    ) -> Tensor:
-        """rows [n, sum of widths] plus the residuals at time t in 0..1, lengths in scene units. Plain torch.
-
-        features: by the time, what the trunk reads of the planes, [n, inputs]. widths: of all heads of the registry, in
-        the order of the columns; the columns of absent heads stay. weight_step: weights are rounded to multiples of it,
-        straight through.
-        """
-        for time, sign in self._signed(t):
-            hidden = F.relu(self.trunk(features(time), weight_step))
-            found = {
-                name: head(hidden, weight_step) * (sign * self._unit_of(name)) for name, head in self._named_heads()
-            }
-            parts = [found[n] if n in found else rows.new_zeros(len(rows), width) for n, width in widths.items()]
-            rows = rows + torch.cat(parts, dim=1)
-        return rows
-
     @property
     def fusible(self) -> bool:
-        """Whether `moved` can evaluate the field by the kernels."""
+        """Whether the kernels can evaluate the field."""
         return self.planes.fusible and all(len(head.layers) == 1 for _, head in self._named_heads())
 
     def moved(
@@ -162,18 +139,40 @@ class DeformationField(nn.Module):
         widths: Mapping[str, int],
         t: float,
         weight_step: float | None = None,
+        kernels: bool = False,
     ) -> Tensor:
-        """`moved_reference` by the kernels."""
+        """rows [n, sum of widths] plus the residuals at time t in 0..1, lengths in scene units.
+
+        features: by the time, what the trunk reads of the planes, [n, inputs]. widths: of all heads of the registry, in
+        the order of the columns; the columns of absent heads stay. weight_step: weights are rounded to multiples of it,
+        straight through. kernels: evaluate by them, as they can if `fusible`, else in plain torch.
+        """
         if not self.heads:
             return rows
-        ends = dict(zip(widths, accumulate(widths.values()), strict=True))
-        own = [(slice(ends[name] - widths[name], ends[name]), self._unit_of(name)) for name, _ in self._named_heads()]
-        networks = [self.trunk, *(head for _, head in self._named_heads())]
-        parameters = [p for network in networks for layer in network.layers for p in (layer.weight, layer.bias)]
+        add = self._added if kernels else self._added_reference
         for time, sign in self._signed(t):
-            settings = ([(columns, sign * unit) for columns, unit in own], 2 * len(self.trunk.layers), weight_step)
-            rows = _AddNetworks.apply(rows, features(time), settings, *parameters)  # type: ignore[no-untyped-call]
+            rows = add(rows, features(time), widths, sign, weight_step)
         return rows
+
+    def _added_reference(
+        self, rows: Tensor, features: Tensor, widths: Mapping[str, int], sign: float, step: float | None
+    ) -> Tensor:
+        hidden = F.relu(self.trunk(features, step))
+        found = {name: head(hidden, step) * (sign * self._unit_of(name)) for name, head in self._named_heads()}
+        parts = [found[n] if n in found else rows.new_zeros(len(rows), width) for n, width in widths.items()]
+        return rows + torch.cat(parts, dim=1)
+
+    def _added(
+        self, rows: Tensor, features: Tensor, widths: Mapping[str, int], sign: float, step: float | None
+    ) -> Tensor:
+        """`_added_reference` by the kernels."""
+        ends, heads = dict(zip(widths, accumulate(widths.values()), strict=True)), self._named_heads()
+        own = [(slice(ends[name] - widths[name], ends[name]), sign * self._unit_of(name)) for name, _ in heads]
+        networks = [self.trunk, *(head for _, head in heads)]
+        parameters = [p for network in networks for layer in network.layers for p in (layer.weight, layer.bias)]
+        settings = own, 2 * len(self.trunk.layers), step
+        found: Tensor = _AddNetworks.apply(rows, features, settings, *parameters)  # type: ignore[no-untyped-call]
+        return found
 
     def _signed(self, t: float) -> list[tuple[float, float]]:
         """The times at which F is evaluated, each with its sign."""

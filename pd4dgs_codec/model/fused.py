@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 
 from pd4dgs_codec.draw import gaussians as kernels
 from pd4dgs_codec.draw.gaussians import MIN_OPACITY, Decoders, Functions
-from pd4dgs_codec.model.networks import MLP
+from pd4dgs_codec.model.networks import MLP, Quantisation
 from pd4dgs_codec.scene import SCALING_DIM
 
 TORCH = Functions(
@@ -34,49 +34,23 @@ def fusible(networks: Sequence[MLP]) -> bool:
     return kernels.fusible([[(layer.weight, layer.bias) for layer in net.layers] for net in networks])
 
 
-def pick(
-    attributes: Sequence[Tensor],
-    position: Tensor,
-    rows: Tensor,
-    steps: Sequence[float],
-    noise: Sequence[Tensor] | None,
-    rounding: bool,
-    spacing: Tensor,
-    centres: Sequence[Tensor],
-) -> Tensor:
-    """[n, 9 + D + 3 G]: the anchors `rows` (int64 [n], none twice) with noise of so many steps, or rounded to steps.
-
-    attributes: feature [N, D], offset [N, G, 3], scaling [N, 6]. Of each: its step, noise [n, width] in steps, and
-    centre, of which rounded values differ by multiples of the step. position [N, 3]; spacing [N]: the factor of an
-    anchor's steps.
-    """
-    row: Tensor = _Pick.apply(  # type: ignore[no-untyped-call]
-        *attributes, position, rows, steps, noise, rounding, spacing, centres
-    )
+def pick(attributes: Sequence[Tensor], position: Tensor, rows: Tensor, quantisation: Quantisation) -> Tensor:
+    """[n, 9 + D + 3 G]: the anchors `rows` (int64 [n], none twice), with noise or rounded. attributes: feature [N, D],
+    offset [N, G, 3], scaling [N, 6]; position [N, 3]."""
+    row: Tensor = _Pick.apply(position, rows, quantisation, *attributes)  # type: ignore[no-untyped-call]
     return row
 
 
 class _Pick(torch.autograd.Function):
     @staticmethod
-    def forward(
-        ctx: Any,
-        feature: Tensor,
-        offset: Tensor,
-        scaling: Tensor,
-        position: Tensor,
-        rows: Tensor,
-        steps: Sequence[float],
-        noise: Sequence[Tensor] | None,
-        rounding: bool,
-        spacing: Tensor,
-        centres: Sequence[Tensor],
-    ) -> Tensor:
+    def forward(ctx: Any, position: Tensor, rows: Tensor, quantisation: Quantisation, *attributes: Tensor) -> Tensor:
         ctx.save_for_backward(rows)
-        ctx.shapes = [feature.shape, offset.shape, scaling.shape]
-        parts = [position, feature, offset.flatten(1), scaling]
-        out = feature.new_empty(len(rows), sum(part.shape[1] for part in parts))
+        ctx.shapes = [values.shape for values in attributes]
+        steps, centres, spacing, noise, rounding = quantisation
+        parts = [position, *(values.flatten(1) for values in attributes)]
+        out = position.new_empty(len(rows), sum(part.shape[1] for part in parts))
         column = 0
-        drawn = (None, *(noise or (None,) * 3))
+        drawn = (None, *(noise or (None,) * len(attributes)))
         for part, step, own, centre in zip(parts, (0.0, *steps), drawn, (position[:1], *centres), strict=True):
             given = part[:0] if own is None else own
             kernels.pick(
@@ -96,7 +70,7 @@ class _Pick(torch.autograd.Function):
             flat = gradient.flatten(1)
             kernels.pick_backward(flat.numpy(), g.numpy(), column, rows.numpy())
             column += flat.shape[1]
-        return *gradients, None, None, None, None, None, None, None
+        return None, None, None, *gradients
 
 
 def grow(

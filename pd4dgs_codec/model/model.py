@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from pd4dgs_codec.draw.gaussians import OFFSET_REACH, SIGMA_REACH, in_view
 from pd4dgs_codec.model import fused, reference
 from pd4dgs_codec.model.deformation import DeformationField
-from pd4dgs_codec.model.networks import EXACT, MLP, Rounding, level_mask
+from pd4dgs_codec.model.networks import EXACT, MLP, Quantisation, Rounding, level_mask
 from pd4dgs_codec.scene import (
     MASK_THRESHOLD,
     SCAFFOLD_NETWORKS,
@@ -132,10 +132,6 @@ class Model(nn.Module):
         """m^(level) [N]."""
         return level_mask(self.mask_logits, level)
 
-    def visible(self, level: int, camera: Camera) -> Tensor:
-        """int64 [n]: anchors active at `level` that may reach the image, in ascending order."""
-        return self._visible(self.masks(level), self.anchor, camera)
-
     @torch.no_grad()
     def _visible(self, masks: Tensor, position: Tensor, camera: Camera, only: Tensor | None = None) -> Tensor:
         offsets, sizes = (part.amax(1).exp() for part in torch.split(self.scaling_log, 3, dim=1))
@@ -148,23 +144,11 @@ class Model(nn.Module):
         self, level: int, t: float, camera: Camera, rounding: Rounding = EXACT, only: Tensor | None = None
     ) -> Gaussians:
         """The Gaussians of `level` at normalised time t in 0..1 as the camera meets them; only of the anchors `only`
-        (bool [N]) if given. By the kernels where they take the model, else as `gaussians_reference`."""
-        return self._gaussians(level, t, camera, rounding, only, self._fusible())
-
-    def gaussians_reference(
-        self, level: int, t: float, camera: Camera, rounding: Rounding = EXACT, only: Tensor | None = None
-    ) -> Gaussians:
-        """The plain torch form of `gaussians`, for any device and any networks."""
-        return self._gaussians(level, t, camera, rounding, only, False)
-
-    def _gaussians(
-        self, level: int, t: float, camera: Camera, rounding: Rounding, only: Tensor | None, kernels: bool
-    ) -> Gaussians:
+        (bool [N]) if given. By the kernels where they take the model, else in plain torch."""
+        kernels, masks, slots = self._fusible(), self.masks(level), self.widths.slots
         stages: Any = fused if kernels else reference
-        masks, slots = self.masks(level), self.widths.slots
         rows, viewmat = self._visible(masks, self.anchor, camera, only), self._viewmat(camera)
-        anchors = self._picked(rows, rounding, kernels)
-        anchors = self._moved(level, anchors, t, rounding, kernels)
+        anchors = self._moved(level, stages.pick(*self._picked(rows, rounding)), t, rounding, kernels)
         step = self.steps.weights_scaffold if rounding.weights else None
         networks = [self.network(name) for name in SCAFFOLD_NETWORKS]
         eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
@@ -174,26 +158,18 @@ class Model(nn.Module):
         gated, kept = (scales * gates[:, None], opacities[:, 0] * gates), owner * slots + keep % slots
         return Gaussians(means, quats, *gated, colors, kept, rows, raw_opacity)
 
-    def _picked(self, rows: Tensor, rounding: Rounding, kernels: bool) -> Tensor:
-        """[n, 9 + D + 3 G]: the attributes of the anchors `rows`, with noise or rounding."""
+    def _picked(self, rows: Tensor, rounding: Rounding) -> tuple[Any, ...]:
+        """The arguments of `pick` for the anchors `rows`: attributes, positions, rows and how they are quantised."""
         noise = None
         if rounding.noise is not None and not rounding.attributes:
             taken = self.feature, self.scaling_log, self.offset  # in the order in which they take noise
             draws = [rounding.noise.draw(torch.Size((len(rows), x[0].numel()))) for x in taken]
             noise = draws[0], draws[2], draws[1]
-        steps, centres = self.steps, self.centres
-        stages: Any = fused if kernels else reference
-        picked: Tensor = stages.pick(
-            (self.feature, self.offset, self.scaling_log),
-            self.anchor,
-            rows,
-            (steps.feature, steps.offset, steps.scaling_log),
-            noise,
-            rounding.attributes,
-            self.spacing,
-            (centres["feature"], centres["offset"], centres["scaling_log"]),
+        steps, centres, names = self.steps.attributes, self.centres, ("feature", "offset", "scaling_log")
+        quantisation = Quantisation(
+            [steps[n] for n in names], [centres[n] for n in names], self.spacing, noise, rounding.attributes
         )
-        return picked
+        return [getattr(self, name) for name in names], self.anchor, rows, quantisation
 
     def _moved(self, level: int, rows: Tensor, t: float, rounding: Rounding, kernels: bool) -> Tensor:
         """The rows of anchors plus the residuals of the deformation of `level`."""
@@ -208,8 +184,7 @@ class Model(nn.Module):
             return torch.cat(parts, dim=1)
 
         step = self.steps.weights(layers[-1]) if rounding.weights else None
-        moved = fields[-1].moved if kernels else fields[-1].moved_reference
-        return moved(rows, features, self.widths.heads, t, step)
+        return fields[-1].moved(rows, features, self.widths.heads, t, step, kernels)
 
     def _viewmat(self, camera: Camera) -> Tensor:
         """[4, 4] world to camera."""

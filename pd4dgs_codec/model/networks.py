@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -42,6 +42,18 @@ class Rounding:
 
 
 EXACT = Rounding()
+
+
+class Quantisation(NamedTuple):
+    """How the attributes of anchors are quantised: the step of each attribute, its centre, of which rounded values
+    differ by multiples of the step, the factor `spacing` [N] of each anchor's steps, and the noise in steps [n, width]
+    of each attribute, None without; rounding: round in place of the noise."""
+
+    steps: Sequence[float]
+    centres: Sequence[Tensor]
+    spacing: Tensor
+    noise: Sequence[Tensor] | None
+    rounding: bool
 
 
 class _Round(torch.autograd.Function):

@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 from pd4dgs_codec.draw import rasteriser
 from pd4dgs_codec.draw.gaussians import check_time, near_plane
 from pd4dgs_codec.draw.projection import ALPHA_MAX, EPS2D, FAR
-from pd4dgs_codec.draw.rasteriser import Geometry, Projected, check_camera, check_colors, check_near_plane, check_shape
+from pd4dgs_codec.draw.rasteriser import Geometry, Projected
 from pd4dgs_codec.errors import RenderError
 from pd4dgs_codec.model import reference
 from pd4dgs_codec.model.model import Gaussians, Model
@@ -91,12 +91,7 @@ def rasterization(
 ) -> Drawn:
     """Draws N Gaussians with a pinhole camera (OpenCV axes, pixel centres at +0.5).
 
-    means      [N, 3] world, scene units.
-    quats      [N, 4] rotations wxyz, not necessarily unit; a zero quaternion is the identity and gets no gradient.
-    scales     [N, 3] standard deviations, scene units (activated; the sign does not matter).
-    opacities  [N] in 0..1 (activated); a Gaussian whose opacity is not above 1/255, or not finite, is skipped.
-    colors     [N, 3]. background: 3 numbers.
-    near_plane: Gaussians with camera z outside (near_plane, FAR] are skipped, scene units.
+    Arguments as those of `rasteriser.draw`, as tensors. A zero quaternion gets no gradient.
     backend: "cpu", "gsplat" (CUDA), "reference" (dense float64, slow) or "auto", by the device of `means`.
 
     float16 and float64 inputs are drawn in float32; gradients come back in the input's type. A Gaussian with NaN or
@@ -111,37 +106,21 @@ def rasterization(
     """
     if backend not in BACKENDS:
         raise RenderError(f"backend is {backend!r}, expected one of {', '.join(BACKENDS)}")
-    check_near_plane(near_plane)
-    check_camera(camera)
-    _check("means", means, None, 3)
-    n = len(means)
-    for name, tensor, *width in (
-        ("quats", quats, 4),
-        ("scales", scales, 3),
-        ("opacities", opacities),
-        ("colors", colors, 3),
-    ):
-        _check(name, tensor, n, *width)
-    tensors = [means, quats, scales, opacities, colors]
+    tensors = means, quats, scales, opacities, colors
+    behind = rasteriser.check_input(
+        tensors, camera, background, near_plane, _is_floats, lambda t: float(torch.as_tensor(t).detach().float().sum())
+    )
     if any(t.device != means.device for t in tensors):
         raise RenderError(f"tensors are on different devices: {sorted({str(t.device) for t in tensors})}")
-    behind = np.array(background, np.float32)
-    check_shape("background", behind.shape, 3)
-    check_colors("colors", float(colors.detach().float().sum()))
-    check_colors("background", float(behind.sum()))
-    return _choose(backend, means.device)(*tensors, camera, behind, near_plane)
+    return _choose(backend, means.device)(tensors, camera, behind, near_plane)
 
 
-def _check(name: str, tensor: Any, *shape: int | None) -> None:
-    """Raises RenderError unless it is a floating-point tensor of that shape; None is any size."""
-    if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
-        found = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
-        raise RenderError(f"{name} is {found}, expected a floating-point tensor")
-    check_shape(name, tensor.shape, *shape)
+def _is_floats(tensor: Any) -> bool:
+    return isinstance(tensor, Tensor) and tensor.is_floating_point()
 
 
 def _choose(backend: str, device: torch.device) -> Callable[..., Drawn]:
-    """The function of a backend for tensors on `device`: (means, ..., colors, camera, background, near_plane)."""
+    """The function of a backend for tensors on `device`."""
     if device.type not in ("cpu", "cuda"):
         raise RenderError(f"tensors are on {device.type}, expected cpu or cuda")
     if backend == "reference":
@@ -156,24 +135,17 @@ def _choose(backend: str, device: torch.device) -> Callable[..., Drawn]:
 
 
 class _Composite(torch.autograd.Function):
-    """(..., projected) -> (image, alpha); all tensors float32, contiguous and on the CPU, where arrays are views."""
+    """(projected, background, means2d, means, ..., colors) -> (image, alpha); all tensors float32, contiguous and on
+    the CPU, where arrays are views."""
 
     @staticmethod
     def forward(
-        ctx: Any,
-        means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        colors: Tensor,
-        means2d: Tensor,
-        background: np.ndarray,
-        projected: Projected,
+        ctx: Any, projected: Projected, background: np.ndarray, means2d: Tensor, *tensors: Tensor
     ) -> tuple[Tensor, Tensor]:
-        drawn = rasteriser.composite(projected, colors.detach().numpy(), background)
+        drawn = rasteriser.composite(projected, tensors[-1].detach().numpy(), background)
         picture, transmittance = map(torch.from_numpy, drawn)
         ctx.projected = projected
-        ctx.save_for_backward(means, quats, scales, opacities, colors, picture, transmittance)
+        ctx.save_for_backward(*tensors, picture, transmittance)
         return picture, 1.0 - transmittance
 
     @staticmethod
@@ -181,26 +153,17 @@ class _Composite(torch.autograd.Function):
     def backward(ctx: Any, g_picture: Tensor, g_alpha: Tensor) -> tuple[Tensor | None, ...]:
         arrays = [t.detach().numpy() for t in (*ctx.saved_tensors, g_picture.contiguous(), g_alpha.contiguous())]
         found = rasteriser.backward(ctx.projected, Geometry(*arrays[:4]), *arrays[4:])
-        gradients = [torch.from_numpy(a) for a in (*found.geometry, found.colors, found.means2d[None])]
-        return *gradients, None, None
+        gradients = (torch.from_numpy(a) for a in (found.means2d[None], *found.geometry, found.colors))
+        return None, None, *gradients
 
 
-def rasterize_cpu(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    camera: Camera,
-    background: np.ndarray,
-    near_plane: float,
-) -> Drawn:
+def rasterize_cpu(given: Sequence[Tensor], camera: Camera, background: np.ndarray, near_plane: float) -> Drawn:
     """The CPU backend of `rasterization`, which checks the arguments."""
-    tensors = [t.to(torch.float32).contiguous() for t in (means, quats, scales, opacities, colors)]
+    tensors = [t.to(torch.float32).contiguous() for t in given]
     projected = rasteriser.project(Geometry(*(t.detach().numpy() for t in tensors[:4])), camera, near_plane)
     means2d, radii = torch.from_numpy(projected.means2d)[None], torch.from_numpy(projected.radii)[None]
     means2d.requires_grad_(torch.is_grad_enabled() and any(t.requires_grad for t in tensors))
-    image, alpha = _Composite.apply(*tensors, means2d, background, projected)  # type: ignore[no-untyped-call]
+    image, alpha = _Composite.apply(projected, background, means2d, *tensors)  # type: ignore[no-untyped-call]
     return image, alpha, {"means2d": means2d, "radii": radii}
 
 
@@ -250,21 +213,13 @@ def _drawable(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -
     ]
 
 
-def rasterize_gsplat(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    camera: Camera,
-    background: np.ndarray,
-    near_plane: float,
-) -> Drawn:
+def rasterize_gsplat(given: Sequence[Tensor], camera: Camera, background: np.ndarray, near_plane: float) -> Drawn:
     """gsplat behind `rasterization`, which checks the arguments. float32, dense layout."""
-    viewmat, K = (means.new_tensor(np.array(a), dtype=torch.float32)[None] for a in (camera.viewmat, camera.K))
+    *shapes, colors = (t.to(torch.float32) for t in given)
+    viewmat, K = (colors.new_tensor(np.array(a))[None] for a in (camera.viewmat, camera.K))
     images, alphas, meta = _gsplat().rasterization(
-        *_drawable(*(t.to(torch.float32) for t in (means, quats, scales, opacities))),
-        colors.to(torch.float32),
+        *_drawable(*shapes),
+        colors,
         viewmat,
         K,
         camera.width,
@@ -272,7 +227,7 @@ def rasterize_gsplat(
         near_plane=near_plane,
         far_plane=FAR,
         eps2d=EPS2D,
-        backgrounds=torch.from_numpy(background)[None].to(means.device),
+        backgrounds=torch.from_numpy(background)[None].to(colors.device),
         rasterize_mode="classic",
         packed=False,
     )

@@ -20,7 +20,7 @@ from torch.nn import functional as F
 
 from pd4dgs_codec.draw.gaussians import MIN_OPACITY
 from pd4dgs_codec.draw.projection import ALPHA_MAX, ALPHA_MIN, EPS2D, FAR
-from pd4dgs_codec.model.networks import MLP, round_straight_through
+from pd4dgs_codec.model.networks import MLP, Quantisation, round_straight_through
 from pd4dgs_codec.scene import SCALING_DIM, Camera
 
 T_MIN = 1e-4
@@ -100,17 +100,10 @@ def composite_blocks(
 
 
 def rasterize(
-    means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
-    opacities: Tensor,
-    colors: Tensor,
-    camera: Camera,
-    background: np.ndarray,
-    near_plane: float,
+    given: Sequence[Tensor], camera: Camera, background: np.ndarray, near_plane: float
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
     """The oracle behind `rasterization(backend="reference")`, which checks the arguments. Float64 results."""
-    means, quats, scales, opacities, colors = (t.double() for t in (means, quats, scales, opacities, colors))
+    means, quats, scales, opacities, colors = (t.double() for t in given)
     viewmat, K = (means.new_tensor(np.array(a)).double() for a in (camera.viewmat, camera.K))
     n, width, height = len(means), camera.width, camera.height
     index = _before_the_camera(means, quats, scales, opacities, viewmat, near_plane)
@@ -148,17 +141,9 @@ def _before_the_camera(
 # -- the stages of `Model.gaussians`, as `fused` has them --------------------------------------------------------------
 
 
-def pick(
-    attributes: Sequence[Tensor],
-    position: Tensor,
-    rows: Tensor,
-    steps: Sequence[float],
-    noise: Sequence[Tensor] | None,
-    rounding: bool,
-    spacing: Tensor,
-    centres: Sequence[Tensor],
-) -> Tensor:
+def pick(attributes: Sequence[Tensor], position: Tensor, rows: Tensor, quantisation: Quantisation) -> Tensor:
     """See `fused.pick`."""
+    steps, centres, spacing, noise, rounding = quantisation
     parts, factor = [position.index_select(0, rows)], spacing.index_select(0, rows)[:, None]
     for i, (values, step, centre) in enumerate(zip(attributes, steps, centres, strict=True)):
         picked, middle = values.flatten(1).index_select(0, rows), centre.flatten()

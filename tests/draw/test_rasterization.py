@@ -315,7 +315,7 @@ def install(monkeypatch, version):
 
 
 def rasterize_with_gsplat(tensors):
-    return rasterize_gsplat(*tensors, camera(8, 6), np.zeros(3, np.float32), NEAR)
+    return rasterize_gsplat(tensors, camera(8, 6), np.zeros(3, np.float32), NEAR)
 
 
 @pytest.mark.parametrize("version", ["1.6.0", "2.0.1", "1.4.0"])
