@@ -108,10 +108,9 @@ def test_no_two_modules_need_each_other():
         pytest.fail(f"a circle of imports: {' -> '.join(error.args[1])}")
 
 
-@pytest.mark.parametrize("part", ["planes", "omissions"])
-def test_parts_of_the_deformation_are_used_by_the_deformation_alone(part):
-    users = {name for name in MODULES if f"pd4dgs_codec.format.{part}" in imports()[name]}
-    assert users <= {"pd4dgs_codec.format.deformation", "pd4dgs_codec.format.omissions"}
+def test_planes_are_used_by_the_deformation_alone():
+    users = {name for name in MODULES if "pd4dgs_codec.format.planes" in imports()[name]}
+    assert users == {"pd4dgs_codec.format.deformation"}
 
 
 @pytest.mark.parametrize("room", DECODER)

@@ -102,7 +102,7 @@ def test_the_modes_report_the_same_symbols_and_rate():
 def test_the_trainers_rate_is_the_coders_rate():
     """On values that were never rounded, layer by layer and part by part, within 2 %."""
     pytest.importorskip("torch")
-    from pd4dgs_codec.quality.measure import train_rate_bits
+    from trainer_rate import train_rate_bits
 
     for own, row in zip(train_rate_bits(gaussian_scene()), report("gauss").layers, strict=True):
         assert own["layer"] == row.layer

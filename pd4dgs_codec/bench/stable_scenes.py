@@ -15,10 +15,10 @@ import torch
 from torch import Tensor
 
 from pd4dgs_codec.bench.stability import BOX, CAMERA, HEIGHT, WIDTH, Found, Promise, largest, refusal, small_scene
+from pd4dgs_codec.draw.deformation import Field
 from pd4dgs_codec.draw.gaussians import near_plane
 from pd4dgs_codec.errors import EncodeError, NotFinite, RenderError
 from pd4dgs_codec.format import decoder, encoder
-from pd4dgs_codec.format import deformation as coded
 from pd4dgs_codec.interchange.teacher import load_source
 from pd4dgs_codec.model import checkpoint, hexplane
 from pd4dgs_codec.model.config import DeformationConfig, ModelConfig
@@ -92,13 +92,10 @@ def _exact_samples(
 def _sampling_error(
     points: np.ndarray, times: Sequence[float], resolution: Sequence[int] = RESOLUTION, box: np.ndarray = BOX
 ) -> Found:
-    worst = {"kernel": 0.0, "torch": 0.0, "encoder": 0.0}
-    for t, (name, channels) in itertools.product(times, (("kernel", 8), ("torch", 5), ("encoder", 5))):
+    worst = {"kernel": 0.0, "torch": 0.0}
+    for t, (name, channels) in itertools.product(times, (("kernel", 8), ("torch", 5))):
         planes = _planes(resolution, channels)  # the kernel takes multiples of eight
-        if name == "encoder":
-            found = coded.sample_planes(planes, box, points, t)
-        else:
-            found = hexplane.HexPlane.from_arrays(box, planes)(torch.from_numpy(points), t).detach().numpy()
+        found = hexplane.HexPlane.from_arrays(box, planes)(torch.from_numpy(points), t).detach().numpy()
         expected = _exact_samples(planes, box, points, t)
         worst[name] = largest([worst[name], float(np.abs(found - expected).max() / np.abs(expected).max())])
     return ", ".join(f"{name} {error:.1e}" for name, error in worst.items()), largest(worst.values())
@@ -138,7 +135,7 @@ def _field(name: str, plane: np.ndarray) -> Deformation:
 
 def _residual_error(field: Deformation, times: Sequence[float]) -> Found:
     places = INSIDE * np.float32(1.4)
-    module, worst = DeformationField.from_arrays(field, BOX), 0.0
+    module, player, worst = DeformationField.from_arrays(field, BOX), Field(field, BOX, {"position": 3}), 0.0
     ((head, _),), ((trunk, _),) = (field.networks[name] for name in ("position", "trunk"))
     scale = max(float(np.abs(plane).max()) for plane in field.planes[0].values())
     for t in times:
@@ -146,9 +143,10 @@ def _residual_error(field: Deformation, times: Sequence[float]) -> Found:
         expected = hidden @ head.T.astype(np.float64) * float(deformation_unit(BOX))
         points = torch.from_numpy(places)
         still = points.new_zeros(len(points), 3)
-        moved = module.moved_reference(still, lambda time: module.planes(points, time), {"position": 3}, t)  # noqa: B023
-        model = moved.detach().numpy()
-        for found in (model, coded.residuals(field, BOX, places, t)["position"]):
+        moved = module.moved(still, lambda time: module.planes(points, time), {"position": 3}, t)  # noqa: B023
+        played = np.zeros_like(places)
+        player.move(played, places, t)
+        for found in (moved.detach().numpy(), played):
             worst = largest([worst, float(np.abs(found - expected).max()) / scale])
     return f"{len(times)} instants", worst
 
@@ -347,7 +345,7 @@ TRAINED = "finite checkpoint, a file that decodes, images of all levels within 1
 REFERENCE = f"finite; image and gradients within {BOUND:g} of those of the float64 reference"
 
 PROMISES = [
-    Promise("hexplane", "the float64 value of the definition, by kernel, torch and encoder alike", _sampling_error, [
+    Promise("hexplane", "the float64 value of the definition, by kernel and torch alike", _sampling_error, [
         ("time before the range", "t = -1e-7, -3, -1e30, -inf", INSIDE, (-1e-7, -3.0, -1e30, -INF)),
         ("time after the range", "t = 1 + 1e-7, 7, 1e30, inf", INSIDE, (1 + 1e-7, 7.0, 1e30, INF)),
         ("time on the rows", "t on each of 4 time rows, and one float32 beside", INSIDE, ROWS),
@@ -360,7 +358,7 @@ PROMISES = [
     ], FLOAT32),
     Promise("hexplane", "as at the lower, upper, lower border; no gradient to the point", _bad_points_error,
             [("points not finite", "NaN, inf, -inf in each coordinate")]),
-    Promise("deformation", "the residuals of float64, by model and encoder", _residual_error, FIELDS, FLOAT32),
+    Promise("deformation", "the residuals of float64, by model and player", _residual_error, FIELDS, FLOAT32),
     Promise("deformation", "finite images within 1/255 of those of the float64 reference", _file_pictures,
             [(f"{name}: pictures of its file", *rest) for name, *rest in FIELDS], 1 / 255),
     refusal("deformation", EncodeError, lambda: encoder.encode(small_scene(_field("xy", np.full((6, 6), 1e20)))),

@@ -15,7 +15,7 @@ from pd4dgs_codec.quality import ENCODE_MIN_DB_PER_MEGABYTE
 
 if TYPE_CHECKING:
     from pd4dgs_codec.format.metadata import Metadata
-    from pd4dgs_codec.quality.packing import Packed, Views
+    from pd4dgs_codec.quality.packing import Views
     from pd4dgs_codec.scene import Scene, SceneInfo
 
 DETAILS = f"""\
@@ -45,7 +45,7 @@ HELP = {
     "priors": "distributions to choose from per channel",
     "layers": "auto leaves out layers without visible effect; a number keeps the layers up to it",
     "effort": "1 is fast, 9 makes the smallest files",
-    "omit": "leave out residuals too small to see and parts without effect, only the latter, or nothing",
+    "omit": "leave out plane cells that no anchor reads, or nothing",
 }
 
 
@@ -90,7 +90,7 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
         raise UsageError("--min-gain needs --data SOURCE: gains are measured on its views")
     common.check_output(args.output, args.overwrite)
     chosen = _options(args)
-    scene, trained, metadata = _load(args)
+    scene, metadata = _load(args)
     console.detail(f"{args.input}: {len(scene.anchor_q)} anchors, layers {list(scene.layers)}, steps {scene.steps}")
     from pd4dgs_codec.quality.packing import pack
 
@@ -105,8 +105,6 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
         progress=lambda what: progress_bar(None, "pictures", what),
     )
     result = {"input": args.input, "output": args.output, **packed.json()}
-    if trained and args.json:  # it takes time, and only the JSON shows it
-        _add_train_rate(result, packed, chosen)
     common.write_bytes(args.output, packed.data, args.overwrite)
     console.result(result, _text(result, 8 * packed.report.first_bytes / FIRST_FRAME_RATE))
     return OK
@@ -121,15 +119,15 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
     return EncodeOptions(**named | {"layers": layers, "verify": not args.no_verify})
 
 
-def _load(args: argparse.Namespace) -> tuple[Scene, bool, Metadata | None]:
-    """(scene, whether it has the unquantised values of a checkpoint, metadata)."""
+def _load(args: argparse.Namespace) -> tuple[Scene, Metadata | None]:
+    """(scene, metadata)."""
     data = common.read_bytes(args.input)
     if common.is_pd4(data):
         from pd4dgs_codec.format.decoder import decode
         from pd4dgs_codec.format.info import metadata_of
 
-        return decode(data), False, _metadata(args, metadata_of(data))
-    return common.checkpoint_scene(args.input, data), True, _metadata(args, None)
+        return decode(data), _metadata(args, metadata_of(data))
+    return common.checkpoint_scene(args.input, data), _metadata(args, None)
 
 
 def _metadata(args: argparse.Namespace, had: Metadata | None) -> Metadata | None:
@@ -153,22 +151,6 @@ def _views(args: argparse.Namespace, info: SceneInfo, console: Console) -> Views
     if not dataset.test:
         console.message("no views are held out: gains are measured on training views")
     return views
-
-
-def _add_train_rate(result: dict[str, Any], packed: Packed, options: EncodeOptions) -> None:
-    """Adds the trainer's sum of R over the unquantised values, at the steps and for the layers of this file."""
-    from pd4dgs_codec.quality.measure import train_rate_bits
-
-    coded = EncodeOptions(layers=options.layers, effort=options.effort, omit=options.omit)
-    rows = train_rate_bits(packed.scene, coded)
-    per_layer = [
-        {**row, "layer": int(row["layer"]), "bits": sum(bits for name, bits in row.items() if name != "layer")}
-        for row in rows
-    ]
-    bits = {row["layer"]: row["bits"] for row in per_layer}
-    result |= {"train_rate_bits": sum(bits.values()), "train_rate_bits_layers": per_layer}
-    for row in result["layers"]:
-        row["train_rate_bits"] = bits.get(row["layer"])
 
 
 def _text(result: dict[str, Any], first_frame: float) -> str:

@@ -41,7 +41,8 @@ def parser() -> options.Parser:
 
 def _info(args: argparse.Namespace, console: Console) -> int:
     data, total = _input(args, console)
-    from pd4dgs_codec.format.info import hashes, info, nearest_bounds
+    from pd4dgs_codec.format.decoder import read_layers
+    from pd4dgs_codec.format.info import hashes, info
 
     result = {"input": args.input, **info(data), "available": total}
     end = result["layers"][0]["slices"][0]["end"]
@@ -50,7 +51,7 @@ def _info(args: argparse.Namespace, console: Console) -> int:
     if args.bytes:
         result["parts"] = _parts(result)
     if args.check:
-        result["nearest_bounds"] = nearest_bounds(data)
+        read_layers(data)
         result["checked"] = True
     if args.hashes:
         result["hashes"] = hashes(data)
@@ -154,14 +155,6 @@ def _slice_lines(result: dict[str, Any]) -> list[str]:
     return [table(("slice", "layer", "prefix", "new anchors", "mPSNR dB"), rows)]
 
 
-def _bound_lines(declared: dict[str, float], nearest: dict[str, float]) -> list[str]:
-    return [
-        f"error bound of {what}: {declared[what]:.9g} declared, {bound:.9g} by rounding to the nearest symbol"
-        for what, bound in nearest.items()
-        if declared[what] != bound
-    ] or ["checked: error bounds are those of rounding to the nearest symbol"]
-
-
 def _text(result: dict[str, Any]) -> str:
     cut = "" if result["available"] >= result["bytes"] else f", of which {result['available']:,} are present"
     low, high = result["time_range"]
@@ -187,7 +180,6 @@ def _text(result: dict[str, Any]) -> str:
         lines.append(_parts_table(result))
     if result.get("checked"):
         lines.append("checked: every layer decodes")
-        lines += _bound_lines(result["error_bounds"], result["nearest_bounds"])
     for row in result.get("hashes", []):
         lines.append(f"layer {row['layer']}: symbols {row['symbols']}")
         lines.append(f"layer {row['layer']}: tensors {row['tensors']}")

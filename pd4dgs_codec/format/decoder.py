@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from itertools import accumulate
 
 from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.errors import DecodeError, Malformed, Truncated, UnsupportedFeature
@@ -16,7 +14,6 @@ from pd4dgs_codec.format.registry import BY_CHUNK_TYPE, LayerKind
 from pd4dgs_codec.format.symbols import (
     GrowingScene,
     LayerSymbols,
-    MaskCodes,
     SceneSymbols,
     TakenVoxels,
     check_slice,
@@ -28,23 +25,18 @@ from pd4dgs_codec.scene import Scene
 class LayerReader:
     """Reads a file's chunks in order. It holds neither bytes nor slices: a call gets the bytes from the next chunk on
     and returns one slice. After a fault it stands where it stood before the slice.
-
-    growing: whether `scene` grows with each slice.
     """
 
-    def __init__(self, growing: bool = True) -> None:
+    def __init__(self) -> None:
         self.header: Header | None = None
         self.offset = 0  #: of the next chunk
         self.count = 0  #: slices read
-        self._growing = growing
         self._scene: GrowingScene | None = None
         self._layer, self._number = -1, -1  # of the latest slice
         self._following: list[int | None] = []  # by chunk, the layer of the first slice behind those before it
-        self._share: list[float] = []  # by chunk, the part of all slices' bytes that has come with it
         self._index = 0
         self._scene_id = b""
         self._declared = Declared()
-        self._codes = MaskCodes()
         self._taken = TakenVoxels()
         self._past: Past[Prior] | None = None
 
@@ -55,7 +47,7 @@ class LayerReader:
 
     @property
     def scene(self) -> GrowingScene:
-        """The scene of the slices read so far, at least one."""
+        """The scene of the slices read so far, once the header is."""
         assert self._scene is not None
         return self._scene
 
@@ -97,9 +89,7 @@ class LayerReader:
         for kind, _ in reversed(header.chunks):
             following.append(kind if kind in BY_CHUNK_TYPE else following[-1])
         self.header, self._following = header, following[::-1]
-        come = [*accumulate(size if kind in BY_CHUNK_TYPE else 0 for kind, size in header.chunks)]
-        self._share = [part / max(1, come[-1]) for part in come]
-        self._scene = GrowingScene(header.info, header.grid) if self._growing else None
+        self._scene = GrowingScene(header.info, header.grid)
 
     def _read_chunk(self, data: bytes | bytearray, start: int) -> LayerSymbols | None:
         """Read the next chunk: a slice, or None for an ancillary chunk."""
@@ -146,7 +136,7 @@ class LayerReader:
             part, declared = read_layer(
                 chunk.payload, kind, header.grid.widths, self._declared, header.mode, later, past
             )
-            check_slice(part, self._codes, header.info.voxel_size, header.grid)
+            check_slice(part, self.scene.codes, header.info.voxel_size, header.grid)
             missing = [name for name in part.steps if name not in header.error_bounds]
             if missing:
                 raise Malformed(f"layer {kind.layer}: no error bound of {missing[0]} in the header, expected one")
@@ -155,15 +145,11 @@ class LayerReader:
             if undo:
                 undo()
             raise
-        self._codes.take(part, not later)
         self._declared, self._past = declared, past
         self._layer, self._number, self.count = kind.layer, chunk.slice, self.count + 1
-        if self._scene is not None:
-            following, share = self._following[self._index + 1], self._share[self._index]
-            growth = 1.0 if following is None else max(1.5, 1.25 / share)
-            self._scene.add(part, not later, growth)
-            if following != kind.layer:
-                self._scene.sort(growth)
+        self.scene.add(part, not later)
+        if self._following[self._index + 1] != kind.layer:
+            self.scene.sort()
         return part
 
 
@@ -190,25 +176,13 @@ def _read(
     return True
 
 
-@dataclass(eq=False)
-class FileSymbols:
-    """What a file stores: its header, and the symbols of its layers."""
-
-    header: Header
-    layers: list[LayerSymbols]
-
-    @property
-    def symbols(self) -> SceneSymbols:
-        """The scene as integers."""
-        return SceneSymbols(self.header.info, self.header.grid, self.layers)
-
-
-def read_layers(data: bytes, *, max_layer: int | None = None) -> FileSymbols:
-    """The symbols of a file, or of its layers <= max_layer. Raises as `decode` does."""
-    reader, layers = LayerReader(growing=False), dict[int, list[LayerSymbols]]()
+def read_layers(data: bytes, *, max_layer: int | None = None) -> tuple[Header, SceneSymbols]:
+    """(header, what the file stores, or its layers <= max_layer). Raises as `decode` does."""
+    reader, layers = LayerReader(), dict[int, list[LayerSymbols]]()
     _read(reader, data, max_layer, take=lambda part: layers.setdefault(part.kind.layer, []).append(part))
     assert reader.header is not None
-    return FileSymbols(reader.header, [merged(parts) for parts in layers.values()])
+    header = reader.header
+    return header, SceneSymbols(header.info, header.grid, [merged(parts) for parts in layers.values()])
 
 
 def decode(

@@ -1,8 +1,8 @@
-"""A layer's planes and networks for the rest of the codec: symbols, checks, parameters, sections, residuals.
+"""A layer's planes and networks for the rest of the codec: symbols, checks, parameters, sections.
 
-Only this module and its parts `planes` and `omissions`, which nothing else imports, know what a deformation is made of:
-planes, and a trunk with a network per residual head. The codec passes a `Deformation` on, of float32 values in a scene
-and of int32 symbols in a layer. Layer 0 has networks and no planes.
+Only this module and its part `planes`, which nothing else imports, know what a deformation is made of: planes, and a
+trunk with a network per residual head. The codec passes a `Deformation` on, of float32 values in a scene and of int32
+symbols in a layer. Layer 0 has networks and no planes.
 """
 
 from __future__ import annotations
@@ -18,24 +18,26 @@ import numpy as np
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
 from pd4dgs_codec.errors import LimitExceeded, Malformed
 from pd4dgs_codec.format.canonical import Fields, as_integer, as_list, as_registered
-from pd4dgs_codec.format.omissions import Anchors as Anchors
-from pd4dgs_codec.format.omissions import Omissions as Omissions
 from pd4dgs_codec.format.options import EncodeOptions
-from pd4dgs_codec.format.planes import PREDICTORS, PlaneShape, read_planes, restore, write_planes
+from pd4dgs_codec.format.planes import (
+    PREDICTORS,
+    PlaneShape,
+    cells_read,
+    fill_plane,
+    read_planes,
+    restore,
+    write_planes,
+)
 from pd4dgs_codec.format.planes import choose_predictor as choose_predictor
-from pd4dgs_codec.format.planes import sample_planes as sample_planes
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, dequantise, expect, expect_array, is_step, magnitude, quantise
 from pd4dgs_codec.format.registry import LAYER_KINDS, LayerKind, Section
 from pd4dgs_codec.scene import (
     INSTANTS,
-    LENGTH_HEADS,
     PLANES,
     TRUNK,
     Deformation,
-    Network,
     Steps,
     Widths,
-    deformation_unit,
     instant,
     plane_sides,
 )
@@ -149,31 +151,22 @@ def is_zero(tensors: Deformation, head: str) -> bool:
     return not weight.any() and (tensors.key is not None or not bias.any())
 
 
-def time_rows(tensors: Deformation) -> int:
-    """The number of instants at which a deformation has values of its own."""
-    return max(plane_sides(scale)[3] for scale in tensors.planes)
+def without_unread(symbols: Deformation, unit: np.ndarray) -> tuple[Deformation, str, float]:
+    """(symbols with values of little cost in the cells of planes that no point reads, how many these are, the bits that
+    this saves by order-0 entropy); `symbols` itself where nothing changes.
 
-
-def residuals(deformation: Deformation, box: np.ndarray, points: np.ndarray, t: float) -> dict[str, np.ndarray]:
-    """head -> float32 [n, width] residuals at `points` [n, 3] (scene units) and normalised time t; lengths in scene
-    units. The function of the trained model, in numpy; it is not normative."""
-    outputs = _outputs(deformation, box, points, t)
-    if deformation.key is not None:
-        still = _outputs(deformation, box, points, instant(deformation.key))
-        outputs = {name: out - still[name] for name, out in outputs.items()}
-    unit = deformation_unit(box)
-    return {name: out * unit if name in LENGTH_HEADS else out for name, out in outputs.items()}
-
-
-def _outputs(deformation: Deformation, box: np.ndarray, points: np.ndarray, t: float) -> dict[str, np.ndarray]:
-    hidden = np.maximum(_run(deformation.networks[TRUNK], sample_planes(deformation.planes, box, points, t)), 0)
-    return {name: _run(deformation.networks[name], hidden) for name in heads_of(deformation)}
-
-
-def _run(network: Network, x: np.ndarray) -> np.ndarray:
-    for i, (weight, bias) in enumerate(network):
-        x = (np.maximum(x, 0) if i else x) @ weight.T + bias
-    return x
+    unit: float32 [n, 3], 0..1 in the box.
+    """
+    filled, free, cells, saved = [], 0, 0, 0.0
+    for scale, marks in zip(symbols.planes, cells_read(symbols.planes, unit), strict=True):
+        found = {name: fill_plane(scale[name], marks[name]) for name, _, _ in PLANES}
+        filled.append({name: samples for name, (samples, _) in found.items()})
+        saved += sum(bits for _, bits in found.values())
+        free += sum(int((~mark).sum()) for mark in marks.values())
+        cells += sum(mark.size for mark in marks.values())
+    if all((new[n] == old[n]).all() for new, old in zip(filled, symbols.planes, strict=True) for n in new):
+        return symbols, "", 0.0
+    return replace(symbols, planes=tuple(filled)), f"{free:,} of {cells:,} plane cells", max(saved, 0.0)
 
 
 # -- parameters --------------------------------------------------------------------------------------------------------

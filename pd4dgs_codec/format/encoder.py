@@ -28,7 +28,7 @@ from pd4dgs_codec.format.info import info
 from pd4dgs_codec.format.metadata import CHUNK_TYPE, Metadata, write_metadata
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.payload import StreamReport, write_layer
-from pd4dgs_codec.format.plan import LeftOut, make_plan
+from pd4dgs_codec.format.plan import LeftOut, plan
 from pd4dgs_codec.format.registry import MAX_CHUNKS
 from pd4dgs_codec.format.symbols import LayerSymbols, SceneSymbols, sliced
 from pd4dgs_codec.scene import Scene
@@ -130,7 +130,7 @@ def encode_with_report(
     started = time.perf_counter()
     scene, options = replace(options, **changes).apply_scale(scene)
     check_scene(scene)
-    planned = make_plan(scene, options)
+    planned = plan(scene, options)
     symbols, omitted = planned.symbols, planned.left_out
     bounds = rounding_bounds(symbols)
     errors = verify_errors(planned.scene, symbols, bounds) if options.verify else []
@@ -228,7 +228,7 @@ def _container(
 ) -> bytes:
     """The file of these slices. Metadata, if there is any, comes last: a picture does not wait for it."""
     parts = [
-        (layer.kind.chunk_type, slice_flags(number, len(slices)), part.payload)
+        (layer.kind.layer, slice_flags(number, len(slices)), part.payload)
         for layer, slices in zip(symbols.layers, written, strict=True)
         for number, part in enumerate(slices)
     ]
@@ -248,18 +248,17 @@ def _check_file(data: bytes, fingerprints: list[bytes]) -> None:
         if not fingerprints:
             info(data)
             return
-        file = read_layers(data)
+        header, found = read_layers(data)
     except LimitExceeded as error:
         raise EncodeError(f"the scene is over a limit of the format: {error}") from None
     except DecodeError as error:
         raise EncodeError(f"verification: the file does not decode: {error}") from error
-    if pack_header(file.header) != read_preamble(data).header:
+    if pack_header(header) != read_preamble(data).header:
         raise EncodeError("verification: the header decodes to other values")
-    found = [_fingerprint(layer) for layer in file.layers]
-    if len(found) != len(fingerprints):
-        raise EncodeError(f"verification: the file decodes to {len(found)} layers, expected {len(fingerprints)}")
-    for layer, own, meant in zip(file.layers, found, fingerprints, strict=True):
-        if own != meant:
+    if len(found.layers) != len(fingerprints):
+        raise EncodeError(f"verification: the file decodes to {len(found.layers)} layers, expected {len(fingerprints)}")
+    for layer, meant in zip(found.layers, fingerprints, strict=True):
+        if _fingerprint(layer) != meant:
             raise EncodeError(f"verification: layer {layer.kind.layer} decodes to other symbols")
 
 

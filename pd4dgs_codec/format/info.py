@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.errors import DecodeError
-from pd4dgs_codec.format.check import rounding_bounds
 from pd4dgs_codec.format.container import CHUNK_OVERHEAD, MAJOR, MINOR, PREAMBLE_SIZE, read_chunk, read_preamble
 from pd4dgs_codec.format.decoder import read_layers
 from pd4dgs_codec.format.header import unpack_header
@@ -109,12 +108,6 @@ def _about(payload: bytes) -> dict[str, Any]:
     return {**texts, **quality, **slices, **({"still_bytes": len(found.still)} if found.still else {})}
 
 
-def nearest_bounds(data: bytes) -> dict[str, float]:
-    """By field of Steps the error bounds of an encoder that rounds to the nearest symbol, for a complete file, which is
-    decoded. They can be compared with the declared bounds without the scene that was encoded."""
-    return rounding_bounds(read_layers(data).symbols)
-
-
 def hashes(data: bytes, max_layer: int | None = None) -> list[dict[str, Any]]:
     """Per layer {layer, symbols, tensors}: SHA-256 in hex of the integers and the float32 values of a complete file, or
     of its layers <= max_layer alone (bytes after those are not looked at). Clause 12.4.
@@ -125,7 +118,7 @@ def hashes(data: bytes, max_layer: int | None = None) -> list[dict[str, Any]]:
     tensors: float32 little-endian of anchor [n, 3], feature [n, D], scaling_log [n,
     6], offset [n, G, 3] of own rows, then planes and networks as above.
     """
-    symbols = read_layers(data, max_layer=max_layer).symbols
+    _, symbols = read_layers(data, max_layer=max_layer)
     scene, rows = symbols.scene(), []
     for index, layer in enumerate(symbols.layers):
         integers, tensors = _digest(layer.arrays(), "<i4"), _digest(float_tensors(scene, index), "<f4")

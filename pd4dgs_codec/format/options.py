@@ -25,7 +25,7 @@ CHOICES: Mapping[str, Sequence[str | int]] = {
     "priors": PRIORS,
     "layers": ("auto", 0, 1, 2),
     "effort": EFFORTS,
-    "omit": ("bounded", "lossless", "nothing"),
+    "omit": ("lossless", "nothing"),
 }
 
 #: Least bytes of a slice: its frame and parameters take some 50 bytes, and its channels name a prior each.
@@ -37,10 +37,9 @@ class EncodeOptions:
     """Options of the encoder. Raises EncodeError for an invalid value.
 
     mode: "ans", or "lzma" for the same symbols under LZMA2. priors: "best", or "gauss", the model of R(a). layers:
-    "auto" leaves out every head that is zero after quantisation or below the bounds of `plan.head_bounds`, and every
-    layer without a head; 0, 1 or 2 keeps the layers up to that number and drops only heads that are exactly zero.
-    effort: 1 (fast) .. 9 (small). omit: "bounded" leaves out heads below those bounds and parts that change no picture,
-    "lossless" the latter alone, "nothing" only heads that are exactly zero and anchors below the mask threshold.
+    "auto" leaves out every layer without a head; 0, 1 or 2 keeps the layers up to that number. Heads that are zero
+    after quantisation and anchors below the mask threshold are always left out. effort: 1 (fast) .. 9 (small). omit:
+    "lossless" gives plane cells that no anchor reads values of little cost, "nothing" does not.
     step_scale: factor on every quantisation step. slices: most bytes of a slice, where planes and networks allow it,
     the header counted with the first slice; 0 for one slice per layer. verify: decode the result, compare every symbol,
     and check every value against the error bound in the header.
@@ -50,7 +49,7 @@ class EncodeOptions:
     priors: str = "best"
     layers: str | int = "auto"
     effort: int = 5
-    omit: str = "bounded"
+    omit: str = "lossless"
     step_scale: float = 1.0
     slices: int = 0
     verify: bool = True

@@ -1,4 +1,4 @@
-"""The planes of a HexPlane, for `deformation`: prediction, the coded section, samples, and cells that nothing samples.
+"""The planes of a HexPlane, for `deformation`: prediction, the coded section, and cells that nothing samples.
 
 A plane is int32 [C, H, W]. A sample at row i, column j of a channel is predicted from its neighbours W = k[i, j-1],
 N = k[i-1, j] and NW = k[i-1, j-1], and the residual k - prediction is coded. In row 0 N and NW are taken equal to W, in
@@ -221,42 +221,6 @@ def _estimated_bits(residuals: Array) -> float:
         mean = np.abs(channel.astype(np.int64) - np.median(channel)).mean() + 1
         bits += float(size * np.log2(mean) + 2 * size)
     return bits
-
-
-# -- samples -----------------------------------------------------------------------------------------------------------
-
-
-def sample_planes(planes: Planes, box: np.ndarray, points: np.ndarray, t: float) -> np.ndarray:
-    """float32 [n, sum of C]: bilinear samples, multiplied over a scale's six planes, concatenated over scales.
-
-    points: float32 [n, 3], scene units; box float32 [2, 3] maps to the planes' corners (align corners), clamped at the
-    border; t in 0..1 to the first and last time row.
-    """
-    extent = np.maximum(box[1] - box[0], np.finfo(np.float32).tiny)
-    unit = np.empty((len(points), 4), dtype=np.float32)
-    unit[:, :3] = np.clip((points - box[0]) / extent, 0.0, 1.0)
-    unit[:, 3] = np.clip(t, 0.0, 1.0)
-    features = []
-    for scale in planes:
-        position = unit * (np.array(plane_sides(scale), dtype=np.float32) - 1)
-        product: np.ndarray | float = 1.0
-        for name, a, b in PLANES:
-            product = product * bilinear(scale[name], position[:, a], position[:, b])
-        features.append(product)
-    return np.concatenate(features, axis=1) if features else np.zeros((len(points), 0), np.float32)
-
-
-def bilinear(plane: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """[n, C] samples of plane [C, H, W] at column u in 0..W-1 and row v in 0..H-1."""
-    _, h, w = plane.shape
-    rows_last = np.ascontiguousarray(plane.transpose(1, 2, 0))
-    j, i = np.minimum(u.astype(np.intp), max(w - 2, 0)), np.minimum(v.astype(np.intp), max(h - 2, 0))
-    j1, i1 = np.minimum(j + 1, w - 1), np.minimum(i + 1, h - 1)
-    fu, fv = (u - j)[:, None], (v - i)[:, None]
-    top = rows_last[i, j] * (1 - fu) + rows_last[i, j1] * fu
-    bottom = rows_last[i1, j] * (1 - fu) + rows_last[i1, j1] * fu
-    samples: np.ndarray = top * (1 - fv) + bottom * fv
-    return samples
 
 
 # -- cells that nothing samples ----------------------------------------------------------------------------------------

@@ -22,11 +22,6 @@ class LayerKind:
     planes_step: str | None = None
 
     @property
-    def chunk_type(self) -> int:
-        """Its type in the bitstream."""
-        return self.layer
-
-    @property
     def network_ids(self) -> dict[str, int]:
         """The numbers of its networks in the bitstream, ascending: the order of the tables in `scene`."""
         names = (TRUNK, *HEADS) if self.layer else SCAFFOLD_NETWORKS
@@ -48,7 +43,7 @@ LAYER_KINDS: tuple[LayerKind, ...] = (
     LayerKind(2, "local_deformation", "weights_local", "planes_local"),
 )
 
-BY_CHUNK_TYPE: dict[int, LayerKind] = {kind.chunk_type: kind for kind in LAYER_KINDS}
+BY_CHUNK_TYPE: dict[int, LayerKind] = {kind.layer: kind for kind in LAYER_KINDS}
 
 
 class Section(IntEnum):

@@ -135,15 +135,9 @@ class SceneSymbols:
     def scene(self) -> Scene:
         """The dequantised scene (clause 11.5)."""
         grown = GrowingScene(self.info, self.grid)
-        rows = [len(layer.anchor_q) for layer in self.layers]
-        for i, layer in enumerate(self.layers, start=1):
-            grown.add(layer, growth=sum(rows) / max(1, sum(rows[:i])))
+        for layer in self.layers:
+            grown.add(layer)
         return grown.scene()
-
-
-def rounded(scene: Scene) -> Scene:
-    """A planned scene with the values that come back from its file. Raises EncodeError for one that has no symbol."""
-    return replace(SceneSymbols.of(scene).scene(), steps=scene.steps)
 
 
 def float_tensors(scene: Scene, index: int) -> list[np.ndarray]:
@@ -157,10 +151,6 @@ def float_tensors(scene: Scene, index: int) -> list[np.ndarray]:
 # -- slices as they come -----------------------------------------------------------------------------------------------
 
 
-#: An array is allocated for so many times its rows at most, however many are to come.
-MOST_GROWTH = 4.0
-
-
 class _Column:
     """An array [n, ...] that grows at its end. What was read from it before stays as it is."""
 
@@ -172,19 +162,19 @@ class _Column:
     def values(self) -> np.ndarray:
         return self._room[: self.size]
 
-    def grow(self, n: int, growth: float) -> np.ndarray:
-        """n further rows, to be written. growth: about how many times as many there will be."""
+    def grow(self, n: int) -> np.ndarray:
+        """n further rows, to be written."""
         end = self.size + n
         if end > len(self._room):
-            room = np.empty((int(end * min(growth, MOST_GROWTH)), *self._room.shape[1:]), self._room.dtype)
+            room = np.empty((max(end, 2 * len(self._room)), *self._room.shape[1:]), self._room.dtype)
             room[: self.size] = self.values
             self._room = room
         first, self.size = self.size, end
         return self._room[first:end]
 
-    def reorder(self, first: int, order: np.ndarray, growth: float) -> None:
+    def reorder(self, first: int, order: np.ndarray) -> None:
         """Sort the rows from `first` on, in a copy."""
-        room = np.empty((int(self.size * min(growth, MOST_GROWTH)), *self._room.shape[1:]), self._room.dtype)
+        room = np.empty_like(self._room)
         room[:first], room[first : self.size] = self.values[:first], self.values[first:][order]
         self._room = room
 
@@ -208,36 +198,41 @@ class GrowingScene:
         self._sorted = True  # whether its rows are
         self._centre = grid.centre_values
 
-    def add(self, part: LayerSymbols, first: bool = True, growth: float = 1.0) -> None:
-        """Add a slice. first: of its layer. growth: about how many times as many rows there will be in the end."""
+    def add(self, part: LayerSymbols, first: bool = True) -> None:
+        """Add a slice. first: of its layer."""
         n, layer = len(part.anchor_q), part.kind.layer
         if first:
             self.sort()
             self._first, codes = self._columns["anchor_q"].size, _Column(np.uint8)
-            before = self._masks[-1].values if self._masks else np.zeros(0, np.uint8)
-            raised = codes.grow(len(before), growth * (len(before) + n) / max(1, len(before)))
+            before = self.codes
+            raised = codes.grow(len(before))
             np.add(before, part.mask_increase, out=raised, casting="unsafe")
             self._masks.append(codes)
             self._steps = replace(self._steps, **part.steps)
             self._tensors[layer] = dequantise_tensors(part.tensors, part.kind, self._steps)
         self._sorted = first or (self._sorted and not n)
-        self._masks[-1].grow(n, growth)[:] = part.mask_own
-        self._columns["anchor_q"].grow(n, growth)[:] = part.anchor_q
-        self._columns["classes"].grow(part.classes.size, growth)[:] = part.classes
-        rows = {name: self._columns[name].grow(n, growth) for name in self._grid.widths.attributes}
+        self._masks[-1].grow(n)[:] = part.mask_own
+        self._columns["anchor_q"].grow(n)[:] = part.anchor_q
+        self._columns["classes"].grow(part.classes.size)[:] = part.classes
+        rows = {name: self._columns[name].grow(n) for name in self._grid.widths.attributes}
         for at in row_blocks(n):
             for name, x in self._grid.dequantise(part.attributes[:, at], part.classes[at]).items():
                 rows[name][at] = x
 
-    def sort(self, growth: float = 1.0) -> None:
-        """Put the rows of the layer in progress in order. growth: as in `add`."""
+    def sort(self) -> None:
+        """Put the rows of the layer in progress in order."""
         if self._sorted:
             return
         order = morton_order(self._columns["anchor_q"].values[self._first :])
         for column in (*self._columns.values(), self._masks[-1]):
             if column.size:
-                column.reorder(self._first, order, growth)
+                column.reorder(self._first, order)
         self._sorted = True
+
+    @property
+    def codes(self) -> np.ndarray:
+        """uint8 [rows so far]: the mask codes of the latest layer."""
+        return self._masks[-1].values if self._masks else np.zeros(0, np.uint8)
 
     def scene(self, writeable: bool = True) -> Scene:
         """The scene so far, at least one slice. Scenes share their arrays: let no two of them be written to."""
@@ -263,15 +258,15 @@ class GrowingScene:
 # -- rules between slices ----------------------------------------------------------------------------------------------
 
 
-def check_slice(layer: LayerSymbols, before: MaskCodes, voxel_size: float, grid: Grid) -> None:
-    """Check a slice against the header and the codes before it.
+def check_slice(layer: LayerSymbols, before: np.ndarray, voxel_size: float, grid: Grid) -> None:
+    """Check a slice against the header and the mask codes before it, uint8 [rows before].
 
     Raises Malformed if a mask code is above 255, an attribute lies too many steps from 0, or a dequantised value would
     not be finite.
     """
     where = f"layer {layer.kind.layer}"
     if layer.mask_increase.size:
-        highest = int((before.codes + layer.mask_increase).max())
+        highest = int((before + layer.mask_increase).max())
         if highest > 255:
             raise Malformed(f"{where}: mask code {highest}, expected at most 255")
     farthest = grid.farthest(layer.attributes, layer.classes)
@@ -281,30 +276,6 @@ def check_slice(layer: LayerSymbols, before: MaskCodes, voxel_size: float, grid:
     stored += [(k, layer.steps[name]) for name, _, k in arrays_of(layer.tensors, layer.kind)]
     if not all(all_finite(k, step) for k, step in stored):
         raise Malformed(f"{where}: a dequantised value is not finite")
-
-
-class MaskCodes:
-    """The mask codes of the slices so far."""
-
-    def __init__(self) -> None:
-        self._raised = np.zeros(0, np.int32)  # of the rows before the latest layer
-        self._cells, self._own = list[np.ndarray](), list[np.ndarray]()
-
-    @property
-    def codes(self) -> np.ndarray:
-        """int32 [rows so far], in the order of clause 12.2."""
-        if len(self._own) > 1:
-            cells = np.concatenate(self._cells)
-            order = morton_order(cells)
-            self._cells, self._own = [cells[order]], [np.concatenate(self._own)[order]]
-        return np.concatenate([self._raised, *self._own])
-
-    def take(self, part: LayerSymbols, first: bool) -> None:
-        """Add those of a slice. first: of its layer."""
-        if first:
-            self._raised, self._cells, self._own = self.codes + part.mask_increase, [], []
-        self._cells.append(part.anchor_q)
-        self._own.append(part.mask_own)
 
 
 class TakenVoxels:

@@ -1,4 +1,4 @@
-"""What packing does to a scene: the error of its pictures, the gain of its layers, the rate that training saw."""
+"""What packing does to a scene: the error of its pictures, the gain of its layers."""
 
 from __future__ import annotations
 
@@ -9,16 +9,11 @@ import numpy as np
 import torch
 
 from pd4dgs_codec.data.view import View
-from pd4dgs_codec.entropy.bits import entropy_bits
-from pd4dgs_codec.format.deformation import decorrelate
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.plan import LeftOut, plan, tensor_bytes
-from pd4dgs_codec.format.quantise import classes_of
 from pd4dgs_codec.format.registry import LAYER_KINDS
-from pd4dgs_codec.format.symbols import layer_symbols, rounded
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.picture import render_image
-from pd4dgs_codec.model.rate import channel_moments, gaussian_bits, rate_bits
 from pd4dgs_codec.model.sensitivity import omission_error
 from pd4dgs_codec.quality.frames import Frame
 from pd4dgs_codec.quality.image import level_psnr
@@ -128,31 +123,5 @@ def leave_out_low_gain(
 
 
 def _measure(scene: Scene, views: Sequence[View], options: EncodeOptions, step: Callable[[], None]) -> dict[int, float]:
-    planned, _ = plan(scene, replace(options, layers="auto", omit="nothing"))
-    return true_psnr(rounded(planned), views, step)
-
-
-def train_rate_bits(scene: Scene, options: EncodeOptions = DEFAULTS) -> list[dict[str, float]]:
-    """Per layer of the file that `scene` becomes: bits of R(a) as the trainer computes them, in float64.
-
-    attributes: R of the unrounded values over the layer's anchors, by step class, priors their moments, and the entropy
-    of the classes. planes, weights: R of the rounded residuals and weights, as in the last third of training.
-    """
-    planned, _ = plan(scene, options)
-    rows = (0, *planned.rows)
-    result = []
-    for i, layer in enumerate(planned.layers):
-        own = slice(rows[i], rows[i + 1])
-        classes = np.zeros(rows[-1], np.int32) if planned.grading is None else classes_of(planned)
-        attributes = 0.0 if planned.grading is None else entropy_bits(classes[own])
-        for c in np.unique(classes[own]).tolist():
-            for name, rows_of in planned.attributes.items():
-                values = torch.from_numpy(rows_of[own][classes[own] == c]).double().flatten(1)
-                step = planned.steps.attributes[name] * 2.0**c
-                attributes += float(rate_bits(values, *channel_moments(values), step).sum())
-        symbols = layer_symbols(planned, i)
-        coded = decorrelate(symbols.tensors, symbols.kind)
-        row = {"layer": float(layer), "attributes": attributes}
-        row |= {"planes": gaussian_bits(coded.plane_channels), "weights": gaussian_bits(coded.weights)}
-        result.append(row)
-    return result
+    planned = plan(scene, replace(options, layers="auto", omit="nothing"))
+    return true_psnr(planned.symbols.scene(), views, step)

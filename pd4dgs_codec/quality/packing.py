@@ -13,7 +13,6 @@ from pd4dgs_codec.format.encoder import Report, encode_with_report, with_metadat
 from pd4dgs_codec.format.metadata import Metadata
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.plan import LeftOut, plan
-from pd4dgs_codec.format.symbols import rounded
 from pd4dgs_codec.quality import ENCODE_MIN_DB_PER_MEGABYTE
 from pd4dgs_codec.quality.frames import Frame, dataset_frames, own_frames
 from pd4dgs_codec.scene import Scene
@@ -153,12 +152,13 @@ class _Pictures:
         from pd4dgs_codec.quality.measure import RenderedLoss, true_psnr
         from pd4dgs_codec.quality.target import fit
 
-        scene, left_out = plan(scene, options)
+        planned = plan(scene, options)
+        scene, left_out = planned.scene, planned.left_out
         frames = self.frames(scene)
         with self.progress("fitting sizes") as step:
             loss = RenderedLoss(scene, frames, step)
             fitted, dropped, fits = fit(scene, target_sizes, loss.mean_mse, loss.omission_error, options)
-            packed = rounded(plan(fitted, replace(options, omit="nothing"))[0])
+            packed = plan(fitted, replace(options, omit="nothing")).symbols.scene()
             errors = loss.mse(packed)
             before, after = (true_psnr(s, self.held_out, step) if self.held_out else {} for s in (scene, packed))
         levels = []

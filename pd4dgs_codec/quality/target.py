@@ -24,9 +24,8 @@ from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.payload import write_layer
-from pd4dgs_codec.format.plan import LeftOut, plan
+from pd4dgs_codec.format.plan import LeftOut, Plan, plan
 from pd4dgs_codec.format.registry import LAYER_KINDS
-from pd4dgs_codec.format.symbols import layer_symbols, rounded
 from pd4dgs_codec.scene import Scene
 
 #: Values tried: log2 of the factor on a step, and the share of a layer's anchors that leave it.
@@ -266,10 +265,9 @@ class _Layer:
         if key not in self._sizes:
             planned = self._planned(setting)
             self._sizes[key] = 0
-            if self.layer in planned.layers:
-                symbols = layer_symbols(planned, planned.layers.index(self.layer))
+            for symbols in (layer for layer in planned.symbols.layers if layer.kind.layer == self.layer):
                 payload, _ = write_layer(symbols, replace(self.options, effort=effort))
-                self._sizes[key] = self.header + len(write_chunk(symbols.kind.chunk_type, 0, bytes(8), payload))
+                self._sizes[key] = self.header + len(write_chunk(symbols.kind.layer, 0, bytes(8), payload))
         return self._sizes[key]
 
     def final_size(self, setting: Setting) -> int:
@@ -280,18 +278,18 @@ class _Layer:
         """The given loss of the decoded scene."""
         key = frozenset(setting.items())
         if key not in self._losses:
-            self._losses[key] = self.of_scene(rounded(self._planned(setting)))
+            self._losses[key] = self.of_scene(self._planned(setting).symbols.scene())
         return self._losses[key]
 
-    def _planned(self, setting: Setting) -> Scene:
-        return plan(self.apply(setting), self.options)[0]
+    def _planned(self, setting: Setting) -> Plan:
+        return plan(self.apply(setting), self.options)
 
     def _moved(self, setting: Setting) -> int:
         return round(setting.get(ANCHORS, 0.0) * len(self.order))
 
     def describe(self, setting: Setting, target: int) -> Fit:
         """The report of the setting that was chosen."""
-        moved, steps = self._moved(setting), vars(self._planned(setting).steps)
+        moved, steps = self._moved(setting), vars(self._planned(setting).scene.steps)
         factors = {k: 2.0**v for k, v in setting.items() if k != ANCHORS}
         return Fit(
             layer=self.layer,

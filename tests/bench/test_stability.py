@@ -12,8 +12,8 @@ from pd4dgs_codec.bench import stability, stable_scenes
 from pd4dgs_codec.cli import bench
 from pd4dgs_codec.entropy import channels
 from pd4dgs_codec.errors import DataError, EncodeError
-from pd4dgs_codec.format import deformation, quantise
-from pd4dgs_codec.model import networks, rate, reference
+from pd4dgs_codec.format import quantise
+from pd4dgs_codec.model import hexplane, networks, rate, reference
 
 KEYS = {"case", "group", "fed", "promised", "got", "error", "bound", "status"}
 GROUPS = ("rate", "fitting", "quantiser", "masks", "hexplane", "deformation", "rasteriser", "training")
@@ -64,7 +64,7 @@ def floor(x, step, name=""):
     return np.zeros(x.shape, np.int32)
 
 
-bits, decode, sample, mask = rate.rate_bits, channels.decode_channels, deformation.sample_planes, networks.level_mask
+bits, decode, sample, mask = rate.rate_bits, channels.decode_channels, hexplane.sample_reference, networks.level_mask
 draw = stable_scenes.rasterization
 #: What is broken: (module, name, broken, rows to run, rows that must fail, a row that must not).
 FAULTS = {
@@ -85,7 +85,7 @@ FAULTS = {
         {"step 1", "halves", "negative zero", "step 0", "value nan"}, "",
     ),
     "time that is not clamped": (
-        deformation, "sample_planes", lambda p, b, x, t: sample(p, b, x, t) * (1 + max(t - 1, 0)), "hexplane",
+        hexplane, "sample_reference", lambda *x: sample(*x) * (1 + max(x[-1] - 1, 0)), "hexplane",
         {"time after the range"}, "time before the range",
     ),
     "masks that fall with the level": (

@@ -65,13 +65,12 @@ def test_a_layer_that_explains_the_pictures_is_kept(scene):
     from pd4dgs_codec.data.view import View
     from pd4dgs_codec.format.options import EncodeOptions
     from pd4dgs_codec.format.plan import plan
-    from pd4dgs_codec.format.symbols import rounded
     from pd4dgs_codec.model.convert import from_scene
     from pd4dgs_codec.model.picture import render_image
     from pd4dgs_codec.quality.image import to_uint8
     from pd4dgs_codec.quality.measure import leave_out_low_gain
 
-    camera, model = scene.info.camera, from_scene(rounded(plan(scene)[0]))
+    camera, model = scene.info.camera, from_scene(plan(scene).symbols.scene())
     views = []
     for time in (0.2, 0.9):
         picture = render_image(model, 1, time, camera)
@@ -87,7 +86,7 @@ def test_the_estimated_omission_error_is_close_to_the_measured_one(scene, monkey
     from pd4dgs_codec.quality.measure import RenderedLoss
 
     monkeypatch.setattr(sensitivity, "PROBES", 64)  # the anchors differ less here than in a trained scene
-    planned = plan(scene)[0]
+    planned = plan(scene).scene
     loss = RenderedLoss(planned, own_frames(planned.info, 2, 20.0))
     harm = loss.omission_error(planned, 0)
     anchors = range(planned.rows[0])

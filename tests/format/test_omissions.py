@@ -1,4 +1,4 @@
-"""What changes no picture is left out, all of it, and no picture changes."""
+"""Plane cells that no anchor reads are left out, and no picture changes."""
 
 from dataclasses import replace
 
@@ -7,18 +7,18 @@ import pytest
 from strategies import assert_same_scene, make_scene
 
 from pd4dgs_codec.format.decoder import decode
-from pd4dgs_codec.format.encoder import encode, encode_with_report
+from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.options import EncodeOptions
-from pd4dgs_codec.format.plan import make_plan, plan
+from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.format.planes import PREDICTORS, cells_read, fill_plane, residual
-from pd4dgs_codec.format.symbols import rounded
+from pd4dgs_codec.format.symbols import SceneSymbols
 from pd4dgs_codec.scene import DEFAULT_WIDTHS, PLANES, Camera, Deformation, Scene, Widths
 
 SIDES = (6, 5, 7, 5)
 
 
 def lively_scene(widths: Widths = DEFAULT_WIDTHS) -> Scene:
-    """A scene in which every value matters, but for the cells that nothing reaches."""
+    """A scene with plane cells that nothing reaches."""
     options = dict(hidden=(12,), channels=8, sides=SIDES, scales=2, width=8, extent=30, widths=widths)
     scene = make_scene(5, anchors=60, kind="gaussian", **options)
     scaling_log = scene.scaling_log.copy()
@@ -31,74 +31,11 @@ def lively_scene(widths: Widths = DEFAULT_WIDTHS) -> Scene:
     return replace(scene, mask=masks, scaling_log=scaling_log, global_deformation=Deformation(near_one, heads))
 
 
-def edited(network, layer, **places):
-    """`network` with 0 in rows (of the weight; the bias becomes `bias` there) and columns of one of its layers."""
-    layers = [(w.copy(), b.copy()) for w, b in network]
-    weight, bias = layers[layer]
-    weight[places.get("rows", [])] = 0
-    bias[places.get("rows", [])] = places.get("bias", 0)
-    weight[:, places.get("columns", [])] = 0
-    return tuple(layers)
-
-
-def dead_scene(widths: Widths = DEFAULT_WIDTHS) -> Scene:
-    """lively_scene with dead channels, units and a dead head."""
-    scene = lively_scene(widths)
-    networks = {name: edited(network, 0, columns=[7]) for name, network in scene.networks.items()}  # feature 7: unread
-    networks["opacity"] = edited(networks["opacity"], 0, rows=[3], bias=-1)  # a silent unit
-    networks["opacity"] = edited(networks["opacity"], 1, columns=[5])  # an unread one
-    feature = scene.feature.copy()
-    feature[:, 9] = 0
-    field, local = scene.global_deformation, scene.local_deformation
-    planes = tuple({name: plane.copy() for name, plane in scale.items()} for scale in field.planes)
-    planes[1]["yz"][1] = 0  # channel 1 of scale 1 is a product with 0
-    heads = dict(field.networks)
-    heads["feature"] = edited(heads["feature"], 0, rows=[9])
-    heads["scaling"] = edited(heads["scaling"], 0, rows=list(range(6)))
-    heads["trunk"] = edited(heads["trunk"], 0, rows=[2], columns=[4])  # a silent unit; channel 4 of scale 0 is unread
-    local_heads = {n: net if n == "trunk" else edited(net, 0, columns=[0]) for n, net in local.networks.items()}
-    local_heads["trunk"] = edited(local_heads["trunk"], 0, columns=[4])  # channel 4 is unread here, too
-    local_heads["feature"] = edited(local_heads["feature"], 0, rows=[9])
-    return replace(
-        scene,
-        networks=networks,
-        feature=feature,
-        global_deformation=Deformation(planes, heads),
-        local_deformation=Deformation(local.planes, local_heads),
-    )
-
-
 @pytest.mark.parametrize("widths", [Widths(), Widths(graded=True), Widths(viewing=("color",))])
 def test_the_planned_scene_is_rounded_to_the_planned_symbols(widths):
-    planned = make_plan(dead_scene(widths), EncodeOptions(layers=2))
-    assert len(planned.left_out) > 8
-    assert_same_scene(planned.symbols.scene(), rounded(planned.scene))
-
-
-def test_every_dead_part_is_found_and_costs_less():
-    scene = dead_scene()
-    whole, _ = encode_with_report(scene, layers=2, effort=9, omit="nothing")
-    data, report = encode_with_report(scene, layers=2, effort=9)
-    found = {row["what"]: row["bytes"] for row in report.left_out}
-    expected = [
-        "global_deformation head scaling",
-        "1 feature channels",
-        "global_deformation feature: rows of weights",
-        *(f"scaffold {name}: columns of weights" for name in scene.networks),
-        "global_deformation trunk: columns of weights",
-        "global_deformation: 2 plane channels",
-        "scaffold opacity: 2 units of layer 1",
-        "global_deformation trunk: 1 units of layer 1",
-        "local_deformation trunk: 1 units of layer 1",
-    ]
-    assert set(expected) <= set(found)
-    assert [what.split(":")[0] for what in found if "cells" in what] == ["global_deformation", "local_deformation"]
-    assert sum(found.values()) > 400 and len(whole) - len(data) > 300
-    got = decode(data)
-    assert not got.networks["opacity"][0][0][[3, 5]].any() and not got.networks["opacity"][1][0][:, [3, 5]].any()
-    assert not got.feature[:, 7].any() and not got.global_deformation.planes[0]["xy"][4].any()
-    assert set(got.global_deformation.networks) == {"trunk", "position", "feature", "offset"}
-    assert encode(got, layers=2, effort=9) == data
+    planned = plan(lively_scene(widths), EncodeOptions(layers=2))
+    assert len(planned.left_out) == 2
+    assert_same_scene(planned.symbols.scene(), SceneSymbols.of(planned.scene).scene())
 
 
 def test_no_pixel_changes():
@@ -108,7 +45,7 @@ def test_no_pixel_changes():
     from pd4dgs_codec.model.picture import render_image
 
     whole, less = (
-        from_scene(decode(encode(dead_scene(), layers=2, effort=1, omit=o))) for o in ("nothing", "lossless")
+        from_scene(decode(encode(lively_scene(), layers=2, effort=1, omit=o))) for o in ("nothing", "lossless")
     )
     K = np.array([[40, 0, 24], [0, 40, 18], [0, 0, 1]], np.float32)
     rng = np.random.default_rng(3)
@@ -127,10 +64,10 @@ def test_no_pixel_changes():
 
 
 def test_nothing_that_matters_goes():
-    """Of a scene without dead parts only cells that nothing reaches go, and what is kept stays as given."""
+    """Only cells that nothing reaches go, and what is kept stays as given."""
     scene = lively_scene()
     planned = decode(encode(scene, layers=2, effort=1))
-    _, left_out = plan(scene, EncodeOptions(layers=2))
+    left_out = plan(scene, EncodeOptions(layers=2)).left_out
     assert all("cells" in item.what for item in left_out)
     untouched = decode(encode(scene, layers=2, effort=1, omit="nothing"))
     low, high = untouched.info.box

@@ -124,8 +124,8 @@ def faults_by_every_door(data):
 @pytest.mark.parametrize("first", ["value", "mask code", "voxel"])
 def test_of_two_faults_every_door_names_that_of_the_earlier_layer(first, later):
     """Values that are not finite, sums of masks and voxels taken twice, which a payload alone does not show."""
-    file = read_layers(small_file())
-    header, layers = file.header, file.layers
+    header, symbols = read_layers(small_file())
+    layers = symbols.layers
     payloads = [write_layer(layer, EncodeOptions(effort=1))[0] for layer in layers]
     steps, which = header.grid.steps, 1
     if first == "value":

@@ -98,7 +98,7 @@ def scene():
     masks = np.full((3, n), 255, np.uint8)
     masks[0, rng.permutation(n)[:10]] = 0
     feature = rng.normal(0, 1, made.feature.shape).astype(np.float32)
-    return plan(replace(made, mask=tuple(masks), feature=feature))[0]
+    return plan(replace(made, mask=tuple(masks), feature=feature)).scene
 
 
 @pytest.fixture(autouse=True)
@@ -155,7 +155,7 @@ def test_anchors_of_least_harm_move_to_the_next_layer_and_out_of_the_highest(sce
     assert harm(scene, 0)[moved & own].max() == row.harm < harm(scene, 0)[~moved & own].min()
     assert (fitted.mask[1] > 0).all(), "they are shown from there on"
 
-    alone, _ = plan(scene, EncodeOptions(layers=0))
+    alone = plan(scene, EncodeOptions(layers=0)).scene
     fitted, left_out, (row,) = fit(alone, {0: round(0.8 * whole[0])}, lambda decoded: 0.0, harm, EncodeOptions(**FAST))
     assert row.to_layer is None and row.moved and (fitted.mask[0] == 0).sum() == row.moved
     report = encode_with_report(fitted, **FAST, left_out=left_out)[1]
@@ -170,6 +170,6 @@ def test_a_target_out_of_reach_says_what_could_be_reached(scene):
 
 
 def test_a_layer_that_is_not_there_meets_any_target(scene):
-    alone, _ = plan(scene, EncodeOptions(layers=0))
+    alone = plan(scene, EncodeOptions(layers=0)).scene
     fitted, left_out, (row,) = fit(alone, {2: 1}, coarseness(alone), harm, EncodeOptions(**FAST))
     assert fitted is alone and not left_out and (row.bytes, row.moved, row.factors) == (0, 0, {})

@@ -2,12 +2,12 @@
 
 import pytest
 from runs import read_log
+from trainer_rate import train_rate_bits
 
 from pd4dgs_codec.format.encoder import encode_with_report
 from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.quality.image import level_psnr
-from pd4dgs_codec.quality.measure import train_rate_bits
 from pd4dgs_codec.train import phases
 from pd4dgs_codec.train.config import TrainConfig, at_quality
 from pd4dgs_codec.train.loop import Trainer

@@ -9,6 +9,7 @@ import pytest
 import torch
 from runs import assert_resumes_bit_for_bit, read_log
 from tiny import TINY, disc
+from trainer_rate import train_rate_bits
 
 from pd4dgs_codec.errors import NotFinite
 from pd4dgs_codec.format.decoder import decode
@@ -18,7 +19,6 @@ from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.model.networks import EXACT
 from pd4dgs_codec.model.picture import render, render_image
 from pd4dgs_codec.model.sensitivity import rounding_error
-from pd4dgs_codec.quality.measure import train_rate_bits
 from pd4dgs_codec.scene import ATTRIBUTES, MASK_THRESHOLD, MAX_CLASS
 from pd4dgs_codec.train import learner, losses, phases
 from pd4dgs_codec.train.config import TrainConfig

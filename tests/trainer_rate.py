@@ -1,0 +1,36 @@
+"""The rate of a scene as the trainer computes it, which that of its file must equal."""
+
+import numpy as np
+import torch
+
+from pd4dgs_codec.entropy.bits import entropy_bits
+from pd4dgs_codec.format.deformation import decorrelate
+from pd4dgs_codec.format.plan import plan
+from pd4dgs_codec.format.quantise import classes_of
+from pd4dgs_codec.model.rate import channel_moments, gaussian_bits, rate_bits
+
+
+def train_rate_bits(scene):
+    """Per layer of the file that `scene` becomes: bits of R(a) as the trainer computes them, in float64.
+
+    attributes: R of the unrounded values over the layer's anchors, by step class, priors their moments, and the entropy
+    of the classes. planes, weights: R of the rounded residuals and weights, as in the last third of training.
+    """
+    found = plan(scene)
+    planned = found.scene
+    rows = (0, *planned.rows)
+    result = []
+    for i, symbols in enumerate(found.symbols.layers):
+        own = slice(rows[i], rows[i + 1])
+        classes = np.zeros(rows[-1], np.int32) if planned.grading is None else classes_of(planned)
+        attributes = 0.0 if planned.grading is None else entropy_bits(classes[own])
+        for c in np.unique(classes[own]).tolist():
+            for name, rows_of in planned.attributes.items():
+                values = torch.from_numpy(rows_of[own][classes[own] == c]).double().flatten(1)
+                step = planned.steps.attributes[name] * 2.0**c
+                attributes += float(rate_bits(values, *channel_moments(values), step).sum())
+        coded = decorrelate(symbols.tensors, symbols.kind)
+        row = {"layer": float(symbols.kind.layer), "attributes": attributes}
+        row |= {"planes": gaussian_bits(coded.plane_channels), "weights": gaussian_bits(coded.weights)}
+        result.append(row)
+    return result
