@@ -50,10 +50,6 @@ class Changed(Exception):
     """The file has changed: its earlier bytes are discarded, and the transfer stands at byte 0."""
 
 
-class OutOfTime(Exception):
-    """The time budget is spent; bytes that have arrived stay."""
-
-
 class _Cut(Exception):
     """The connection ended early, or the response is invalid: a new request may help."""
 
@@ -79,30 +75,28 @@ class Transfer:
         self._at = 0  # offset in the file of the next byte of the response; bytes that are here are skipped
         self._response_end: int | None = None  # offset in the file where the response ends, if known
 
-    def read(self, end: int | None = None, *, reach: int | None = None, seconds: float = math.inf) -> bytes:
+    def read(self, end: int | None = None, *, reach: int | None = None) -> bytes:
         """The next bytes to arrive, none beyond `end` (None: the end of the file); empty if all are here.
 
         reach: offset up to which one request may ask, so that later reads need no further request; None: the end.
-        Raises Changed, OutOfTime after `seconds`, or DeliveryError if the file is not available.
+        Raises Changed, or DeliveryError if the file is not available.
         """
-        until, failures = time.monotonic() + seconds, 0
+        failures = 0
         while not self._is_here(end):
             try:
                 if self._response is None:
-                    self._request(reach, until)
+                    self._request(reach)
                     continue  # the response may say that there is nothing to read
-                block = self._receive(end, until)
+                block = self._receive(end)
             except (OSError, http.client.HTTPException, _Cut) as error:
                 self.close()
-                if time.monotonic() >= until:
-                    raise OutOfTime from None
                 self.cuts += 1
                 failures += 1
                 if failures >= self.attempts or isinstance(error, ssl.SSLCertVerificationError):
                     message = f"{self.url}: {_reason(error)} ({len(self.data):,} bytes are here)"
                     raise DeliveryError(message) from None
                 if failures > 1:
-                    time.sleep(max(0.0, min(BACKOFF_SECONDS * 2 ** (failures - 2), until - time.monotonic())))
+                    time.sleep(BACKOFF_SECONDS * 2 ** (failures - 2))
                 continue
             except DeliveryError as error:
                 self.close()
@@ -132,7 +126,7 @@ class Transfer:
         size = len(self.data)
         return (end is not None and size >= end) or (self.total is not None and size >= self.total)
 
-    def _receive(self, end: int | None, until: float) -> bytes:
+    def _receive(self, end: int | None) -> bytes:
         """One block of the response; b"" at its regular end and while bytes are skipped."""
         response, skipped = self._response, len(self.data) - self._at
         assert response is not None and self._socket is not None
@@ -143,11 +137,10 @@ class Transfer:
             limits.append(end - self._at)
         if self._response_end is not None:
             limits.append(self._response_end - self._at)
-        seconds = self._patience(until)
-        self._socket.settimeout(seconds)
+        self._socket.settimeout(self.stall)
         # a chunk's length takes several reads, each with a time limit of its own
         read = partial(response.read1, min(limits))
-        block = _within(seconds, read) if response.chunked else read()
+        block = _within(self.stall, read) if response.chunked else read()
         self._at += len(block)
         if not skipped:
             self.data += block
@@ -160,16 +153,9 @@ class Transfer:
             self._response, self.total = None, self._at  # of unknown length: it ends with the connection
         return b"" if skipped else block
 
-    def _patience(self, until: float) -> float:
-        """Seconds for the next operation."""
-        left = min(self.stall, until - time.monotonic())
-        if left <= 0:
-            raise TimeoutError
-        return left
-
     # -- requests ------------------------------------------------------------------------------------------------------
 
-    def _request(self, reach: int | None, until: float) -> None:
+    def _request(self, reach: int | None) -> None:
         start = len(self.data)
         headers = {"Accept-Encoding": "identity", "User-Agent": "pd4dgs"}
         if start and self._validator is None:  # the rest may belong to another file: fetch all of it again
@@ -180,7 +166,7 @@ class Transfer:
         elif reach is not None:
             headers["Range"] = f"bytes=0-{reach - 1}"
         for _ in range(MAX_REDIRECTS + 1):
-            response = self._send(headers, until)
+            response = self._send(headers)
             if response.status not in REDIRECTS:
                 self._accept(response, start, "Range" in headers)
                 return
@@ -191,14 +177,13 @@ class Transfer:
             self._place = _parsed(target, here)
         raise DeliveryError(f"more than {MAX_REDIRECTS} redirects")
 
-    def _send(self, headers: dict[str, str], until: float) -> http.client.HTTPResponse:
+    def _send(self, headers: dict[str, str]) -> http.client.HTTPResponse:
         """The response with its headers. The time limit covers name resolution, connection, TLS and all headers."""
-        seconds = self._patience(until)
         if self._connection is None:
             secure = self._place.scheme == "https"
             kind = http.client.HTTPSConnection if secure else http.client.HTTPConnection
             port = self._place.port or kind.default_port  # without one it is looked for in an IPv6 address
-            self._connection = kind(str(self._place.hostname), port, timeout=seconds)
+            self._connection = kind(str(self._place.hostname), port, timeout=self.stall)
         connection, target = self._connection, _target(self._place)
         self.requests += 1
 
@@ -212,11 +197,11 @@ class Transfer:
                 connection.close()
                 raise TimeoutError  # the caller has given up
             self._socket = connection.sock
-            self._socket.settimeout(seconds)
+            self._socket.settimeout(self.stall)
             connection.request("GET", target, headers=headers)
             return connection.getresponse()
 
-        return _within(seconds, exchange)
+        return _within(self.stall, exchange)
 
     def _accept(self, response: http.client.HTTPResponse, start: int, asked_range: bool) -> None:
         """Checks a response for bytes from `start` on. Raises Changed if it is about another file than before."""

@@ -10,11 +10,8 @@ import ssl
 import struct
 import subprocess
 import threading
-import time
-from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from types import SimpleNamespace
 from urllib.parse import urlsplit
 
 import pytest
@@ -36,8 +33,7 @@ from pd4dgs_codec.format import canonical
 from pd4dgs_codec.format.container import read_preamble, write_preamble
 from pd4dgs_codec.format.header import scene_id_of
 from pd4dgs_codec.scene import Scene
-from pd4dgs_codec.web import client as client_module
-from pd4dgs_codec.web.client import Budget, SceneClient, next_end, recent_rate
+from pd4dgs_codec.web.client import SceneClient
 from pd4dgs_codec.web.server import Link, Server
 from pd4dgs_codec.web.transfer import MAX_CHANGES, Transfer, fetch, slice_ends
 
@@ -230,9 +226,9 @@ def test_layers_appear_before_the_file_is_whole_and_each_end_is_a_cut(scene_byte
 
 def test_upgrades_fetch_the_missing_layers_only(scene_bytes, levels):
     with FaultyServer(scene_bytes) as server, SceneClient(server.url) as client:
-        check(list(client.scenes(Budget(max_layer=0))), levels[:1])
-        check(list(client.scenes(Budget(max_layer=0))), [])
-        check(list(client.scenes(Budget(max_layer=2))), levels[1:])
+        check(list(client.scenes(max_layer=0)), levels[:1])
+        check(list(client.scenes(max_layer=0)), [])
+        check(list(client.scenes(max_layer=2)), levels[1:])
     ends = [end for _, end in slice_ends(scene_bytes)]
     assert [r.get("range") for r in server.requests] == [None, f"bytes={ends[0]}-{ends[2] - 1}"]
     assert server.requests[0]["accept-encoding"] == "identity"
@@ -296,7 +292,7 @@ def test_https_with_certificates_checked(folder, tmp_path, monkeypatch, levels):
         assert client.transfer.cuts == 1  # nothing that asking again would change
         monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
         with SceneClient(url) as client:
-            check(list(client.scenes(Budget(max_layer=0))) + list(client.scenes()), levels)
+            check(list(client.scenes(max_layer=0)) + list(client.scenes()), levels)
 
 
 @pytest.mark.parametrize("url", ["ftp://host/x", "http://", "http:///x", "http://user@host/x", "http://h:99999/x", "x"])
@@ -305,55 +301,11 @@ def test_urls_that_cannot_be_fetched(url):
         SceneClient(url)
 
 
-def test_stop_when_the_seconds_are_over_and_go_on_later(scene_bytes, levels, monkeypatch):
-    """Nearly all of a minute is over once the first layer is shown; the rest of it goes by in silence."""
-    over = 0.0
-    monkeypatch.setattr(client_module, "time", SimpleNamespace(monotonic=lambda: time.monotonic() + over))
-    ends = [end for _, end in slice_ends(scene_bytes)]
-    with FaultyServer(scene_bytes, [Fault(ends[0] + 20, "stall")]) as server, SceneClient(server.url) as client:
-        shown = []
-        for scene in client.scenes(Budget(seconds=60)):
-            shown.append(scene)
-            over = 59.8
-        check(shown, levels[:1])
-        have = len(client.transfer.data)
-        assert ends[0] <= have <= ends[0] + 20 and client.transfer.cuts == 0
-        check(list(client.scenes()), levels[1:])
-    assert server.requests[1]["range"] == f"bytes={have}-{ends[2] - 1}"
-
-
-LAYERS = [(0, 1000), (1, 1500), (2, 3000)]
-
-
-@pytest.mark.parametrize(
-    ("have", "budget", "left", "rate", "expected"),
-    [
-        (0, Budget(), math.inf, None, 1000),
-        (0, Budget(), 1e-3, 1.0, 1000),  # without the first layer there is no picture
-        (0, Budget(seconds=1), 0.0, None, None),
-        (1000, Budget(), math.inf, 1.0, 1500),
-        (1000, Budget(max_layer=0), math.inf, 1e9, None),
-        (1500, Budget(max_layer=1), math.inf, 1e9, None),
-        (1200, Budget(bytes=1500), math.inf, 1e9, 1500),
-        (1500, Budget(bytes=2999), math.inf, 1e9, None),
-        (0, Budget(bytes=999), math.inf, None, None),
-        (1000, Budget(seconds=9), 1.0, 500.0, 1500),
-        (1000, Budget(seconds=9), 1.0, 499.0, None),
-        (1400, Budget(seconds=9), 1.0, 100.0, 1500),  # what is here already counts
-        (3000, Budget(), math.inf, 1e9, None),
-    ],
-)
-def test_which_layer_next(have, budget, left, rate, expected):
-    assert next_end(LAYERS, have, budget, left, rate) == expected
-
-
-def test_the_rate_is_that_of_the_last_second():
-    arrivals = deque([(10.0, 0)])
-    assert recent_rate(arrivals) is None
-    arrivals += [(10.1 + i / 10, 100 * (i + 1)) for i in range(10)]
-    assert recent_rate(arrivals) == pytest.approx(1000)
-    arrivals += [(11.1 + i / 10, 1010 + 10 * i) for i in range(20)]
-    assert recent_rate(arrivals) == pytest.approx(100)
+@pytest.mark.parametrize(("limits", "expected"), [({"max_bytes": 999_999}, 3), ({"max_bytes": 600}, 0)])
+def test_no_slice_ends_beyond_the_bytes_that_are_asked_for(scene_bytes, levels, limits, expected):
+    with FaultyServer(scene_bytes) as server, SceneClient(server.url) as client:
+        check(list(client.scenes(**limits)), levels[:expected])
+        check(list(client.scenes(max_bytes=slice_ends(scene_bytes)[1][1])), levels[expected:2])
 
 
 @pytest.mark.parametrize("cuts", [20, pytest.param(1000, marks=pytest.mark.slow)])
