@@ -17,8 +17,6 @@ from pd4dgs_codec.errors import DataError
 ROTATION_TOLERANCE = UNIT_TOLERANCE = 1e-3
 #: OpenGL's camera looks along -z with y up; OpenCV's along +z with y down.
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
-#: Samples of a fisheye's polynomial, to find the angle where it turns back.
-FISHEYE_STEPS = 1000
 
 
 @dataclass(frozen=True)
@@ -107,63 +105,38 @@ def world_to_camera(rotation: np.ndarray, center: np.ndarray) -> np.ndarray:
     return viewmat
 
 
-def distort(x: np.ndarray, y: np.ndarray, lens: Lens) -> tuple[np.ndarray, ...]:
-    """OpenCV's radial-tangential model on normalised coordinates: (xd, yd) and its symmetric Jacobian (xx, xy, yy)."""
-    (k1, k2, k3), (p1, p2) = lens.radial, lens.tangential
-    r = x * x + y * y
-    d = 1 + r * (k1 + r * (k2 + r * k3))
-    slope = 2 * (k1 + r * (2 * k2 + 3 * k3 * r))  # d changes by slope * x per unit of x
-    xd = d * x + 2 * p1 * x * y + p2 * (r + 2 * x * x)
-    yd = d * y + 2 * p2 * x * y + p1 * (r + 2 * y * y)
-    xx = d + slope * x * x + 2 * p1 * y + 6 * p2 * x
-    yy = d + slope * y * y + 2 * p2 * x + 6 * p1 * y
-    cross = slope * x * y + 2 * p1 * x + 2 * p2 * y
-    return xd, yd, xx, cross, yy
-
-
-def distort_fisheye(x: np.ndarray, y: np.ndarray, k: tuple[float, float, float, float]) -> tuple[np.ndarray, ...]:
-    """OpenCV's fisheye model on normalised pinhole coordinates: (xd, yd), and bool where the model is one to one."""
+def distort(x: np.ndarray, y: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """OpenCV's models on normalised pinhole coordinates: (xd, yd), and bool where they are one to one."""
     r = np.hypot(x, y)
-    angle = np.arctan(r)
-
-    def bent(a: np.ndarray) -> np.ndarray:
-        a2 = a * a
-        return np.asarray(a * (1 + a2 * (k[0] + a2 * (k[1] + a2 * (k[2] + a2 * k[3])))))
-
-    grid = np.linspace(0, np.pi / 2, FISHEYE_STEPS)
-    falls = np.flatnonzero(np.diff(bent(grid)) <= 0)
-    last = grid[falls[0]] if falls.size else np.pi / 2
-    scale = np.where(r > 0, bent(angle) / np.where(r > 0, r, 1), 1)
-    return x * scale, y * scale, angle < last
+    if lens.fisheye is not None:
+        angle = np.arctan(r)
+        scale = np.where(r > 0, angle * _growth(angle, lens.fisheye) / np.where(r > 0, r, 1), 1)
+        return x * scale, y * scale, angle < _turning_point(lens.fisheye)
+    d, (p1, p2) = _growth(r, lens.radial), lens.tangential
+    xd = d * x + 2 * p1 * x * y + p2 * (r * r + 2 * x * x)
+    yd = d * y + 2 * p2 * x * y + p1 * (r * r + 2 * y * y)
+    return xd, yd, r < _turning_point(lens.radial)
 
 
-def undistort(xd: np.ndarray, yd: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
-    """Inverse of `distort` by 12 steps of Newton's method on all points at once, from the distorted points."""
-    x, y = np.array(xd, np.float64), np.array(yd, np.float64)
-    for _ in range(12):
-        fx, fy, xx, xy, yy = distort(x, y, lens)
-        fx, fy, det = fx - xd, fy - yd, xx * yy - xy * xy
-        det = np.where(np.abs(det) < 1e-9, np.inf, det)
-        x, y = x - (yy * fx - xy * fy) / det, y - (xx * fy - xy * fx) / det
-    return x, y
+def _growth(r: np.ndarray, k: Sequence[float]) -> np.ndarray:
+    """1 + k1 r^2 + k2 r^4 + ..."""
+    return np.asarray(np.polyval([*k[::-1], 1.0], r * r))
+
+
+def _turning_point(k: Sequence[float]) -> float:
+    """The least r > 0 at which r times `_growth` stops to grow; beyond, the lens would show the image twice."""
+    roots = np.roots([(2 * i + 1) * c for i, c in enumerate((1.0, *k))][::-1])  # of the derivative, by r^2
+    real = roots.real[(roots.imag == 0) & (roots.real > 0)]
+    return float(np.sqrt(real.min(initial=np.inf)))
 
 
 @lru_cache(maxsize=8)
 def _warp(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Coordinates in the stored image of each ideal pinhole pixel (u, v float64 [H, W]), and bool: it is inside.
-
-    Far off the axis the polynomial folds back and would show the image twice, so a pixel is valid only if the inverse
-    leads back to it.
-    """
+    """Coordinates in the stored image of each ideal pinhole pixel (u, v float64 [H, W]), and bool: it is inside."""
     u, v = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     x, y = (u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy
     with np.errstate(all="ignore"):
-        if lens.fisheye is not None:
-            xd, yd, single = distort_fisheye(x, y, lens.fisheye)
-        else:
-            xd, yd, xx, xy, yy = distort(x, y, lens)
-            xi, yi = undistort(xd, yd, lens)
-            single = (np.hypot(xi - x, yi - y) * lens.fx < 0.01) & (xx * yy - xy * xy > 0)
+        xd, yd, single = distort(x, y, lens)
     u, v = lens.fx * xd + lens.skew * yd + lens.cx, lens.fy * yd + lens.cy
     inside = (u >= 0.5) & (v >= 0.5) & (u <= lens.width - 0.5) & (v <= lens.height - 0.5)
     return u, v, single & inside

@@ -2,35 +2,10 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
-from pd4dgs_codec.data.cameras import Lens, UnreadView, distort, rectify, undistort
+from pd4dgs_codec.data.cameras import Lens, UnreadView, distort, rectify
 from pd4dgs_codec.data.posed import cameras_box, normalised_times, points_box, seconds_range
 from pd4dgs_codec.errors import DataError
-
-small = st.floats(-0.02, 0.02)  # in this range the polynomial does not fold within the tested square
-
-
-@settings(max_examples=50, deadline=None)
-@given(small, small, small, st.floats(-0.01, 0.01), st.floats(-0.01, 0.01))
-def test_undistort_inverts_distort(k1, k2, k3, p1, p2):
-    lens = Lens(100, 100, 100, 100, 50, 50, 0.0, (k1, k2, k3), (p1, p2))
-    x, y = np.meshgrid(np.linspace(-0.7, 0.7, 9), np.linspace(-0.7, 0.7, 9))
-    xi, yi = undistort(*distort(x, y, lens)[:2], lens)
-    np.testing.assert_allclose(xi, x, atol=1e-9)
-    np.testing.assert_allclose(yi, y, atol=1e-9)
-
-
-def test_jacobian_is_the_derivative():
-    lens = Lens(100, 100, 100, 100, 50, 50, 0.0, (0.1, -0.05, 0.02), (0.01, -0.02))
-    x, y, h = np.array([0.3, -0.5]), np.array([0.2, 0.4]), 1e-6
-    _, _, xx, xy, yy = distort(x, y, lens)
-    dx = (np.array(distort(x + h, y, lens)[:2]) - distort(x - h, y, lens)[:2]) / (2 * h)
-    dy = (np.array(distort(x, y + h, lens)[:2]) - distort(x, y - h, lens)[:2]) / (2 * h)
-    np.testing.assert_allclose([xx, xy], dx, atol=1e-8)
-    np.testing.assert_allclose([xy, yy], dy, atol=1e-8)
-
 
 def test_matches_opencv_formula():
     """One point, by hand: k1 = .1, p1 = .01, p2 = .02 at (1, 2), r² = 5."""
@@ -45,6 +20,13 @@ def test_folded_pixels_are_masked():
     _, seen = rectify(np.full((64, 96, 3), 200, np.uint8), lens)
     x, y = np.meshgrid((np.arange(96) + 0.5 - 48) / 40, (np.arange(64) + 0.5 - 32) / 40)
     np.testing.assert_array_equal(seen, np.hypot(x, y) < np.sqrt(2 / 3))
+
+
+def test_a_folded_fisheye_is_masked():
+    """With k1 = -.2 the angle stops to grow at sqrt(1 / .6)."""
+    lens = Lens(96, 64, 12.0, 12.0, 48.0, 32.0, fisheye=(-0.2, 0.0, 0.0, 0.0))
+    x, y = np.meshgrid((np.arange(96) + 0.5 - 48) / 12, (np.arange(64) + 0.5 - 32) / 12)
+    np.testing.assert_array_equal(distort(x, y, lens)[2], np.arctan(np.hypot(x, y)) < np.sqrt(1 / 0.6))
 
 
 def test_skew_moves_along_x():
