@@ -143,7 +143,7 @@ def read_library(path: Path) -> None:
 
 def read_manifest(path: Path) -> None:
     """A manifest of a batch."""
-    from pd4dgs_codec.batch.manifest import OPS, Manifest
+    from pd4dgs_codec.batch.job import OPS, Manifest
 
     Manifest(str(path), OPS["encode"], lambda options: None)
 

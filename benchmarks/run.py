@@ -28,7 +28,7 @@ import refining_gif
 from common import QUICK, ROOT, SCENES, Benchmark, Row, Run, commit, present, say
 from page import write
 
-from pd4dgs_codec.bench.timing import machine, machine_line
+from pd4dgs_codec.bench.report import machine, machine_line
 from pd4dgs_codec.errors import DataError, Pd4Error
 
 ALL = (

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.bench.report import Panel, markdown, optional
-from pd4dgs_codec.bench.timing import clock, spread, summary
+from pd4dgs_codec.bench.report import Panel, clock, markdown, optional, spread, summary
 from pd4dgs_codec.errors import DataError, RenderError
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode

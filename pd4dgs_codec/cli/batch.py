@@ -12,7 +12,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.batch.manifest import OPS, arguments
+from pd4dgs_codec.batch.job import OPS, arguments
 from pd4dgs_codec.cli import options
 from pd4dgs_codec.cli.common import FAILED, OK, STDIO, Console, UsageError, check_output, run, say, write_bytes
 from pd4dgs_codec.cli.progress import progress_bar
@@ -20,8 +20,7 @@ from pd4dgs_codec.errors import DataError, printable
 from pd4dgs_codec.threads import available
 
 if TYPE_CHECKING:
-    from pd4dgs_codec.batch.job import Job, Outcome
-    from pd4dgs_codec.batch.manifest import Manifest
+    from pd4dgs_codec.batch.job import Job, Manifest, Outcome
 
 VERBS = tuple(OPS)
 ENGINES = ("local", "ray", "slurm")
@@ -117,7 +116,7 @@ def _scan(args: argparse.Namespace, console: Console) -> int:
     if args.json and args.output == STDIO:
         raise UsageError("the manifest and --json both write to stdout; name a file with -o")
     check_output(args.output, args.overwrite)
-    from pd4dgs_codec.batch.manifest import scan
+    from pd4dgs_codec.batch.job import scan
 
     lines = [json.dumps(line) + "\n" for line in scan(args.input, args.op)]
     write_bytes(args.output, "".join(lines).encode(), args.overwrite)
@@ -130,8 +129,7 @@ def _batch(args: argparse.Namespace, console: Console) -> int:
     workers = args.workers if args.workers is not None else {"local": cores, "ray": 0, "slurm": 0}[args.on]
     threads = args.cpus or (max(1, cores // max(1, workers)) if args.on == "local" else 1)
     from pd4dgs_codec.batch import store
-    from pd4dgs_codec.batch.job import Job
-    from pd4dgs_codec.batch.manifest import Manifest
+    from pd4dgs_codec.batch.job import Job, Manifest
     from pd4dgs_codec.batch.run import Settings
     from pd4dgs_codec.batch.run import run as run_jobs
 

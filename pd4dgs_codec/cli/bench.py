@@ -92,9 +92,9 @@ def _codec_options(p: options.Parser) -> None:
 
 def _codec(args: argparse.Namespace, console: Console) -> Outcome:
     data = read_bytes(args.input)
-    from pd4dgs_codec.bench import runtime, timing
+    from pd4dgs_codec.bench import report, runtime
 
-    machine = timing.machine()
+    machine = report.machine()
     scales, modes, efforts, repeats = (SWEEP | (QUICK if args.quick else {}) | _given(args, *SWEEP)).values()
     if is_pd4(data):
         if args.plot is not None:
@@ -107,7 +107,7 @@ def _codec(args: argparse.Namespace, console: Console) -> Outcome:
         with progress_bar(len(settings), "files", "codec") as step:
             points = runtime.codec_points(args.input, scene, frames, settings, repeats, step)
         panels = runtime.codec_panels(points)
-    text = f"{runtime.codec_table(points)}\n\n{timing.machine_line(machine)}"
+    text = f"{runtime.codec_table(points)}\n\n{report.machine_line(machine)}"
     return Outcome({"input": args.input, "machine": machine, "points": points}, text, panels, "RMSE of images")
 
 
@@ -134,13 +134,13 @@ def _render_options(p: options.Parser) -> None:
 
 
 def _render(args: argparse.Namespace, console: Console) -> Outcome:
-    from pd4dgs_codec.bench import runtime, timing
+    from pd4dgs_codec.bench import report, runtime
     from pd4dgs_codec.quality.levels import load_levels
 
     names = args.only or tuple(runtime.BACKENDS)
     if unknown := [name for name in names if name not in runtime.BACKENDS]:
         raise UsageError(f"--only: found {unknown[0]!r}, expected some of {', '.join(runtime.BACKENDS)}")
-    machine = timing.machine()
+    machine = report.machine()
     level = load_levels(common.named_input(args.input), last_only=True)[-1]
     frames = _frames(args, level.model.info)
     views = [runtime.view(level, frame) for frame in frames]
@@ -151,7 +151,7 @@ def _render(args: argparse.Namespace, console: Console) -> Outcome:
         for f, v in zip(frames, views, strict=True)
     ]
     shown = "; ".join(f"{v['width']}x{v['height']}, {v['gaussians']:,} Gaussians" for v in sizes)
-    text = f"{runtime.render_table(points)}\n\nImages: {shown}.\n\n{timing.machine_line(machine)}"
+    text = f"{runtime.render_table(points)}\n\nImages: {shown}.\n\n{report.machine_line(machine)}"
     result = {"input": args.input, "machine": machine, "level": level.level, "pictures": sizes, "points": points}
     return Outcome(result, text, runtime.render_panels(points), "RMSE from the float64 reference")
 
@@ -189,11 +189,11 @@ def _train(args: argparse.Namespace, console: Console) -> Outcome:
         raise UsageError("found no SOURCE, expected a dataset to train on or --from FILE")
     if args.seconds and args.iterations:
         raise UsageError("found --seconds and --iterations, expected one of them")
-    from pd4dgs_codec.bench import runtime, timing
+    from pd4dgs_codec.bench import report, runtime
 
-    machine = None if args.runs else timing.machine()  # the machine of existing runs is unknown
+    machine = None if args.runs else report.machine()  # the machine of existing runs is unknown
     runs = [runtime.recorded_run(path) for path in args.runs] if args.runs else _trained(args, console)
-    text = "\n\n".join([runtime.train_table(runs), *([timing.machine_line(machine)] if machine else [])])
+    text = "\n\n".join([runtime.train_table(runs), *([report.machine_line(machine)] if machine else [])])
     result = {"source": args.source, "machine": machine, "runs": runs}
     return Outcome(result, text, runtime.train_panels(runs), "held-out RMSE of the highest level")
 
@@ -242,9 +242,9 @@ def _latency_options(p: options.Parser) -> None:
 
 def _latency(args: argparse.Namespace, console: Console) -> Outcome:
     contents = [_with_camera(name) for name in args.inputs]
-    from pd4dgs_codec.bench import latency, timing
+    from pd4dgs_codec.bench import latency, report
 
-    machine, speeds, files, parts = timing.machine(), args.rates.values(), [], []
+    machine, speeds, files, parts = report.machine(), args.rates.values(), [], []
     with progress_bar(3 * args.runs * len(speeds) * len(contents), "runs", "latency") as step:
         for name, data in zip(args.inputs, contents, strict=True):
             rows = [row for rate in speeds for row in latency.times(data, rate, args.runs, step)]
@@ -254,7 +254,7 @@ def _latency(args: argparse.Namespace, console: Console) -> Outcome:
             parts += [f"## {name}", latency.table(rows), cold]
     parts.append(f"Seconds since the request (cold: since the start of the process), medians of {args.runs}.")
     result = {"runs": args.runs, "rates": args.rates, "machine": machine, "files": files}
-    return Outcome(result, "\n\n".join([*parts, timing.machine_line(machine)]))
+    return Outcome(result, "\n\n".join([*parts, report.machine_line(machine)]))
 
 
 def _with_camera(name: str) -> bytes:

@@ -31,9 +31,8 @@ from pd4dgs_codec.data.files import read_file, split_options
 from pd4dgs_codec.data.posed import depth_range, held_out, points_box
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError, one_line
-from pd4dgs_codec.interchange.deformed import read_deformed
 from pd4dgs_codec.interchange.formats import SH_SPAN, checked, library, read_gsplat, read_splats
-from pd4dgs_codec.interchange.runs import read_cameras
+from pd4dgs_codec.interchange.runs import read_cameras, read_deformed
 from pd4dgs_codec.interchange.splats import SH_C0, Splats, looking, picture, sphere, spread
 from pd4dgs_codec.quality.frames import shrunk
 from pd4dgs_codec.scene import Camera

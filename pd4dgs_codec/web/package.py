@@ -19,9 +19,9 @@ from pd4dgs_codec.errors import DeliveryError, printable
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.scene import Scene
-from pd4dgs_codec.web import PAGE, mp4
+from pd4dgs_codec.web import PAGE
 from pd4dgs_codec.web.headers import cache_control
-from pd4dgs_codec.web.manifests import MAX_SECONDS, Video, dash, hls, hls_video
+from pd4dgs_codec.web.manifests import MAX_SECONDS, Video, dash, fragment, hls, hls_video, initialisation, ticks
 from pd4dgs_codec.web.page import page
 
 SCENE, SEGMENTS, MPD, PLAYLIST, INDEX = "scene.pd4", "scene.mp4", "scene.mpd", "scene.m3u8", "index.json"
@@ -91,11 +91,11 @@ def _segments(data: bytes, about: dict[str, Any], seconds: float) -> tuple[bytes
     Byte ranges are [first, one past the last]; sha256: of the `.pd4` bytes.
     """
     rows = [(row["layer"], i, part["end"]) for row in about["layers"] for i, part in enumerate(row["slices"])]
-    content = mp4.initialisation(len(rows), mp4.ticks(seconds))
+    content = initialisation(len(rows), ticks(seconds))
     init, start, slices = len(content), 0, list[dict[str, Any]]()
     for number, (layer, place, end) in enumerate(rows, 1):
         part = data[start : len(data) if number == len(rows) else end]
-        piece = mp4.fragment(number, number, part, mp4.ticks(seconds))
+        piece = fragment(number, number, part, ticks(seconds))
         row = {"layer": layer, "slice": place, "range": [start, start + len(part)]}
         row["sha256"] = hashlib.sha256(part).hexdigest()
         row["depends_on"] = sorted({before for before, *_ in rows[: number - 1]})

@@ -9,8 +9,7 @@ from typing import Any
 import pytest
 from standin import upper
 
-from pd4dgs_codec.batch.job import Job, Outcome
-from pd4dgs_codec.batch.manifest import OPS, Manifest
+from pd4dgs_codec.batch.job import OPS, Job, Manifest, Outcome
 from pd4dgs_codec.batch.run import Settings, Summary, run
 
 

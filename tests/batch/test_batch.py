@@ -9,7 +9,7 @@ import pytest
 
 from pd4dgs_codec import __version__
 from pd4dgs_codec.batch import store
-from pd4dgs_codec.batch.manifest import arguments, scan
+from pd4dgs_codec.batch.job import arguments, scan
 from pd4dgs_codec.errors import DataError
 
 

@@ -14,7 +14,7 @@ from PIL import Image
 from tiny import TINY, write_views
 
 from pd4dgs_codec import encode
-from pd4dgs_codec.bench import latency, report, runtime, timing
+from pd4dgs_codec.bench import latency, report, runtime
 from pd4dgs_codec.cli import bench
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.format.info import info
@@ -39,18 +39,18 @@ def test_pareto_front_by_hand():
 
 
 def test_times_are_medians_with_quartiles_of_repetitions_within_the_budget():
-    five = timing.summary([4.0, 1.0, 2.0, 3.0, 5.0])
-    assert five == {"median": 3.0, "low": 2.0, "high": 4.0, "repeats": 5} and timing.spread(five) == "3 (2..4)"
-    assert timing.spread(timing.summary([2.0])) == "2"
+    five = report.summary([4.0, 1.0, 2.0, 3.0, 5.0])
+    assert five == {"median": 3.0, "low": 2.0, "high": 4.0, "repeats": 5} and report.spread(five) == "3 (2..4)"
+    assert report.spread(report.summary([2.0])) == "2"
     calls = []
-    assert len(timing.clock(lambda: calls.append(1), 4, budget=math.inf)[1]) == len(calls) == 4
-    assert len(timing.clock(lambda: None, 4, budget=0.0)[1]) == 1
+    assert len(report.clock(lambda: calls.append(1), 4, budget=math.inf)[1]) == len(calls) == 4
+    assert len(report.clock(lambda: None, 4, budget=0.0)[1]) == 1
 
 
 def test_the_machine_is_described_without_names_or_paths():
-    about = timing.machine()
+    about = report.machine()
     assert about["cpus"] >= 1 and about["versions"]["numpy"] == np.__version__
-    text = timing.machine_line(about)
+    text = report.machine_line(about)
     assert "Python" in text and "/" not in text.replace("n/a", "") and platform.node() not in text
 
 

@@ -7,6 +7,7 @@ from pd4dgs_codec.data.cameras import Lens, UnreadView, distort, rectify
 from pd4dgs_codec.data.posed import cameras_box, normalised_times, points_box, seconds_range
 from pd4dgs_codec.errors import DataError
 
+
 def test_matches_opencv_formula():
     """One point, by hand: k1 = .1, p1 = .01, p2 = .02 at (1, 2), r² = 5."""
     lens = Lens(10, 10, 1, 1, 0, 0, 0.0, (0.1, 0.0, 0.0), (0.01, 0.02))

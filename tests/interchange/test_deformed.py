@@ -15,7 +15,7 @@ from torch import nn
 
 from pd4dgs_codec.data.cameras import rotation_matrix
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.interchange import deformed
+from pd4dgs_codec.interchange import runs
 from pd4dgs_codec.interchange.teacher import load_source, read_model
 
 DEFORMATION, PLY = "point_cloud/iteration_7/deformation.pth", "point_cloud/iteration_7/point_cloud.ply"
@@ -57,7 +57,7 @@ def _same(place: Path, model: FourD | Deformable) -> None:
     ids=lambda options: ",".join(options) or "usual",
 )
 def test_4dgaussians_follows_the_published_formulas(tmp_path, options, monkeypatch):
-    monkeypatch.setattr(deformed, "ROWS", 16)  # of 40
+    monkeypatch.setattr(runs, "ROWS", 16)  # of 40
     torch.manual_seed(1)
     model = FourD(splats := make_splats(), **options)
     _same(model.save(tmp_path / "run", splats), model)

@@ -18,7 +18,7 @@ from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import DeliveryError, Malformed, Truncated
 from pd4dgs_codec.format import decoder
 from pd4dgs_codec.format.container import write_chunk
-from pd4dgs_codec.web import mp4
+from pd4dgs_codec.web import manifests
 from pd4dgs_codec.web.manifests import Video
 from pd4dgs_codec.web.package import MPD, PLAYLIST, package
 
@@ -28,11 +28,13 @@ NAMESPACE = {"d": "urn:mpeg:dash:schema:mpd:2011"}
 
 def fake_video(fps: float = 20.0, samples: tuple[int, ...] = (40, 40, 7)) -> Video:
     """Boxes as an encoder would write them around payloads that no decoder will see."""
-    content = mp4.box(b"ftyp", b"iso6\0\0\0\0") + mp4.box(b"moov", mp4.box(b"avcC", bytes.fromhex("0164001fff")))
+    content = manifests.box(b"ftyp", b"iso6\0\0\0\0") + manifests.box(
+        b"moov", manifests.box(b"avcC", bytes.fromhex("0164001fff"))
+    )
     for i, count in enumerate(samples):
         run = struct.pack(">II", 0x200, count) + struct.pack(">I", 100) * count
-        moof = mp4.box(b"moof", mp4.box(b"traf", mp4.box(b"trun", run)))
-        content += moof + mp4.box(b"mdat", bytes([i]) * 100 * count)
+        moof = manifests.box(b"moof", manifests.box(b"traf", manifests.box(b"trun", run)))
+        content += moof + manifests.box(b"mdat", bytes([i]) * 100 * count)
     return Video(content, 64, 48, fps)
 
 
@@ -53,13 +55,13 @@ def _range(text: str) -> slice:
 def test_the_segments_give_the_file_back_layer_by_layer(packaged, scene_bytes):
     """A reader that knows boxes and nothing of how these were written."""
     segments, payload, tracks = packaged["scene.mp4"], b"", []
-    init, moov = list(mp4.boxes(segments))[:2]
+    init, moov = list(manifests.boxes(segments))[:2]
     assert (init.kind, moov.kind) == (b"ftyp", b"moov")
-    handlers = mp4.find(segments, b"hdlr", [moov])
+    handlers = manifests.find(segments, b"hdlr", [moov])
     assert [segments[handler.content + 8 : handler.content + 12] for handler in handlers] == [b"meta"] * 3
-    for moof in (b for b in mp4.boxes(segments) if b.kind == b"moof"):
-        (head,) = mp4.find(segments, b"tfhd", [moof])
-        (run,) = mp4.find(segments, b"trun", [moof])
+    for moof in (b for b in manifests.boxes(segments) if b.kind == b"moof"):
+        (head,) = manifests.find(segments, b"tfhd", [moof])
+        (run,) = manifests.find(segments, b"trun", [moof])
         flags, count, offset, _, size = struct.unpack_from(">IIiII", segments, run.content)
         assert flags == 0x301 and count == 1
         tracks.append(struct.unpack_from(">I", segments, head.content + 4)[0])
@@ -82,9 +84,9 @@ def test_each_layer_is_fetched_by_its_ranges(packaged, scene_bytes):
         (init,) = representation.findall(".//d:Initialization", NAMESPACE)
         (segment,) = representation.findall(".//d:SegmentURL", NAMESPACE)
         piece = file[_range(init.attrib["range"])] + file[_range(segment.attrib["mediaRange"])]
-        assert [b.kind for b in mp4.boxes(piece)] == [b"ftyp", b"moov", b"moof", b"mdat"]
+        assert [b.kind for b in manifests.boxes(piece)] == [b"ftyp", b"moov", b"moof", b"mdat"]
         assert slice(*row["dash"]["range"]) == _range(segment.attrib["mediaRange"])
-        *_, mdat = mp4.boxes(piece)
+        *_, mdat = manifests.boxes(piece)
         part = scene_bytes[slice(*row["range"])]
         assert piece[mdat.content : mdat.end] == part and hashlib.sha256(part).hexdigest() == row["sha256"]
         got += part
@@ -110,7 +112,7 @@ def test_the_manifest_is_valid(layers, video):
 def test_the_video_is_listed_fragment_by_fragment(scene_bytes):
     video = fake_video()
     files = package(scene_bytes, lambda scene: video)
-    init, pieces = mp4.fragments(video.data)
+    init, pieces = manifests.fragments(video.data)
     assert [piece.samples for piece in pieces] == [40, 40, 7]
     playlist = files["fallback.m3u8"].decode().splitlines()
     assert f'#EXT-X-MAP:URI="fallback.mp4",BYTERANGE="{init}@0"' in playlist and playlist[-1] == "#EXT-X-ENDLIST"
@@ -170,16 +172,17 @@ def test_another_reader_of_boxes_finds_the_layers(scene_bytes):
 
 
 @pytest.mark.parametrize(
-    "data", [b"\0\0\0\x09ftyp", b"abc", b"\0\0\0\x07ftyp", b"\0\0\0\x01mdat\0\0\0\0\0\0\0\x09", mp4.box(b"ftyp", b"x")]
+    "data",
+    [b"\0\0\0\x09ftyp", b"abc", b"\0\0\0\x07ftyp", b"\0\0\0\x01mdat\0\0\0\0\0\0\0\x09", manifests.box(b"ftyp", b"x")],
 )
 def test_broken_mp4_files_are_refused(data):
     with pytest.raises(DeliveryError):
-        mp4.fragments(data)
+        manifests.fragments(data)
 
 
 def test_large_boxes_are_read():
     data = struct.pack(">I4sQ", 1, b"mdat", 20) + b"1234"
-    assert list(mp4.boxes(data)) == [mp4.Box(b"mdat", 0, 16, 20)]
+    assert list(manifests.boxes(data)) == [manifests.Box(b"mdat", 0, 16, 20)]
 
 
 # -- the command -------------------------------------------------------------------------------------------------------
@@ -239,7 +242,7 @@ def test_a_rendered_video_is_packaged(cli, folder, tmp_path, monkeypatch):
     done = cli("package", folder / "small.pd4", "-o", tmp_path / "out", "--fps", 10, "--json")
     assert done.code == 0 and done.json["video"] is True, done.err
     assert read == [0, 1, 2]  # each layer is decoded once, for the check and for the video
-    init, pieces = mp4.fragments((tmp_path / "out" / "fallback.mp4").read_bytes())
+    init, pieces = manifests.fragments((tmp_path / "out" / "fallback.mp4").read_bytes())
     low, high = scene.info.time_range
     assert sum(piece.samples for piece in pieces) == round((high - low) * 10) and len(pieces) == 2
     index = json.loads((tmp_path / "out" / "index.json").read_text())
