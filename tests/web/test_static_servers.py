@@ -15,7 +15,7 @@ import pytest
 from strategies import assert_same_scene
 
 from pd4dgs_codec import decode
-from pd4dgs_codec.web.client import Budget, SceneClient
+from pd4dgs_codec.web.client import SceneClient
 
 PAGE = Path(__file__).parents[2] / "docs/player-and-delivery.md"
 PROGRAMS = {name: shutil.which(name) or shutil.which(name, path="/usr/sbin") for name in ("nginx", "caddy")}
@@ -104,12 +104,12 @@ def test_a_page_of_another_site_may_fetch_and_resume(port, folder, scene_bytes):
 
 def test_the_client_streams_upgrades_and_sees_a_change(port, folder, scene_bytes, other_bytes):
     with SceneClient(f"http://127.0.0.1:{port}/scene.pd4") as client:
-        (base,) = client.scenes(Budget(max_layer=0))
+        (base,) = client.scenes(max_layer=0)
         assert_same_scene(base, decode(scene_bytes, max_layer=0))
         assert_same_scene(list(client.scenes())[-1], decode(scene_bytes))
         assert client.transfer.changes == 0
     with SceneClient(f"http://127.0.0.1:{port}/scene.pd4") as client:
-        list(client.scenes(Budget(max_layer=0)))
+        list(client.scenes(max_layer=0))
         (folder / "new").write_bytes(other_bytes)
         (folder / "new").replace(folder / "scene.pd4")
         assert [scene.layers for scene in client.scenes()] == [(0,), (0, 1), (0, 1, 2)]
