@@ -21,16 +21,19 @@ def text(value: str) -> bytes:
     return b"X" + len(value).to_bytes(4, "little") + value.encode()
 
 
-def number(value: int) -> bytes:
-    return b"\x8a\x08" + value.to_bytes(8, "little")
+def numbers(*values: int) -> bytes:
+    """A tuple of one or two."""
+    packed = b"".join(b"\x8a\x08" + value.to_bytes(8, "little", signed=True) for value in values)
+    return packed + (b"\x85", b"\x86")[len(values) - 1]
 
 
-def tensor(size: int, stride: int, count: int = 4) -> bytes:
-    """The pickle of a 1-D tensor in a storage of `count` float32."""
-    stored = b"(" + text("storage") + b"ctorch\nFloatStorage\n" + text("0") + text("cpu") + number(count) + b"tQ"
+def tensor(size: int | tuple, stride: int | tuple, count: int = 4, offset: int = 0) -> bytes:
+    """The pickle of a tensor in a storage of `count` float32. size, stride: two numbers are those of two axes."""
+    stored = b"(" + text("storage") + b"ctorch\nFloatStorage\n" + text("0") + text("cpu") + numbers(count)[:-1] + b"tQ"
     hooks = b"ccollections\nOrderedDict\n)R"
-    shape = number(size) + b"\x85" + number(stride) + b"\x85"
-    return b"ctorch._utils\n_rebuild_tensor_v2\n(" + stored + b"K\x00" + shape + b"\x89" + hooks + b"tR"
+    size, stride = (v if isinstance(v, tuple) else (v,) for v in (size, stride))
+    shape = b"K" + bytes([offset]) + numbers(*size) + numbers(*stride)
+    return b"ctorch._utils\n_rebuild_tensor_v2\n(" + stored + shape + b"\x89" + hooks + b"tR"
 
 
 def archive(data: bytes, method: int = zipfile.ZIP_STORED, storage: bytes = bytes(16)) -> bytes:
@@ -60,6 +63,13 @@ def doubled(depth: int = 60) -> bytes:
 REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
     "a tensor of 2^30 numbers and one": (lambda: archive(tensor(1 << 30, 0)), "beyond its storage"),
     "a tensor of 2^45 numbers": (lambda: archive(tensor(1 << 45, 0)), "beyond its storage"),
+    **{
+        f"a tensor {name}": (lambda of=of: archive(tensor(*of)), "beyond its storage")
+        for name, of in {
+            "of one number more": (5, 1), "that begins late": (4, 1, 4, 1), "of wide steps": (2, 4),
+            "of fewer than none": (-1, 1), "of more axes than steps": ((2, 2), 1),
+        }.items()
+    },
     "many tensors of one storage": (
         lambda: archive(b"](" + tensor(1 << 12, 1, 1 << 12) * 200 + b"e", storage=bytes(1 << 14)), "more bytes than"
     ),
@@ -80,6 +90,7 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
     "a class of code": (lambda: b"cbuiltins\neval\n)\x81", "the pickle asks for builtins.eval"),
     "an end in the middle": (lambda: b"t", "not a zip archive of tensors"),
     "nothing": (lambda: b"", "not a zip archive of tensors"),
+    "an archive of another kind": (lambda: archive(b"}").replace(b"a/data.pkl", b"a/read.txt"), "0 members NAME/data"),
     "an endless number": (lambda: b"\x8b" + (1 << 16).to_bytes(4, "little") + b"\x7f" * (1 << 16), "operation LONG4"),
 }  # fmt: skip
 
@@ -117,3 +128,16 @@ def test_tensors_are_views_of_the_file():
     found = read_tensors(archive(tensor(2, 2), storage=np.arange(4, dtype="<f4").tobytes()), "m.pt")
     np.testing.assert_array_equal(found, [0.0, 2.0])
     assert not found.flags.writeable
+
+
+def test_tensors_equal_those_written_by_torch(tmp_path):
+    torch = pytest.importorskip("torch")
+    base = torch.arange(24.0).reshape(4, 6)
+    tensors = {"whole": base, "turned": base.T, "part": base[1:3, 2:4], "long": torch.tensor([3, 4]), "none": base[:0]}
+    tensors |= {"double": base.double(), "half": base.half(), "scalar": base[2, 3], "own": torch.nn.Parameter(base)}
+    torch.save({"a": tensors, "b": [1, "x", None]}, tmp_path / "t.pth")
+    found = read_tensors((tmp_path / "t.pth").read_bytes(), "t.pth")
+    assert found["b"] == [1, "x", None]
+    for name, tensor in tensors.items():
+        np.testing.assert_array_equal(found["a"][name], tensor.detach().numpy(), err_msg=name)
+        assert found["a"][name].dtype == tensor.detach().numpy().dtype

@@ -200,18 +200,6 @@ def test_options_of_older_runs(tmp_path):
     _same(run, model)
 
 
-def test_code_in_a_network_is_not_run(tmp_path, capfd):
-    class Evil:
-        def __reduce__(self):
-            return print, ("this must not run",)
-
-    run = FourD(make_splats()).save(tmp_path / "run", make_splats())
-    torch.save({"deformation_net.grid.aabb": Evil()}, run / DEFORMATION)
-    with pytest.raises(DataError, match="refused: the pickle asks for"):
-        read_model(str(run), 30)
-    assert capfd.readouterr().out == ""
-
-
 @pytest.mark.parametrize("kind", [FourD, Deformable])
 def test_import_says_how_to_learn_from_them(tmp_path, cli, kind):
     run = kind(make_splats()).save(tmp_path / "run", make_splats())

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import json
-import pickle
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +11,6 @@ import torch
 from tiny import camera_ahead
 from torch import nn
 
-from pd4dgs_codec import archives
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
@@ -223,92 +219,3 @@ def test_broken_folders(tmp_path, cli):
         place / "cov_mlp.pt"
     )
     assert "layers are Linear, GELU, Linear; expected Linear, ReLU, Linear" in _fails(tmp_path, cli)
-
-
-# -- tensors -----------------------------------------------------------------------------------------------------------
-
-
-def read_tensors(path: Path) -> object:
-    return archives.read_tensors(path.read_bytes(), str(path))
-
-
-class _Evil:
-    def __reduce__(self):
-        return print, ("this must not run",)
-
-
-def test_pickled_code_is_refused_and_not_run(tmp_path, capfdbinary):
-    path = tmp_path / "evil.pth"
-    torch.save({"opacity_mlp": _Evil()}, path)
-    with pytest.raises(DataError, match=r"refused: the pickle asks for \w*builtin\w*.print; expected tensors alone"):
-        read_tensors(path)
-    torch.save(nn.Linear(2, 2), path)
-    with pytest.raises(DataError, match="the pickle asks for torch.nn.modules.linear.Linear"):
-        read_tensors(path)
-    assert capfdbinary.readouterr().out == b""
-
-
-def test_tensors_equal_those_written_by_torch(tmp_path):
-    base = torch.arange(24.0).reshape(4, 6)
-    tensors = {"whole": base, "turned": base.T, "part": base[1:3, 2:4], "long": torch.tensor([3, 4]), "none": base[:0]}
-    tensors |= {"double": base.double(), "half": base.half(), "parameter": nn.Parameter(base), "scalar": base[2, 3]}
-    torch.save({"a": tensors, "b": [1, "x", None]}, tmp_path / "t.pth")
-    found = read_tensors(tmp_path / "t.pth")
-    assert found["b"] == [1, "x", None]
-    for name, tensor in tensors.items():
-        np.testing.assert_array_equal(found["a"][name], tensor.detach().numpy(), err_msg=name)
-        assert found["a"][name].dtype == tensor.detach().numpy().dtype
-
-
-def _archive(path: Path, content: object, *, packed: bool = False, storage: bytes = bytes(16)) -> Path:
-    """A zip archive with a pickle in which ("storage", ...) tuples under a `_Stored` are persistent."""
-
-    class Pickler(pickle.Pickler):
-        def persistent_id(self, value):
-            return value.pid if isinstance(value, _Stored) else None
-
-    stream = io.BytesIO()
-    Pickler(stream, 2).dump(content)
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED if packed else zipfile.ZIP_STORED) as archive:
-        archive.writestr("a/data.pkl", stream.getvalue())
-        archive.writestr("a/data/0", storage)
-    return path
-
-
-class _Stored:
-    def __init__(self, *pid):
-        self.pid = pid
-
-
-class _Rebuilt:
-    def __init__(self, *arguments):
-        self.arguments = arguments
-
-    def __reduce__(self):
-        return torch._utils._rebuild_tensor_v2, self.arguments
-
-
-@pytest.mark.parametrize(
-    "size, stride, offset",
-    [((5,), (1,), 0), ((4,), (1,), 1), ((2,), (4,), 0), ((10**12,), (0,), 0), ((-1,), (1,), 0), ((2, 2), (1,), 0)],
-)
-def test_tensors_beyond_their_storage_are_refused(tmp_path, size, stride, offset):
-    stored = _Stored("storage", torch.FloatStorage, "0", "cpu", 4)
-    good = _archive(tmp_path / "good.pth", _Rebuilt(stored, 0, (2, 2), (2, 1), False, {}))
-    assert read_tensors(good).shape == (2, 2)
-    bad = _archive(tmp_path / "bad.pth", _Rebuilt(stored, offset, size, stride, False, {}))
-    with pytest.raises(DataError, match="beyond its storage"):
-        read_tensors(bad)
-
-
-def test_archives_that_grow_when_read_are_refused(tmp_path):
-    with pytest.raises(DataError, match="is compressed"):
-        read_tensors(_archive(tmp_path / "bomb.pth", {}, packed=True, storage=bytes(1 << 20)))
-    with pytest.raises(DataError, match="0 members NAME/data.pkl"):
-        with zipfile.ZipFile(tmp_path / "other.zip", "w") as archive:
-            archive.writestr("readme", "")
-        read_tensors(tmp_path / "other.zip")
-    loop: dict[str, object] = {}
-    loop["again"] = loop
-    with pytest.raises(DataError, match="a part that has two places"):
-        read_tensors(_archive(tmp_path / "loop.pth", loop))

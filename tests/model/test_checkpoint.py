@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -161,7 +160,6 @@ def test_content_that_is_not_what_was_saved_is_named_damage(path):
 
 
 HOSTILE = {
-    "a tensor of 2^30 numbers of one": lambda c: c["state"].update(feature=torch.zeros(1).expand(1 << 30)),
     "a tensor of 2^45 numbers of one": lambda c: c["state"].update(feature=torch.zeros(1).expand(1 << 45)),
     "a number of 600 digits": lambda c: c.update(training={"iteration": 10**600}),
     "a tensor for a dict": lambda c: c.update(info=torch.zeros(3)),
@@ -177,25 +175,6 @@ def test_what_costs_more_than_it_weighs_is_refused_in_one_line(path, kind):
     HOSTILE[kind](content)
     torch.save(content | {"digest": "0" * 64}, path, _use_new_zipfile_serialization=True)
     assert "\n" not in refusal(path)
-
-
-def test_lists_in_lists_are_refused_in_one_line(path):
-    def text(value: str) -> bytes:
-        return b"X" + len(value).to_bytes(4, "little") + value.encode()
-
-    head = b"\x80\x02}(" + text("format") + text(checkpoint.FORMAT) + text("version") + b"K\x01" + text("training")
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("a/data.pkl", head + b"](" * 3000 + b"e" * 3000 + b"u.")
-    assert "\n" not in refusal(path)
-
-
-def test_a_deflated_checkpoint_is_refused(path):
-    with zipfile.ZipFile(path) as archive:
-        members = {member.filename: archive.read(member) for member in archive.infolist()}
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in members.items():
-            archive.writestr(name, content)
-    refusal(path, "is compressed")
 
 
 def test_missing_files_and_folders(tmp_path):
