@@ -109,7 +109,7 @@ def trained_like_scene() -> Scene:
         scaling_log=rng.normal(-2.5, 0.3, (n, 6)).astype(np.float32),
         offset=rng.normal(0, 0.5, (n, 10, 3)).astype(np.float32),
         mask=tuple(np.full(r, 200, np.uint8) for r in rows),
-        networks={name: _network(rng, 35, 16, width) for name, width in Widths().networks.items()},
+        networks={name: random_network(rng, 35, 16, width) for name, width in Widths().networks.items()},
         global_deformation=_deformation(rng, key=40_000),
         local_deformation=_deformation(rng, below=4),
     )
@@ -124,7 +124,7 @@ def sighted(scene: Scene, *viewing: str) -> Scene:
     return replace(scene, networks=networks)
 
 
-def _network(rng: np.random.Generator, *widths: int, scale: float = 0.3) -> Network:
+def random_network(rng: np.random.Generator, *widths: int, scale: float = 0.3) -> Network:
     pairs = zip(widths, widths[1:], strict=False)
     return tuple(
         (rng.normal(0, scale, (b, a)).astype(np.float32), rng.normal(0, scale, b).astype(np.float32)) for a, b in pairs
@@ -136,8 +136,8 @@ def _deformation(rng: np.random.Generator, key: int | None = None, below: int = 
     planes = tuple(
         {name: rng.normal(1, 0.3, (2, reso[b], reso[a])).astype(np.float32) for name, a, b in PLANES} for _ in range(2)
     )
-    networks = {"trunk": _network(rng, below + 4, 8, 8)}
-    networks |= {name: _network(rng, 8, width, scale=0.05) for name, width in Widths().heads.items()}
+    networks = {"trunk": random_network(rng, below + 4, 8, 8)}
+    networks |= {name: random_network(rng, 8, width, scale=0.05) for name, width in Widths().heads.items()}
     return Deformation(planes, networks, key)
 
 

@@ -1,6 +1,5 @@
 """Vectors in kernels: their operations, the same bits for any width of the CPU's, and what is compiled and cached."""
 
-import gc
 import os
 import platform
 import subprocess
@@ -10,7 +9,6 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
-from numba.core import event
 from numba.core.caching import NullCache
 
 from pd4dgs_codec.draw import simd
@@ -146,24 +144,3 @@ def test_a_kernel_is_not_compiled_anew_for_each_constant():
     thrice_and_five_times = _uncached(lambda value: (twice(value) + value, twice(2) + 1))
     assert thrice_and_five_times(7) == (21, 5)
     assert twice.signatures == [(numba.int64,)]
-
-
-def test_the_garbage_collector_is_as_it_was_after_compiling():
-    seen, states = [], (True, False)
-
-    class Watch(event.Listener):
-        def on_start(self, event):
-            seen.append(gc.isenabled())
-
-        on_end = on_start
-
-    with event.install_listener("numba:run_pass", Watch()):
-        for enabled in states:
-            compiled = _uncached(lambda value: value + 1)
-            (gc.enable if enabled else gc.disable)()
-            try:
-                assert compiled(1) == 2
-                assert gc.isenabled() is enabled
-            finally:
-                gc.enable()
-    assert seen and not any(seen)

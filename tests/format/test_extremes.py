@@ -1,82 +1,18 @@
-"""The ends of what a file may hold: no anchor and very many, steps near the largest binary32, chunks of other files."""
+"""The ends of what a file may hold: very many anchors, steps near the largest and the least binary32."""
 
 from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
 import pytest
-from strategies import assert_same_scene, make_scene
-from vectors import blocks
+from strategies import make_scene
 
-from pd4dgs_codec import decode, encode, open_stream
-from pd4dgs_codec.errors import DecodeError, Malformed
-from pd4dgs_codec.format.decoder import decode_partial
+from pd4dgs_codec import decode, encode
 from pd4dgs_codec.format.encoder import encode_with_report
-from pd4dgs_codec.format.info import hashes, info
 from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import Widths
 
 MANY = 300_000
-
-
-# -- chunks of other files ---------------------------------------------------------------------------------------------
-
-
-def alike(count=3):
-    """Encodes of `count` scenes whose chunks have the same lengths, so that the chunk lists show nothing."""
-    scenes = [blocks.make_layer(attributes=np.full((68, 1), i, np.int32)) for i in range(count)]
-    deformed = blocks.make_layer(1, [[5, 5, i] for i in range(2)], before=1, scales=[blocks.Scale()])
-    return [blocks.make_file(scene, deformed) for scene in scenes]
-
-
-def bytes_of(file):
-    """Its header and its chunks."""
-    data, starts = file.data(), [file.start(i) for i in range(len(file.chunks) + 1)]
-    return [data[: starts[0]], *(data[a:b] for a, b in zip(starts, starts[1:], strict=False))]
-
-
-def test_a_chunk_of_another_scene_is_refused_by_every_door():
-    parts = [bytes_of(file) for file in alike()]
-    assert len({tuple(map(len, own)) for own in parts}) == 1
-    for place in range(3):
-        for i, j in ((0, 1), (1, 0), (1, 2), (2, 0)):
-            mixed = [*parts[i]]
-            mixed[place] = parts[j][place]
-            data = b"".join(mixed)
-            for door in (decode, hashes, decode_partial, lambda d: open_stream().feed(d)):
-                if place == 2 and door not in (decode, hashes):  # layer 0 stands; layer 1 does not join it
-                    continue
-                with pytest.raises(Malformed, match="scene"):
-                    door(data)
-            if place == 2:
-                stream = open_stream()
-                assert [scene.layers for scene in stream.feed(data)] == [(0,)]
-                with pytest.raises(Malformed, match="scene"):
-                    stream.finish()
-
-
-def test_chunks_of_two_encodes_of_one_scene_do_not_mix():
-    """Other steps, so that the headers differ, and lengths too."""
-    scene = make_scene(3, anchors=9)
-    framed = [encode(scene, layers=2, effort=1, step_scale=scale) for scale in (1.0, 0.5)]
-    ends = [[0, *(row["end"] for row in info(data)["layers"])] for data in framed]
-    for i, j in ((0, 1), (1, 0)):
-        data = framed[i][: ends[i][1]] + framed[j][ends[j][1] :]
-        with pytest.raises(DecodeError):
-            decode(data)
-
-
-# -- numbers of anchors ------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("mode", ["ans", "lzma"])
-@pytest.mark.parametrize("layers", [(0,), (0, 1, 2)])
-def test_no_anchor(mode, layers):
-    scene = make_scene(4, anchors=0, layers=layers)
-    data = encode(scene, layers=layers[-1], effort=1, mode=mode)
-    got = decode(data)
-    assert got.rows == (0,) * len(layers) and got.feature.shape == (0, 32) and got.offset.shape == (0, 10, 3)
-    assert_same_scene(open_stream().feed(data)[-1], got)
 
 
 def many(anchors, widths):
@@ -107,9 +43,6 @@ def test_three_hundred_thousand_anchors(slices):
     for name in ("anchor_q", "feature", "scaling_log", "offset"):
         np.testing.assert_array_equal(getattr(got, name), getattr(scene, name)[order])
     np.testing.assert_array_equal(got.mask[0], scene.mask[0][order])
-
-
-# -- steps of 1e30 -----------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("step", [1e30, 3.1e31, 2.0**-126, 1e-37])

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import HUGE, RANGES, assert_same_networks, assert_same_scene, make_scene, scenes
+from strategies import RANGES, assert_same_networks, assert_same_scene, make_scene, scenes
 
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format import encoder
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.morton import morton_codes
-from pd4dgs_codec.scene import HEADS, Widths
+from pd4dgs_codec.scene import Widths
 
 encode, encode_with_report = (partial(f, effort=1) for f in (encoder.encode, encoder.encode_with_report))
 MODES = ("ans", "lzma")
@@ -62,28 +62,6 @@ def test_rows_are_sorted_by_layer_then_morton_order(scene):
             earlier = decoded.mask[index - 1]
             assert (decoded.mask[index][: len(earlier)] >= earlier).all()
         first = last
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_unquantised_values_come_back_within_half_a_step(mode):
-    scene = make_scene(3, kind="gaussian")
-    rng = np.random.default_rng(0)
-    noisy = replace(scene, feature=scene.feature + rng.uniform(-0.49, 0.49, scene.feature.shape).astype(np.float32))
-    got = decode(encode(noisy, mode=mode, step_scale=0.5, layers=2))
-    order = {tuple(c): i for i, c in enumerate(scene.anchor_q.tolist())}
-    index = [order[tuple(c)] for c in got.anchor_q.tolist()]
-    step = scene.steps.feature * 0.5
-    assert got.steps.feature == step and len(index) > 0
-    error = np.abs(got.feature - noisy.feature[index])
-    assert error.max() <= 0.5 * step * (1 + 1e-5) and error.max() > 0.1 * step
-
-
-@pytest.mark.parametrize("mode", ["ans", "lzma"])
-def test_symbols_over_the_whole_range(mode):
-    scene = make_scene(1, layers=(0,), anchors=3, kind="huge", hidden=())
-    got = decode(encode(scene, mode=mode, priors="gauss", omit="nothing"))
-    assert np.abs(got.feature).max() == HUGE * scene.steps.feature
-    assert_same_networks(got.networks, scene.networks)
 
 
 def test_the_header_information_comes_back():
@@ -253,21 +231,3 @@ def test_step_classes_and_centres_come_back(seed, priors, mode):
 def _sent(scene):
     """Its anchors that are active at its highest level."""
     return replace(scene, feature=scene.feature[scene.mask[-1] > 0])
-
-
-@given(st.tuples(*[st.sampled_from(sorted(HEADS))] * 2))
-@settings(max_examples=3)
-def test_single_heads(heads):
-    scene = make_scene(0, heads=tuple({head: Widths().heads[head]} for head in heads))
-    decoded = decode(encode(scene, layers=2))
-    assert_same_scene(decoded, decode(encode(decoded, layers=2)))
-    for layer, head in enumerate(heads, 1):
-        assert set(decoded.deformation(layer).networks) == {"trunk", head}
-
-
-def test_layer_2_may_stand_without_layer_1():
-    scene = make_scene(0, layers=(0, 2))
-    decoded = decode(encode(scene, layers=2, omit="nothing"))
-    assert decoded.layers == (0, 2)
-    assert_same_networks(decoded.local_deformation.networks, scene.local_deformation.networks)
-    assert_same_scene(decoded, decode(encode(decoded, layers=2, omit="nothing")))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import LAYER_SETS, RANGES, make_scene, scenes
+from strategies import LAYER_SETS, make_scene, scenes
 
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import RenderError
@@ -86,18 +86,6 @@ def test_prefixes_of_a_visible_scene_show_something_at_their_level(layers, chann
         moves = shoot(model, layer, 0.7, camera)
         assert np.array_equal(moves, image) == (layer == 0)
         np.testing.assert_array_equal(shoot(model, layer, -1.0, camera), image)
-
-
-@pytest.mark.parametrize("kind", RANGES)
-@pytest.mark.parametrize("anchors", [0, 1])
-def test_the_empty_and_the_one_anchor_file(kind, anchors):
-    data = encode(make_scene(11, kind=kind, anchors=anchors), layers=2, effort=1, verify=False)
-    for layer, prefix in prefixes(data):
-        model, camera = from_scene(prefix), own_camera(prefix)
-        for t in TIMES:
-            image = shoot(model, layer, t, camera)
-            if len(prefix.anchor_q) == 0:
-                np.testing.assert_array_equal(image, np.broadcast_to(np.float32(prefix.info.background), image.shape))
 
 
 @pytest.mark.parametrize("flat", [[0], [0, 1, 2]])

@@ -16,8 +16,6 @@ import pytest
 from strategies import small_file
 from vectors.blocks import later, line, make_file, make_layer, pattern
 
-from pd4dgs_codec import decode, encode
-
 ROOT = Path(__file__).parents[2]
 PLAYER = ROOT / "player"
 NODE = shutil.which("node")
@@ -111,15 +109,6 @@ def test_the_command_refuses_a_damaged_file_a_missing_one_and_other_arguments(tm
     for arguments in ([], ["hashes"], ["dance", path], ["hashes", path, "-n"]):
         done = run_node(PLAYER / "cli.mjs", *arguments)
         assert (done.returncode, done.stdout) == (2, "") and done.stderr.startswith("usage: ")
-
-
-def test_the_speed_tool_copies_anchors_side_by_side(tools):
-    import player_speed
-
-    scene = decode(small_file())
-    grown = player_speed.grown(scene, 3 * scene.rows[-1])
-    assert grown.rows == tuple(3 * n for n in scene.rows)
-    assert decode(encode(grown, omit="nothing", mode="lzma", effort=1)).rows == grown.rows
 
 
 def test_the_speed_tool_compares_the_two(tools, tmp_path, capsys):
