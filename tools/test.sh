@@ -10,7 +10,6 @@ make_environment .venv-test train,eval,test
 .venv-test/bin/mypy & # beside the tests
 types=$!
 workers=$(.venv-test/bin/python -c "import os; print(min(os.cpu_count() + 1, 4))")
-export PYTHONDONTWRITEBYTECODE= # where it is set, each of some hundred processes compiles the package's source anew
 code=0
 .venv-test/bin/python -m pytest -n "$workers" --dist worksteal "$@" || code=$?
 wait $types

@@ -29,13 +29,15 @@ PICTURES = {".png", ".jpg", ".gif"}
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory) -> Path:
+def made(once) -> Path:
     """The folder of a quick run; tests do not write into it."""
-    out = tmp_path_factory.mktemp("benchmarks")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(PRESETS, "tiny", TINY)
-        assert run.main(["--quick", "-o", str(out), "--only", *FAST]) == 0
-    return out
+
+    def make(out: Path) -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setitem(PRESETS, "tiny", TINY)
+            assert run.main(["--quick", "-o", str(out), "--only", *FAST]) == 0
+
+    return once("benchmarks", make)
 
 
 def sections(docs: Path) -> dict[str, dict]:

@@ -208,10 +208,9 @@ def test_import_says_how_to_learn_from_them(tmp_path, cli, kind):
     assert f"pd4dgs-train teacher:{run} learns from it" in result.err
 
 
-@pytest.mark.parametrize("kind", [FourD, Deformable])
-def test_teaching(tmp_path, cli, kind):
+def test_teaching(tmp_path, cli):
     torch.manual_seed(0)
-    model = kind(ball(300))
+    model = FourD(ball(300))
     fit(model, 60)
     source = f"teacher:{model.save(tmp_path / 'run', ball(300))}?views=12&size=40x40"
     made, packed = tmp_path / "model.pt", tmp_path / "scene.pd4"
