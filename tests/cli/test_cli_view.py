@@ -12,11 +12,8 @@ from pathlib import Path
 from typing import IO
 
 import pytest
-from strategies import make_scene
 
-from pd4dgs_codec import decode, encode, show
-from pd4dgs_codec.model.checkpoint import save
-from pd4dgs_codec.model.convert import from_scene
+from pd4dgs_codec import decode, show
 from pd4dgs_codec.web.page import page as whole_page
 
 ROOT = Path(__file__).parents[2]
@@ -24,13 +21,6 @@ ROOT = Path(__file__).parents[2]
 
 #: How a browser asks to go on as a web socket.
 SOCKET = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": "AA=="}
-
-
-@pytest.fixture(scope="module")
-def scene_pd4(tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("view") / "scene.pd4"
-    path.write_bytes(encode(make_scene(0), effort=1))
-    return path
 
 
 def run(*argv: object, stdin: IO[bytes] | None = None) -> subprocess.Popen[str]:
@@ -68,9 +58,8 @@ def test_what_is_no_scene_is_one_line_and_no_page(tmp_path, content, says):
     assert out == "" and says in err and len(err.splitlines()) == 1
 
 
-def test_a_checkpoint_may_come_through_stdin(tmp_path):
-    save(tmp_path / "model.pt", from_scene(make_scene(0)), {})
-    with open(tmp_path / "model.pt", "rb") as stdin:
+def test_a_checkpoint_may_come_through_stdin(model_pt):
+    with open(model_pt, "rb") as stdin:
         process = run("-", stdin=stdin)
         assert process.stdout is not None
         page = process.stdout.readline().strip()
