@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import refdec
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from strategies import norm_table
 
@@ -71,12 +71,6 @@ def test_the_decoder_refuses_counts_that_would_abort(count):
         AnsDecoder(b"\1\0\0\0").take(count, model_of(uniform_table(4)))
 
 
-@pytest.mark.parametrize("data", [b"\1", b"\1\0\0", b"\0\0\0\0", b"\0\0\0\0\1\0\0\0"])
-def test_the_decoder_refuses_impossible_streams(data):
-    with pytest.raises(Malformed):
-        AnsDecoder(data)
-
-
 @pytest.mark.parametrize("table", [[0, 7, 7, 2**24], [1, 7, 2**24], [0, 7, 2**24 - 1], [0, 9, 8, 2**24]])
 def test_the_decoder_refuses_a_bad_table(table):
     with pytest.raises(Malformed):
@@ -93,21 +87,3 @@ def test_models_made_together_decode_as_those_made_alone(cums, data):
     one, other = AnsDecoder(data), AnsDecoder(data)
     for cum, model in zip(cums, together, strict=True):
         np.testing.assert_array_equal(one.take(9, model), other.take(9, model_of(cum)))
-
-
-@settings(max_examples=60)
-@given(st.integers(0, 10**6), st.integers(0, 7), st.booleans())
-def test_damage_shows_in_the_final_state(at, bit, cut):
-    cum = norm_table(20, 2560, 100, 1)
-    symbols = np.random.default_rng(1).integers(0, 20, 200).astype(np.int32)
-    good = ans_encode([symbols], [cum])
-    bad = bytearray(good)
-    if cut:
-        # At least one word stays: without any the state is 0 throughout, the valid stream of 200 first symbols.
-        del bad[4 + 4 * (at % (len(good) // 4 - 1)) :]
-    else:
-        bad[at % len(good)] ^= 1 << bit
-    with pytest.raises(Malformed):
-        decoder = AnsDecoder(bytes(bad))
-        decoder.take(len(symbols), model_of(cum))
-        decoder.finish()

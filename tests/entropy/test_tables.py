@@ -35,16 +35,10 @@ from pd4dgs_codec.entropy.tables import (
     histogram_tables_of_each,
     uniform_table,
 )
-from pd4dgs_codec.errors import Malformed
 
 
 def is_table(cum: np.ndarray, n: int) -> bool:
     return len(cum) == n + 1 and cum[0] == 0 and cum[-1] == TOTAL and bool(np.all(np.diff(cum) >= 1))
-
-
-def test_check_vector():
-    expected = [0, 49993, 672082, 3802177, 10044625, 15004705, 16572122, 2**24]
-    assert norm_table(7, 832, 0, 1).tolist() == expected
 
 
 def test_constants_match_high_precision_and_stay_clear_of_rounding_boundaries():
@@ -155,10 +149,3 @@ def test_histograms_completed_together_are_those_made_alone():
     cums = histogram_tables_of_each(np.concatenate(weights), np.array([len(w) for w in weights]))
     for table, w in zip(np.split(cums, np.cumsum([len(w) + 1 for w in weights])[:-1]), weights, strict=True):
         np.testing.assert_array_equal(table, histogram_table(w))
-
-
-@pytest.mark.parametrize("symbols", [[0, 0, 0], [0, 4, 0]])
-def test_histograms_with_classes_out_of_range_are_malformed(symbols):
-    good = Hist(Window(0, 2), 8, 3, False, 0, 0, None)
-    with pytest.raises(Malformed, match=r"histogram classes 0\.\.\d, expected 0\.\.3, not all 0"):
-        with_class_symbols([good, replace(good, window=Window(0, 3))], [np.array([0, 3]), np.array(symbols)])
