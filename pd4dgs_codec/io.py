@@ -163,7 +163,7 @@ def _flush(temporary: Path) -> None:
 def _move(temporary: Path, target: Path) -> None:
     with contextlib.suppress(FileNotFoundError):  # a new file has the mode of new files
         before = target.stat()
-        with contextlib.suppress(PermissionError):  # only root may give files away
+        with contextlib.suppress(PermissionError, AttributeError):  # only root may give files away, on Windows none
             os.chown(temporary, before.st_uid, before.st_gid)
         os.chmod(temporary, stat.S_IMODE(before.st_mode))
     os.replace(temporary, target)

@@ -34,7 +34,10 @@ def _received(number: int, frame: FrameType | None) -> None:
 
 def _raise_again() -> None:
     """In the main thread, whichever this one is: it may wait for the system."""
-    signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+    if hasattr(signal, "pthread_kill"):
+        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+    else:  # on Windows
+        signal.raise_signal(signal.SIGINT)
 
 
 @contextmanager

@@ -43,6 +43,8 @@ PREFLIGHT = {
     "Access-Control-Allow-Headers": "Range, If-Range, If-None-Match, If-Modified-Since",
     "Access-Control-Max-Age": "86400",
 }
+#: Flags that open neither a link nor a pipe that has just been put there. Windows has none of them.
+FILE_ITSELF = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 #: Time limit for a client to send its next request, and to accept each block of the response.
 IDLE_SECONDS = 60.0
 #: Link time of a block: short against the milliseconds to be measured, long against waking a thread.
@@ -192,8 +194,7 @@ def _opened(root: Path, target: str) -> BinaryIO | None:
         found = root.joinpath(*names).resolve(strict=True)
         if not found.is_relative_to(root):
             return None
-        # neither a link nor a pipe that has just been put there
-        file = open(found, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NOFOLLOW | os.O_NONBLOCK))
+        file = open(found, "rb", opener=lambda name, flags: os.open(name, flags | FILE_ITSELF))
     except (OSError, ValueError, RuntimeError):  # RuntimeError: a cycle of links, before Python 3.13
         return None
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):

@@ -2,6 +2,7 @@
 // do not take, and for other programs' renderers.
 
 import { Remote } from "./remote.js";
+import { WORKERS } from "./workers.js";
 /** @import { Scene } from "../decode/scene.js" */
 /** @import { State } from "./level.js" */
 
@@ -14,7 +15,7 @@ import { Remote } from "./remote.js";
 
 export class CpuEvaluator {
   constructor() {
-    this._remote = new Remote(new URL("./evaluate-worker.js", import.meta.url));
+    this._remote = new Remote(WORKERS.evaluate);
     /** What the worker has. @type {Scene | null} */
     this._scene = null;
   }

@@ -1,6 +1,7 @@
 // What Player and Playback share: the worker that fetches and decodes, and the scene's time.
 
 import { Remote } from "./remote.js";
+import { WORKERS } from "./workers.js";
 /** @import { Scene } from "../decode/scene.js" */
 /** @import { News } from "./loader-worker.js" */
 
@@ -16,7 +17,7 @@ import { Remote } from "./remote.js";
  * @param {string | Blob} [from] what it will be asked to open
  */
 export function startLoader(told, from) {
-  const code = new URL("./loader-worker.js", import.meta.url);
+  const code = WORKERS.loader;
   const { early } = /** @type {{early?: Early}} */ (globalThis);
   const worker = early?.worker;
   if (!worker || early.url !== from) return new Remote(code, told);

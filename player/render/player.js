@@ -9,6 +9,7 @@ import { Clip } from "./loader.js";
 import { Pace } from "./pace.js";
 import { Painter } from "./painter.js";
 import { Remote } from "./remote.js";
+import { WORKERS } from "./workers.js";
 /** @import { Camera, Scene } from "../decode/scene.js" */
 /** @import { Evaluated, Splats } from "./evaluator.js" */
 /** @import { State } from "./level.js" */
@@ -68,7 +69,7 @@ export class Player extends Clip {
     /** @type {number | null} */
     this._level = options.level ?? null;
     this._pace = new Pace();
-    this._sorter = new Remote(new URL("./sort-worker.js", import.meta.url));
+    this._sorter = new Remote(WORKERS.sort);
     /** The highest level that loading went for. */
     this._loadedLevel = Infinity;
     /** @type {Pick<Status, "bytes" | "total" | "loading" | "ends">} */

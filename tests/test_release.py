@@ -1,0 +1,78 @@
+"""What is published: one version, licences, addresses, the npm package, and the Pythons that CI installs on."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from pd4dgs_codec import __version__
+
+ROOT = Path(__file__).resolve().parents[1]
+URL = "https://example.org/someone/pd4dgs-codec"
+
+
+def text(name: str, root: Path = ROOT) -> str:
+    return (root / name).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize(
+    ("file", "pattern"),
+    [
+        ("player/package.json", r'^  "version": "(.*)"'),
+        ("CITATION.cff", r"^version: (.*)$"),
+        ("packaging/conda/recipe.yaml", r"^  version: (.*)$"),
+    ],
+)
+def test_all_that_is_published_has_the_version_of_the_package(file, pattern):
+    assert re.findall(pattern, text(file), flags=re.MULTILINE)[0] == __version__
+
+
+def test_ci_installs_on_each_python_that_the_package_names():
+    named = re.findall(r'"Programming Language :: Python :: (3\.\d+)"', text("pyproject.toml"))
+    matrix = re.search(r"python: \[(.*)\]", text(".github/workflows/ci.yml"))
+    assert matrix is not None and re.findall(r'"([\d.]+)"', matrix[1]) == named
+
+
+@pytest.fixture
+def stamped(tmp_path: Path) -> Path:
+    """What tools/public_url.py changes, in a copy."""
+    for name in ("pyproject.toml", "CITATION.cff", "README.md", "player/README.md", "player/package.json"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        shutil.copy(ROOT / name, tmp_path / name)
+    (tmp_path / "tools").mkdir()
+    shutil.copy(ROOT / "tools" / "public_url.py", tmp_path / "tools")
+    subprocess.run([sys.executable, tmp_path / "tools" / "public_url.py", URL + "/"], check=True)
+    return tmp_path
+
+
+def test_a_release_has_public_addresses_and_no_dead_links(stamped):
+    assert f'[project.urls]\nHomepage = "{URL}"\n' in text("pyproject.toml", stamped)
+    assert json.loads(text("player/package.json", stamped))["repository"]["url"] == f"git+{URL}.git"
+    assert text("CITATION.cff", stamped).endswith(f"repository-code: {URL}\n")
+    for name in ("README.md", "player/README.md"):
+        links = re.findall(r"\]\(([^)]+)\)", text(name, stamped))
+        assert links and all(link.startswith(("https:", "#")) for link in links)
+    assert f"![The scene after 48 kB, then refining to 247 kB while it plays]({URL}/raw/HEAD/docs/img/" in text(
+        "README.md", stamped
+    )
+
+
+def test_the_repository_names_no_address_of_its_own():
+    assert "project.urls" not in text("pyproject.toml") and "repository" not in json.loads(text("player/package.json"))
+
+
+def test_the_npm_package_has_all_that_it_exports(tmp_path):
+    subprocess.run([sys.executable, ROOT / "tools" / "npm_package.py", tmp_path / "package"], check=True)
+    package = tmp_path / "package"
+    about = json.loads(text("package.json", package))
+    wanted = {entry["default"] for entry in about["exports"].values()} | set(about["files"]) | {"LICENSE"}
+    assert all((package / name).exists() for name in wanted if not name.startswith("types/"))
+    workers = text("render/workers.js", package)
+    assert "import.meta" not in workers and workers.count("addEventListener") >= 3
+    assert not list(package.rglob("test*"))
