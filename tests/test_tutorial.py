@@ -23,7 +23,7 @@ def run_shell(line: str, folder: Path) -> str:
         line = line.replace(usual, small)
     path = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
     done = subprocess.run(
-        line, shell=True, cwd=folder, env=os.environ | {"PATH": path}, capture_output=True, text=True, timeout=280
+        line, shell=True, cwd=folder, env=os.environ | {"PATH": path}, capture_output=True, text=True, timeout=900
     )
     assert done.returncode == 0, f"{line}\n{done.stderr}"
     return done.stdout
