@@ -20,7 +20,7 @@ from raster_scenes import (
     with_values,
 )
 
-from pd4dgs_codec.errors import NotFinite, RenderError
+from pd4dgs_codec.errors import RenderError
 from pd4dgs_codec.model import reference
 from pd4dgs_codec.model.picture import check_gsplat, rasterization, rasterize_gsplat
 
@@ -281,14 +281,6 @@ def test_shapes_and_types_that_are_refused(name):
         tensors[NAMES.index(name)] = change(tensors[NAMES.index(name)])
         with pytest.raises(RenderError, match="expected"):
             rasterization(*tensors, camera(8, 8))
-
-
-@pytest.mark.parametrize("value", [NAN, INF, -INF])
-def test_colours_that_are_not_finite_are_refused(value):
-    with pytest.raises(NotFinite, match="colors"):
-        rasterization(*with_values("colors", value), camera(8, 8))
-    with pytest.raises(NotFinite, match="background"):
-        rasterization(*scene(5), camera(8, 8), (0.0, value, 0.0))
 
 
 def test_a_camera_is_checked():

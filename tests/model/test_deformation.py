@@ -115,18 +115,6 @@ def test_rounding_is_straight_through(channels):
         torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-12)
 
 
-@pytest.mark.parametrize("channels", [8, 5])
-def test_non_finite_points_go_to_the_border(channels):
-    plane = plane_of(channels=channels)
-    low, high = torch.tensor(BOX, dtype=torch.float64)
-    bad = torch.tensor([[torch.nan, torch.inf, -torch.inf]], dtype=torch.float64, requires_grad=True)
-    corner = torch.stack([low[0], high[1], low[2]])[None].requires_grad_()
-    features = plane(bad, 0.5)
-    torch.testing.assert_close(features, plane(corner, 0.5))
-    assert torch.autograd.grad(features.sum(), bad)[0].eq(0).all()
-    assert torch.isfinite(plane(corner, float("nan"))).all()
-
-
 def test_no_points():
     plane = plane_of()
     points = torch.zeros(0, 3, dtype=torch.float64, requires_grad=True)
