@@ -286,6 +286,9 @@ export class Pd4Player extends HTMLElement {
   _showControls() {
     const controls = this.hasAttribute("controls");
     this._bar.hidden = this._statusLine.hidden = !controls;
+    const canvas = this._player?.canvas;
+    if (canvas) canvas.tabIndex = controls ? 0 : -1; // without controls keys do nothing
+    canvas?.setAttribute("role", controls ? "application" : "img");
     this._orbit?.close();
     this._orbit = controls && this._player ? new Orbit(this._player, this._player.canvas) : null;
   }
@@ -313,11 +316,12 @@ export class Pd4Player extends HTMLElement {
     if (!player || this._bar.hidden) return;
     const { bytes, total, loading, ends, level, levels, fps, scale, software } = player.status;
     const parts = [];
-    if (level !== null) parts.push(`level ${level}${levels.length ? ` of ${levels[levels.length - 1]}` : ""}`);
+    const drawn = level !== null;
+    if (drawn) parts.push(`level ${level}${levels.length ? ` of ${levels[levels.length - 1]}` : ""}`);
     if (bytes) parts.push(`${size(bytes)}${loading && total ? ` of ${size(total)}` : ""}`);
     if (fps > 1) parts.push(`${fps} fps`);
-    if (scale < 1) parts.push(`${Math.round(100 * scale)} %`);
-    if (software) parts.push("no GPU: the CPU draws, fewer pixels while the picture moves");
+    if (drawn && scale < 1) parts.push(`${Math.round(100 * scale)} %`);
+    if (drawn && software) parts.push("no GPU: the CPU draws, fewer pixels while the picture moves");
     setText(this._statusLine, parts.join(" · "));
 
     const whole = ends.filter(({ layer }, i) => layer !== ends[i + 1]?.layer); // of slices the last one

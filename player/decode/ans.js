@@ -20,26 +20,12 @@ export class AnsDecoder {
     this._words = new Uint32Array(count);
     for (let i = 0; i < count; i++) this._words[i] = view.getUint32(4 * i, true);
     if (count && this._words[0] === 0) throw malformed("an ANS stream that begins with a word of 0");
-    this._at = 0;
-    this._th = 0;
-    this._tl = 0;
-    this._q = 0;
-    if (count) {
-      this._q = this._words[0] & LOW;
-      this._tl = this._words[0] >>> 24;
-      this._at = 1;
-      this._refill();
-    }
-  }
-
-  /** Takes one word if there is one and the state is below 2^32. */
-  _refill() {
-    if (this._th === 0 && this._tl < 256 && this._at < this._words.length) {
-      const word = this._words[this._at++];
-      this._th = (this._tl << 8) | (this._q >>> 16);
-      this._tl = ((this._q << 8) | (word >>> 24)) & LOW;
-      this._q = word & LOW;
-    }
+    const [first = 0, second] = this._words;
+    const both = second !== undefined; // the state is one word, or two if there are
+    this._at = Math.min(count, 2);
+    this._th = both ? first >>> 16 : 0;
+    this._tl = both ? ((first & 0xffff) << 8) | (second >>> 24) : first >>> 24;
+    this._q = (both ? second : first) & LOW;
   }
 
   /**
@@ -87,24 +73,6 @@ export class AnsDecoder {
     this._th = th;
     this._tl = tl;
     this._q = q;
-  }
-
-  /** Adds the next `count` numbers of `bits` uniform bits (7.6) to out[start ..]. @param {number} bits
-   * @param {Int32Array} out @param {number} start @param {number} count */
-  addUniform(bits, out, start, count) {
-    const shift = 24 - bits;
-    const f = 1 << shift;
-    for (let i = start; i < start + count; i++) {
-      const r = this._q & (f - 1);
-      out[i] += this._q >>> shift;
-      const low = (Math.imul(this._tl, f) + r) & LOW;
-      const carry = (this._tl * f + r - low) / 16777216;
-      const middle = (Math.imul(this._th, f) + carry) & LOW;
-      this._th = (this._th * f + carry - middle) / 16777216;
-      this._tl = middle;
-      this._q = low;
-      this._refill();
-    }
   }
 
   /** The stream's end: Malformed unless the state is 0 and no word is left. */

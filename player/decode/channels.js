@@ -4,7 +4,7 @@ import { AnsDecoder } from "./ans.js";
 import { ByteReader, MAX_VARINT } from "./bytes.js";
 import { limitExceeded, malformed, unsupported } from "./errors.js";
 import { FREE_ENTRIES, MAX_CODED, MAX_COUNT, MAX_WINDOW, MORE_ENTRIES } from "./limits.js";
-import { CONSTANT, Table, histogramTable, mixtureTable, normTable } from "./tables.js";
+import { CONSTANT, Table, histogramTable, mixtureTable, normTable, uniformTable } from "./tables.js";
 
 const CONST = 0;
 const GAUSS = 1;
@@ -73,9 +73,10 @@ function takeChannel(stream, prior, exceptions, out, at, count) {
   prior.table ??= new Table(prior.makeTable());
   stream.symbols(prior.table, out, at, coded);
   if (shift) {
-    for (let i = at; i < at + coded; i++) out[i] <<= shift;
-    stream.addUniform(shift, out, at, coded);
+    const low = new Int32Array(coded);
+    stream.symbols(uniformTable(shift), low, 0, coded);
     for (let i = at; i < at + coded; i++) {
+      out[i] = (out[i] << shift) + low[i - at];
       if (out[i] + kmin > MAX_CODED) throw malformed(`a symbol of ${out[i] + kmin}, limit ${MAX_CODED}`);
     }
   }

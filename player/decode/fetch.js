@@ -118,7 +118,9 @@ export class SceneSource {
           if (!(error instanceof Cut || error instanceof TypeError || error instanceof DOMException)) throw error;
           this.cuts++;
           if (++failures >= this._attempts) {
-            throw new FetchError(`${this.url}: ${error.message} (${this.received} bytes are here)`);
+            // browsers do not tell the two apart
+            const why = error instanceof Cut ? error.message : "no connection, or a server that other sites may not read";
+            throw new FetchError(`${this.url}: ${why} (${this.received} bytes are here)`);
           }
           if (failures > 1) await sleep(1000 * Math.min(this._pause * 2 ** (failures - 2), until - now()));
           continue;

@@ -46,7 +46,7 @@ export function asList(value, where, length) {
 }
 
 /** @param {Value | undefined} value @param {string} where @returns {number} an exact binary32 value */
-export function asReal(value, where) {
+function asReal(value, where) {
   if (!(value instanceof Real)) throw malformed(`${where}: ${nameOf(value)}, expected a real`);
   return value.value;
 }

@@ -14,7 +14,7 @@ const LITTLE_ENDIAN = new Uint8Array(Uint16Array.of(1).buffer)[0] === 1;
 
 /** @param {(Int32Array | Float32Array)[]} arrays */
 function digest(arrays) {
-  const bytes = joined(arrays.map(({ buffer, byteOffset, byteLength }) => new Uint8Array(buffer, byteOffset, byteLength)));
+  const bytes = joined(arrays.map((array) => new Uint8Array(array.buffer, array.byteOffset, array.byteLength)));
   if (!LITTLE_ENDIAN) for (let at = 0; at < bytes.length; at += 4) bytes.subarray(at, at + 4).reverse();
   return hex(sha256(bytes));
 }

@@ -112,3 +112,10 @@ export class Table {
 
 /** The table of one symbol. */
 export const CONSTANT = /* @__PURE__ */ new Table(Int32Array.of(0, TOTAL));
+
+/** @type {Table[]} */
+const UNIFORM = [];
+
+/** The table of `bits` uniform bits (7.6). @param {number} bits 1..12 */
+export const uniformTable = (bits) =>
+  (UNIFORM[bits] ??= new Table(Int32Array.from({ length: 2 ** bits + 1 }, (_, i) => i << (24 - bits))));

@@ -23,7 +23,7 @@ export async function bench(source, place, sizes = SIZES) {
   const output = Object.assign(document.createElement("pre"), { id: "bench", textContent: "loading" });
   const canvas = document.createElement("canvas");
   place.append(output, canvas);
-  const player = new Player(canvas, { degrade: false, pixelRatio: 1 });
+  const player = new Player(canvas, { degrade: false, pixelRatio: 1, loop: true });
   const orbit = new Orbit(player, canvas);
   /** @type {{seconds: number, bytes: number} | null} */
   let first = null;
@@ -43,7 +43,9 @@ export async function bench(source, place, sizes = SIZES) {
       await player.settled();
       const moving = await perSecond(() => player.counts.drawn, swing(orbit));
       await player.settled();
-      const playing = level ? await perSecond(() => player.counts.evaluated, play(player)) : 0;
+      player.play();
+      const playing = level ? await perSecond(() => player.counts.evaluated) : 0;
+      player.pause();
       rows.push({ level, width, height, gaussians: player.status.gaussians, moving, playing });
       if (moving < SLOWEST) break;
     }
@@ -59,14 +61,14 @@ export async function bench(source, place, sizes = SIZES) {
 /**
  * Increase of `count` per second while `step` is called with the milliseconds since the start.
  *
- * @param {() => number} count @param {(ms: number) => void} step
+ * @param {() => number} count @param {(ms: number) => void} [step]
  */
 async function perSecond(count, step) {
   const before = count();
   const start = performance.now();
   let last = start;
   for (let now = start; now - start < SPAN_MS || count() === before; now = performance.now()) {
-    step(now - start);
+    step?.(now - start);
     const drawn = count();
     await new Promise((resolve) => requestAnimationFrame(resolve));
     if (count() !== drawn) last = performance.now();
@@ -82,11 +84,4 @@ function swing(orbit) {
     orbit.turn(angle - turned, 0);
     turned = angle;
   };
-}
-
-/** Advances the scene's time. @param {Player} player @returns {(ms: number) => void} */
-function play(player) {
-  const [start, end] = player.timeRange;
-  const length = end - start || 1;
-  return (ms) => player.seek(start + ((ms / 1000) % length));
 }

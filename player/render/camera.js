@@ -53,20 +53,23 @@ export function lookAlong(eye, forward, down, { K, width, height }) {
   return { viewmat: new Float32Array([...rows, 0, 0, 0, 1]), K, width, height };
 }
 
+/** The middle of a scene's box. @param {Info} info @returns {Vector} */
+export const middleOf = ({ box: [low, high] }) => plus(plus([0, 0, 0], low, 0.5), high, 0.5);
+
 /**
  * The camera that shows a scene first: its own, or one that looks at the box's middle from outside.
  *
  * @param {Info} info @returns {Camera}
  */
-export function defaultCamera({ camera, box: [low, high], up }) {
+export function defaultCamera(info) {
+  const { camera, box: [low, high], up } = info;
   if (camera) return camera;
-  const middle = plus(plus([0, 0, 0], low, 0.5), high, 0.5);
   const size = Math.hypot(...plus(high, low, -1)) || 1;
   const worldUp = unit(up, [0, 1, 0]);
   const side = unit(cross(worldUp, [worldUp[1], worldUp[2], worldUp[0]]), [1, 0, 0]);
   const forward = unit(plus(side, worldUp, -0.3));
   const K = new Float32Array([600, 0, 320, 0, 600, 240, 0, 0, 1]);
-  const eye = plus(middle, forward, -1.2 * size);
+  const eye = plus(middleOf(info), forward, -1.2 * size);
   return lookAlong(eye, forward, plus([0, 0, 0], worldUp, -1), { K, width: 640, height: 480 });
 }
 

@@ -1,5 +1,5 @@
-// The evaluator without a GPU, in a worker: for machines that cannot render to float textures, for networks that shaders
-// do not take, and for other programs' renderers.
+// The evaluator without a GPU, in a worker: for machines that cannot render to float textures, for networks that
+// shaders do not take, and for other programs' renderers.
 
 import { Remote } from "./remote.js";
 import { WORKERS } from "./workers.js";

@@ -1,6 +1,7 @@
 // Moving the camera: about a point of the scene, along the picture, towards it.
 
-import { centreOf, cross, downOf, dot, forwardOf, lookAlong, magnification, plus, turn, unit } from "./camera.js";
+import { centreOf, cross, downOf, dot, forwardOf, lookAlong, magnification } from "./camera.js";
+import { middleOf, plus, turn, unit } from "./camera.js";
 /** @import { Vector } from "./camera.js" */
 /** @import { Player } from "./player.js" */
 
@@ -189,11 +190,9 @@ export class Orbit {
       if (Math.abs(px) < width / 4 && Math.abs(py) < height / 4) depths.push(z);
     }
     depths.sort((a, b) => a - b);
-    const [low, high] = info.box;
-    const middle = plus(plus([0, 0, 0], low, 0.5), high, 0.5);
     const depth = depths.length
       ? depths[depths.length >> 1]
-      : Math.max(dot(plus(middle, centreOf(camera), -1), forwardOf(camera)), 2 * info.near);
+      : Math.max(dot(plus(middleOf(info), centreOf(camera), -1), forwardOf(camera)), 2 * info.near);
     return plus(centreOf(camera), forwardOf(camera), depth);
   }
 }

@@ -1,6 +1,6 @@
 // A player in a headset (WebXR): a picture for each eye, of Gaussians that are evaluated and sorted for the head.
 
-import { centreOf, dot, forwardOf, lookAlong, plus, unit } from "./camera.js";
+import { centreOf, dot, forwardOf, lookAlong, middleOf, plus, unit } from "./camera.js";
 /** @import { Camera, Info } from "../decode/scene.js" */
 /** @import { Player } from "./player.js" */
 
@@ -67,10 +67,10 @@ async function show(player, session) {
 
 /** @param {Camera} camera @param {Info} info @returns {[Camera, number]} the camera with its horizon level, and metres
  * per scene unit */
-function standing(camera, { up, unit: metres, box: [low, high] }) {
+function standing(camera, info) {
+  const { up, unit: metres } = info;
   const eye = centreOf(camera);
-  const middle = plus(plus([0, 0, 0], low, 0.5), high, 0.5);
-  const scale = metres || DISTANCE / (Math.hypot(...plus(middle, eye, -1)) || 1);
+  const scale = metres || DISTANCE / (Math.hypot(...plus(middleOf(info), eye, -1)) || 1);
   const upward = unit(up, [0, 0, 0]);
   const ahead = plus(forwardOf(camera), upward, -dot(forwardOf(camera), upward));
   const steep = !Math.hypot(...upward) || Math.hypot(...ahead) < 0.1;

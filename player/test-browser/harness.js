@@ -6,6 +6,7 @@ import { evaluate } from "../render/evaluate.js";
 import { GpuEvaluator } from "../render/evaluator.js";
 import { Gpu } from "../render/gl.js";
 import { ANCHOR_BITS, listGaussians, NO_ENTRY } from "../render/sort.js";
+import { base64 } from "./pictures.js";
 
 /** @param {string} url */
 async function sceneOf(url) {
@@ -71,10 +72,18 @@ async function compare(url, cases, bandPoints) {
   return { cases: out, error };
 }
 
-/** @type {Player | null} */
-let player = null;
-/** @type {[string, any][]} */
-let events = [];
+const harness = {
+  compare,
+  open,
+  shoot,
+  loseContext,
+  close,
+  /** @type {Player | null} */
+  player: null,
+  /** @type {[string, any][]} */
+  events: [],
+};
+Object.assign(window, { harness });
 
 /**
  * A player on a canvas of some size; events are kept.
@@ -88,8 +97,9 @@ async function open(url, width, height, options = {}) {
   Object.assign(canvas.style, { width: `${width}px`, height: `${height}px`, display: "block" });
   document.body.append(canvas);
   const made = new Player(canvas, { degrade: false, pixelRatio: 1, ...options });
-  player = made;
-  events = [];
+  harness.player = made;
+  /** @type {[string, any][]} */
+  const events = (harness.events = []);
   for (const name of ["firstpicture", "upgrade", "loaded", "error"]) {
     made.addEventListener(name, (event) => events.push([name, /** @type {CustomEvent} */ (event).detail]));
   }
@@ -104,6 +114,7 @@ async function open(url, width, height, options = {}) {
  * [state]
  */
 async function shoot({ level, seconds, viewmat, K, width, height } = {}) {
+  const { player } = harness;
   if (!player) throw new Error("nothing is open");
   if (level !== undefined) player.level = level;
   if (seconds !== undefined) player.seek(seconds);
@@ -111,14 +122,12 @@ async function shoot({ level, seconds, viewmat, K, width, height } = {}) {
     player.camera = { viewmat: new Float32Array(viewmat), K: new Float32Array(K), width, height };
   }
   await player.settled();
-  const { data } = player.snapshot();
-  let text = "";
-  for (let i = 0; i < data.length; i += 8192) text += String.fromCharCode(...data.subarray(i, i + 8192));
-  return btoa(text);
+  return base64(player.snapshot().data);
 }
 
 /** Takes the GPU away for a while. */
 async function loseContext() {
+  const { player } = harness;
   const gl = player?.canvas.getContext("webgl2");
   const extension = gl?.getExtension("WEBGL_lose_context");
   const lost = new Promise((resolve) => player?.canvas.addEventListener("webglcontextlost", resolve, { once: true }));
@@ -129,23 +138,7 @@ async function loseContext() {
 }
 
 function close() {
-  player?.close();
-  player?.canvas.remove();
-  player = null;
+  harness.player?.close();
+  harness.player?.canvas.remove();
+  harness.player = null;
 }
-
-Object.assign(window, {
-  harness: {
-    compare,
-    open,
-    shoot,
-    loseContext,
-    close,
-    get player() {
-      return player;
-    },
-    get events() {
-      return events;
-    },
-  },
-});

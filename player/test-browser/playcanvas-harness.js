@@ -3,9 +3,11 @@
 import * as pc from "playcanvas";
 
 import { Pd4 } from "../playcanvas.js";
+import { base64 } from "./pictures.js";
 
-/** @type {any} */
-let shown = null;
+/** app, camera, script, canvas: while a scene is open. @type {any} */
+const harness = { open, shoot, close };
+Object.assign(window, { harness });
 
 /**
  * A scene in PlayCanvas on a canvas of some size.
@@ -36,7 +38,7 @@ async function open(url, width, height) {
   app.root.addChild(entity);
   entity.addComponent("script");
   const script = /** @type {Pd4} */ (entity.script?.create(Pd4, { properties: { src: url, autoplay: false, exact: true } }));
-  shown = { app, camera, script, canvas, width, height };
+  Object.assign(harness, { app, camera, script, canvas });
   await new Promise((resolve, reject) => {
     script.on("loaded", resolve);
     script.on("error", reject);
@@ -49,7 +51,7 @@ async function open(url, width, height) {
  * @param {{level: number, seconds: number, viewmat: number[], K: number[], width: number, height: number}} state
  */
 async function shoot({ level, seconds, viewmat, K, width, height }) {
-  const { app, camera, script, canvas } = shown;
+  const { app, camera, script, canvas } = harness;
   script.maxLayer = level;
   script.playback.time = seconds;
   script.lookThrough(camera, { viewmat: new Float32Array(viewmat), K: new Float32Array(K), width, height });
@@ -64,29 +66,11 @@ async function shoot({ level, seconds, viewmat, K, width, height }) {
   const picture = new OffscreenCanvas(width, height).getContext("2d");
   if (!picture) throw new Error("no 2D context");
   await new Promise((resolve) => app.once("frameend", () => resolve(picture.drawImage(canvas, 0, 0))));
-  const { data } = picture.getImageData(0, 0, width, height);
-  let text = "";
-  for (let i = 0; i < data.length; i += 8192) text += String.fromCharCode(...data.subarray(i, i + 8192));
-  return btoa(text);
+  return base64(picture.getImageData(0, 0, width, height).data);
 }
 
 function close() {
-  if (!shown) return;
-  shown.app.destroy();
-  shown.canvas.remove();
-  shown = null;
+  harness.app?.destroy();
+  harness.canvas?.remove();
+  harness.app = harness.canvas = harness.script = null;
 }
-
-Object.assign(window, {
-  harness: {
-    open,
-    shoot,
-    close,
-    get script() {
-      return shown?.script;
-    },
-    get app() {
-      return shown?.app;
-    },
-  },
-});

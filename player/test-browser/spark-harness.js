@@ -1,6 +1,7 @@
 // What the test of the adapter to Spark calls: `window.harness`. three.js and Spark come from the page's import map.
 
 import { Pd4Splats, SPARK_SETTINGS } from "../spark.js";
+import { base64 } from "./pictures.js";
 
 /** @param {string} name */
 const load = (name) => import(name); // without a type: TypeScript need not find the package
@@ -8,6 +9,7 @@ const [THREE, spark] = await Promise.all(["three", "@sparkjsdev/spark"].map(load
 
 /** @type {any} */
 let shown = null;
+Object.assign(window, { harness: { open, shoot, close } });
 
 /**
  * A scene in Spark on a canvas of some size.
@@ -48,11 +50,8 @@ async function shoot({ level, seconds, viewmat, K, width, height }) {
   const gl = renderer.getContext();
   const pixels = new Uint8Array(4 * width * height);
   gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
-  let text = "";
-  for (let y = height - 1; y >= 0; y--) {
-    text += String.fromCharCode(...pixels.subarray(4 * width * y, 4 * width * (y + 1)));
-  }
-  return btoa(text);
+  const row = 4 * width;
+  return base64(Uint8Array.from(pixels, (_, i) => pixels[row * (height - 1 - Math.floor(i / row)) + (i % row)]));
 }
 
 function close() {
@@ -62,14 +61,3 @@ function close() {
   shown.renderer.domElement.remove();
   shown = null;
 }
-
-Object.assign(window, {
-  harness: {
-    open,
-    shoot,
-    close,
-    get splats() {
-      return shown?.splats;
-    },
-  },
-});

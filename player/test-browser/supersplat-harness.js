@@ -12,6 +12,7 @@ const [{ createViewer }, { defaultSettings }] = await Promise.all(
 
 /** @type {any} */
 let shown = null;
+Object.assign(window, { harness: { open, show, close } });
 
 /**
  * A scene in the viewer, in place of a still one. Time stands still.
@@ -78,17 +79,3 @@ function close() {
   shown?.container.remove();
   shown = null;
 }
-
-Object.assign(window, {
-  harness: {
-    open,
-    show,
-    close,
-    get viewer() {
-      return shown?.viewer;
-    },
-    get script() {
-      return shown?.script;
-    },
-  },
-});

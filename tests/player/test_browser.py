@@ -324,7 +324,7 @@ def viewer(page: Any, server: Server, folder: Path, name: str, files: Sequence[s
         target = folder / "packages" / file
         target.parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(PLAYER / "node_modules" / file, target.with_suffix(".js"))
-    page.goto(server.url_of(f"player/test-browser/{name}.html"))
+    page.goto(f"{server.url_of('player/test-browser/viewer.html')}#{name}")
     page.wait_for_function("!!window.harness")
 
 
