@@ -194,6 +194,15 @@ test("time advances while the mesh plays, and loops or stops at the end", async 
   }
 });
 
+test("a scene that plays before it has arrived begins at its start time", async () => {
+  const [start, end] = decode(BYTES).info.timeRange;
+  const splats = new Pd4Splats({ ...modules, time: (start + end) / 2 });
+  splats.play();
+  await splats.load(ADDRESS, {});
+  assert.ok(splats.time === (start + end) / 2 && !splats.paused);
+  splats.close();
+});
+
 test("a file of another type is refused, a damaged one keeps its valid layers", async () => {
   await assert.rejects(Pd4Splats.open(addressOf(new Uint8Array(64)), modules), { kind: "BadSignature" });
   const damaged = BYTES.slice();

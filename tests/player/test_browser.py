@@ -766,6 +766,7 @@ def test_attributes_and_removal(page, server):
     assert player.locator("img").count() == 1
     wait_for_level(page, 1)
     assert player.locator("img").is_hidden() and player.get_by_role("group").is_hidden()
+    assert page.evaluate(f"{ELEMENT}.player.canvas.tabIndex") == -1  # no key does anything
     page.wait_for_function("document.querySelector('pd4-player').time < 2")  # it plays, and begins anew
     names = [name for name, _ in page.evaluate("seen")]
     assert names.count("firstpicture") == 1 and names.count("upgrade") <= 1 and "progress" in names
