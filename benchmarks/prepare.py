@@ -137,11 +137,11 @@ def errors(found: np.ndarray, true: np.ndarray) -> tuple[float, float]:
     )
 
 
-def measured(recording: Walk | Capture, package: Path, threads: int) -> str:
-    """A row of the table."""
+def measured(recording: Walk | Capture, package: Path, frames: int) -> str:
+    """A row of the table. frames: the most that are used."""
     with tempfile.TemporaryDirectory() as folder:
         truth, output = recording.write(Path(folder)), Path(folder) / "out"
-        command = [sys.executable, "-c", COMMAND, truth.path, "-o", output, "-j", threads]
+        command = [sys.executable, "-c", COMMAND, truth.path, "-o", output, "--frames", frames, "-j", 2]
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         environment = os.environ | {"PYTHONPATH": str(package)}
         done = subprocess.run(list(map(str, command)), env=environment, capture_output=True, text=True)
@@ -150,10 +150,10 @@ def measured(recording: Walk | Capture, package: Path, threads: int) -> str:
         if done.returncode:
             return f"| {recording.name} | {seconds:.0f} | {done.stderr.strip().splitlines()[-1]} |"
         report, views = json.loads((output / "report.json").read_text()), load(output, holdout=0).train
-        frames = [truth.frame(view.image) for view in views]
-        angle, distance = errors(np.stack([view.viewmat for view in views]).astype(np.float64), truth.poses[frames])
+        which = [truth.frame(view.image) for view in views]
+        angle, distance = errors(np.stack([view.viewmat for view in views]).astype(np.float64), truth.poses[which])
         times = [row["seconds"] for row in report["pictures"] if row["pose"]]
-        late = 1000 * np.abs(truth.times[frames] - times).max()
+        late = 1000 * np.abs(truth.times[which] - times).max()
         counts = report["frames"]
         posed = f"{counts['registered']} of {counts['chosen']} | {report['reprojection_error']:.2f}"
         return f"| {recording.name} | {seconds:.0f} | {posed} | {angle:.2f}° | {distance:.2f} % | {late:.0f} ms |"
@@ -164,13 +164,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", help="recordings (default: all)")
     parser.add_argument("--package", type=Path, default=ROOT, help="checkout whose package runs (default: this one)")
-    parser.add_argument("-j", "--threads", type=int, default=2, help="threads of each (default: 2)")
+    parser.add_argument("--frames", type=int, default=COUNT, help=f"frames that are used (default: {COUNT})")
     options = parser.parse_args()
     head = "recording", "CPU s", "poses", "error, pixels", "largest turn", "distance", "time"
     print(f"| {' | '.join(head)} |\n" + "|-" * len(head) + "|")
     for recording in RECORDINGS:
         if not options.names or recording.name in options.names:
-            print(measured(recording, options.package, options.threads), flush=True)
+            print(measured(recording, options.package, options.frames), flush=True)
 
 
 if __name__ == "__main__":
