@@ -143,8 +143,9 @@ def measured(recording: Walk | Capture, package: Path, frames: int) -> str:
         truth, output = recording.write(Path(folder)), Path(folder) / "out"
         command = [sys.executable, "-c", COMMAND, truth.path, "-o", output, "--frames", frames, "-j", 2]
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
-        environment = os.environ | {"PYTHONPATH": str(package)}
-        done = subprocess.run(list(map(str, command)), env=environment, capture_output=True, text=True)
+        environment = os.environ | {"PYTHONPATH": str(package.resolve())}
+        # elsewhere, since Python looks for packages where it starts first
+        done = subprocess.run(list(map(str, command)), cwd=folder, env=environment, capture_output=True, text=True)
         after = resource.getrusage(resource.RUSAGE_CHILDREN)
         seconds = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
         if done.returncode:
