@@ -90,12 +90,16 @@ def whole_files(pattern: str, names: Sequence[str], overwrite: bool) -> Iterator
                 _move(temporary, Path(name))
 
 
-def read_source(path: str | Path) -> bytes:
-    """All bytes of a file, or of a pipe until its writer closes it. Raises OSError, and DataError for a device, whose
-    bytes may never end."""
+def check_source(path: str | Path) -> None:
+    """Raises DataError for a device, whose bytes may never end, and OSError if nothing is there."""
     mode = os.stat(path).st_mode
     if stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
         raise DataError(f"{path}: is a device, expected a file")
+
+
+def read_source(path: str | Path) -> bytes:
+    """All bytes of a file, or of a pipe until its writer closes it. Raises as `check_source` does."""
+    check_source(path)
     return Path(path).read_bytes()
 
 

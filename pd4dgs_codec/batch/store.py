@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from pd4dgs_codec.errors import DataError, one_line
-from pd4dgs_codec.io import is_device, write_bytes
+from pd4dgs_codec.io import check_source, is_device, write_bytes
 from pd4dgs_codec.web.headers import media_type
 
 RECORD = ".done.json"
@@ -78,8 +78,10 @@ def _naming(place: str) -> Iterator[None]:
 
 @contextmanager
 def opened(place: str) -> Iterator[IO[bytes]]:
-    """A file to read. Raises OSError."""
-    system, path, _ = _system(place)
+    """A file to read. Raises OSError, and DataError for a device."""
+    system, path, local = _system(place)
+    if local and Path(path).exists():
+        check_source(path)
     with _naming(place):
         stream = system.open(path, "rb")
     with stream:

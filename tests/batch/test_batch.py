@@ -9,7 +9,7 @@ import pytest
 
 from pd4dgs_codec import __version__
 from pd4dgs_codec.batch import store
-from pd4dgs_codec.batch.job import arguments, scan
+from pd4dgs_codec.batch.job import OPS, Manifest, arguments, scan
 from pd4dgs_codec.errors import DataError
 
 
@@ -165,6 +165,8 @@ def test_a_source_for_which_a_reader_would_wait_is_named(library, kind):
         (library.folder / "in" / "a.pt").symlink_to("/dev/zero")
     library.add("b.pt", "y")
     assert library.run().done == 1
+    with pytest.raises(DataError, match="is a device"):
+        Manifest("/dev/zero", OPS["encode"], lambda options: None)
     outcome, tries = library.outcomes["a.pd4"]
     assert tries == 1 and "a.pt: is a pipe or a device, expected a file" in outcome.message
 

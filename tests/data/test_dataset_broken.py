@@ -149,6 +149,7 @@ CASES: list[tuple[str, str, Any, str]] = [
     ("blender", "transforms.json", dict(near_far_per_frame=[[3, 1]] * 3), "expected 0 < near < far"),
     ("blender", "transforms.json", dict(near_far_per_frame=[[1, 3]]), "has shape (1, 2), expected (3, 2)"),
     ("blender", "transforms.json", b'{\n "w": 3,\n "h": ]\n}', "transforms.json: line 3, column 7: broken JSON"),
+    ("blender", "transforms.json", b'{"a":' + b"[" * 500_000, "cannot be read as JSON"),
     ("blender", "transforms.json", b"[1]", "found a JSON list, expected an object"),
     ("blender", "transforms.json", b"\xff\xfe\x00", "cannot be read as JSON"),
     ("blender", "transforms.json", b'{"fl_x": 1' + b"0" * 5000 + b"}", "transforms.json"),

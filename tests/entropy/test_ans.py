@@ -47,6 +47,21 @@ def test_round_trip_by_both_decoders(case):
     assert decoded == [c.tolist() for c in channels]
 
 
+def test_first_symbols_at_the_end_take_no_bytes():
+    """So no decoder can tell that symbols are missing there (annex C of the format)."""
+    cum = norm_table(9, 1000, 64, 1)
+    few, more = np.array([3, 8, 1], np.int32), np.array([3, 8, 1, 0, 0, 0], np.int32)
+    data = ans_encode([few], [cum])
+    assert data == ans_encode([more], [cum])
+    decoder = AnsDecoder(data)
+    assert decoder.take(6, model_of(cum)).tolist() == more.tolist()
+    decoder.finish()
+    decoder = AnsDecoder(data)
+    decoder.take(2, model_of(cum))
+    with pytest.raises(Malformed, match="state 0"):
+        decoder.finish()
+
+
 @pytest.mark.parametrize(
     "symbols, cum",
     [

@@ -172,6 +172,16 @@ def test_a_body_is_not_the_next_request(server, method, field):
     assert received.count(b"HTTP/1.1 ") <= 1 and b"scene" not in received
 
 
+def test_a_body_that_drips_is_not_waited_for(server):
+    with socket.create_connection(server.server_address[:2], timeout=20) as raw:
+        raw.sendall(b"POST /bytes.bin HTTP/1.1\r\nHost: x\r\nContent-Length: 1000000000\r\n\r\nx")
+        received = b""
+        with contextlib.suppress(ConnectionResetError):
+            while block := raw.recv(65536):  # up to the end of the connection, of which there is one
+                received += block
+    assert received.count(b"HTTP/1.1 ") <= 1
+
+
 @pytest.fixture
 def private(folder):
     with Server(folder, private=True) as served, served.running():
