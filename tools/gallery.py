@@ -51,13 +51,12 @@ def main() -> None:
     """Makes what is missing, then the index."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seconds", type=float, default=150.0, help="training time of a scene (%(default)s)")
-    parser.add_argument("scenes", nargs="*", choices=[*SCENES, []], help="default: all")
     args = parser.parse_args()
     FOLDER.mkdir(parents=True, exist_ok=True)
-    for name in args.scenes or SCENES:
+    for name in SCENES:
         if not (FOLDER / f"{name}.html").exists():
             add(name, args.seconds)
-    cards = "\n".join(card(name) for name in SCENES if (FOLDER / f"{name}.html").exists())
+    cards = "\n".join(map(card, SCENES))
     title = "Synthetic scenes"
     page = f"<!doctype html>\n<html lang=en><meta charset=utf-8><title>{title}</title><style>{STYLE}</style>\n"
     (FOLDER / "index.html").write_text(f"{page}<h1>{title}</h1><main>\n{cards}\n</main>\n</html>\n", encoding="utf-8")
