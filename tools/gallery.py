@@ -44,7 +44,9 @@ def card(name: str) -> str:
     """A scene of the index."""
     size = (FOLDER / f"{name}.html").stat().st_size / 1e6
     what = f"synthetic:{name}: {html.escape(SCENES[name])} ({size:.1f} MB with the player)"
-    return f'<figure><a href="{name}.html"><img src="{name}.gif" alt="{name}"></a><figcaption>{what}</figcaption></figure>'
+    return (
+        f'<figure><a href="{name}.html"><img src="{name}.gif" alt="{name}"></a><figcaption>{what}</figcaption></figure>'
+    )
 
 
 def main() -> None:
