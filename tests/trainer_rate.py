@@ -3,11 +3,11 @@
 import numpy as np
 import torch
 
-from pd4dgs_codec.entropy.bits import entropy_bits
+from pd4dgs_codec.entropy.tables import entropy_bits
 from pd4dgs_codec.format.deformation import decorrelate
 from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.format.quantise import classes_of
-from pd4dgs_codec.model.rate import channel_moments, gaussian_bits, rate_bits
+from pd4dgs_codec.model.rate import channel_moments, rate_bits
 
 
 def train_rate_bits(scene):
@@ -34,3 +34,14 @@ def train_rate_bits(scene):
         row |= {"planes": gaussian_bits(coded.plane_channels), "weights": gaussian_bits(coded.weights)}
         result.append(row)
     return result
+
+
+def gaussian_bits(channels):
+    """The sum of R(a) over integer channels, as the trainer computes it in float64: priors are a channel's moments."""
+    total = 0.0
+    for channel in channels:
+        if channel.size:
+            mu, sigma = channel_moments(torch.from_numpy(channel.astype(np.float64)))
+            symbols, counts = (torch.from_numpy(x) for x in np.unique(channel, return_counts=True))
+            total += float((rate_bits(symbols.double(), mu, sigma, 1.0) * counts).sum())
+    return total

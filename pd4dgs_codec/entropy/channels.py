@@ -19,7 +19,6 @@ import numpy as np
 
 from pd4dgs_codec.entropy import EFFORTS, PRIORS
 from pd4dgs_codec.entropy.ans import MAX_COUNT, AnsDecoder, Model, ans_encode, model_of
-from pd4dgs_codec.entropy.bits import BIT
 from pd4dgs_codec.entropy.fitting import Fit, Fitted, fit_best, histogram, plan_priors
 from pd4dgs_codec.entropy.priors import (
     FIRST_REUSE,
@@ -35,7 +34,7 @@ from pd4dgs_codec.entropy.priors import (
     with_class_symbols,
     write_prior,
 )
-from pd4dgs_codec.entropy.tables import uniform_table
+from pd4dgs_codec.entropy.tables import BIT, uniform_table
 from pd4dgs_codec.entropy.varint import VARINT_MAX, ByteReader, put_varint
 from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
 
@@ -82,14 +81,12 @@ def encode_channels(
     priors: str = "best",
     effort: int = 5,
     known: Sequence[Fitted] = (),
-    entries: int = FREE_ENTRIES,
 ) -> CodedChannels:
     """Encode int32 channels (1-D, any lengths, |k| <= 2**24 - 1) into one payload.
 
     priors: "gauss" allows const and gauss only, the model of R(a); "best" every prior. It is never larger in payloads
     under 4 kB, and in longer ones where Gaussians alone come near.
     effort: 1..9, time spent on fitting. known: priors of earlier payloads, in order; a decoder must have them too.
-    entries: most entries of all tables, beyond one per symbol, if nothing is known.
     Raises EncodeError.
     """
     if priors not in PRIORS or effort not in EFFORTS:
@@ -99,10 +96,10 @@ def encode_channels(
     rounds = 0 if effort < 3 else (effort + 1) // 2
     richer = priors == "best" and effort > 1
     fit: Fit = (lambda h: fit_best(h, effort)) if richer else (lambda h: h.gauss)
-    best = _encode(arrays, plan_priors(histograms, fit, rounds, known, entries), known)
+    best = _encode(arrays, plan_priors(histograms, fit, rounds, known), known)
     least = sum(h.gauss.own for h in histograms) / BIT  # about the bits of Gaussians: sharing can save more
     if richer and (len(best[0]) < SMALL or least < 1.005 * 8 * len(best[0])):
-        other = _encode(arrays, plan_priors(histograms, lambda h: h.gauss, rounds, known, entries), known)
+        other = _encode(arrays, plan_priors(histograms, lambda h: h.gauss, rounds, known), known)
         best = min(best, other, key=lambda encoded: len(encoded[0]))
     payload, defined = best
     return CodedChannels(payload, sum(h.rate_bits for h in histograms), defined)
@@ -178,28 +175,20 @@ def _read_exceptions(reader: ByteReader, count: int, window: Window) -> _Excepti
 
 
 def decode_channels(
-    payload: bytes | memoryview,
-    counts: Sequence[int],
-    known: list[Prior] | None = None,
-    entries: int = FREE_ENTRIES,
+    payload: bytes | memoryview, counts: Sequence[int], known: list[Prior] | None = None
 ) -> list[np.ndarray]:
     """Inverse of encode_channels: one int32 [count] array per count; see `decode_joined`."""
-    symbols = decode_joined(payload, counts, known, entries)
+    symbols = decode_joined(payload, counts, known)
     ends = accumulate(counts)
     return [symbols[end - count : end] for count, end in zip(counts, ends, strict=True)]
 
 
-def decode_joined(
-    payload: bytes | memoryview,
-    counts: Sequence[int],
-    known: list[Prior] | None = None,
-    entries: int = FREE_ENTRIES,
-) -> np.ndarray:
+def decode_joined(payload: bytes | memoryview, counts: Sequence[int], known: list[Prior] | None = None) -> np.ndarray:
     """int32 [sum of counts]: the channels of a payload, concatenated.
 
-    known: priors of earlier payloads, in order; this payload's definitions are appended. entries: as in
-    encode_channels. The caller has checked the counts against its limits. Raises Malformed (cut, trailing or corrupt
-    bytes), LimitExceeded, or UnsupportedFeature (a prior outside the registry).
+    known: priors of earlier payloads, in order; this payload's definitions are appended. The caller has checked the
+    counts against its limits. Raises Malformed (cut, trailing or corrupt bytes), LimitExceeded, or UnsupportedFeature
+    (a prior outside the registry).
     """
     for index, count in enumerate(counts):
         if not 0 <= count <= MAX_COUNT:
@@ -207,7 +196,7 @@ def decode_joined(
     reader = ByteReader(payload)
     defined = [] if known is None else known
     first, heads, found = len(defined), list[_Head](), 0
-    most = sum(counts) + (MORE_ENTRIES if defined else entries)
+    most = sum(counts) + (MORE_ENTRIES if defined else FREE_ENTRIES)
     for count in filter(None, counts):
         before = len(defined)
         head = _read_channel(reader, count, defined)

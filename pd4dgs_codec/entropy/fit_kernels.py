@@ -17,9 +17,18 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.entropy.bits import BIT, LOG2, frequency_costs
 from pd4dgs_codec.entropy.priors import CLASS_STEPS, FLOORS
-from pd4dgs_codec.entropy.tables import NORMAL, OCTAVE, SI_MAX, SI_MIN, TOTAL, norm_cdf28_of_each
+from pd4dgs_codec.entropy.tables import (
+    BIT,
+    LOG2,
+    NORMAL,
+    OCTAVE,
+    SI_MAX,
+    SI_MIN,
+    TOTAL,
+    frequency_costs,
+    norm_cdf28_of_each,
+)
 
 try:
     from numba import njit
@@ -42,13 +51,13 @@ CLASS_WIDTHS = 64
 #: Of R(a): the clip of probabilities, and the least standard deviation, in units of Q.
 P_MIN, SIGMA_MIN = 1e-6, 2.0**-10
 
-_STEPS, _FLOORS = np.array(CLASS_STEPS), np.array(FLOORS)
+_STEPS = np.array(CLASS_STEPS)
 _LOW, _HIGH = FLOORS  # the higher floor keeps outliers from steering the fit
 
 
 @_inlined
 def frequency_cost(frequency: int) -> Any:
-    """`bits.frequency_costs` of one frequency."""
+    """`tables.frequency_costs` of one frequency."""
     bits = np.float64(frequency).view(np.int64)
     i, f = (bits >> 40) & 4095, (bits >> 28) & 4095
     log2 = (((bits >> 52) - 1023) * BIT) + LOG2[i] + (((LOG2[i + 1] - LOG2[i]) * f) >> 12)

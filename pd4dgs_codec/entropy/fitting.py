@@ -17,7 +17,6 @@ from types import ModuleType
 
 import numpy as np
 
-from pd4dgs_codec.entropy.bits import BIT, order0_bits, symbol_counts
 from pd4dgs_codec.entropy.priors import (
     CLASS_STEPS,
     FLOORS,
@@ -34,6 +33,7 @@ from pd4dgs_codec.entropy.priors import (
     Window,
     write_prior,
 )
+from pd4dgs_codec.entropy.tables import BIT, order0_bits, symbol_counts
 
 BLOCK = 256  #: channels planned together; keeps the cost matrix small
 WIDE = 1024  #: a channel with more distinct symbols spends too much on each for its prior's few bytes to matter
@@ -221,12 +221,9 @@ def _window(low: int, high: int) -> Window:
 Fit = Callable[[Histogram], Fitted]
 
 
-def plan_priors(
-    histograms: Sequence[Histogram], fit: Fit, rounds: int, known: Sequence[Fitted] = (), entries: int = FREE_ENTRIES
-) -> list[Fitted]:
+def plan_priors(histograms: Sequence[Histogram], fit: Fit, rounds: int, known: Sequence[Fitted] = ()) -> list[Fitted]:
     """The prior of each channel; channels that share one hold the same object. known: priors that were described
-    earlier. entries: most entries of all tables, beyond one per symbol, if nothing is known; fewer than MAX_WINDOW only
-    if no channel's range takes more."""
+    earlier."""
     plan = [fit(h) for h in histograms]
     free = [replace(fitted, price=0) for fitted in known]
     if free and plan:
@@ -241,19 +238,17 @@ def plan_priors(
         shared = _plan_block([histograms[c] for c in block], [plan[c] for c in block], free, fit, rounds)
         for c, prior in zip(block, shared, strict=True):
             plan[c] = prior
-    return _within_limit(histograms, plan, free, fit, MORE_ENTRIES if free else entries)
+    return _within_limit(histograms, plan, free, fit)
 
 
-def _within_limit(
-    histograms: Sequence[Histogram], plan: list[Fitted], free: list[Fitted], fit: Fit, entries: int
-) -> list[Fitted]:
+def _within_limit(histograms: Sequence[Histogram], plan: list[Fitted], free: list[Fitted], fit: Fit) -> list[Fitted]:
     """The plan. If its tables are larger than a section may define, one prior for all their channels replaces the
     widest new ones, or known priors do if there is no room for one."""
     known = {id(p.prior) for p in free}
     distinct = {id(p.prior): p for p in plan if id(p.prior) not in known}.values()
     ordered = sorted(distinct, key=lambda p: p.prior.window.n)
     ends = np.cumsum([p.prior.window.n for p in ordered])
-    left = sum(int(h.counts.sum()) for h in histograms) + entries
+    left = sum(int(h.counts.sum()) for h in histograms) + (MORE_ENTRIES if free else FREE_ENTRIES)
     if not ordered or ends[-1] <= left:
         return plan
     kept = known | {id(p.prior) for p, end in zip(ordered, ends, strict=True) if end <= left - MAX_WINDOW}

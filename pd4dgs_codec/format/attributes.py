@@ -21,10 +21,10 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from pd4dgs_codec.entropy.bits import entropy_bits
 from pd4dgs_codec.entropy.channels import decode_channels, decode_joined, encode_channels
 from pd4dgs_codec.entropy.fitting import Fitted
 from pd4dgs_codec.entropy.priors import K_MAX, Prior
+from pd4dgs_codec.entropy.tables import entropy_bits
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
 from pd4dgs_codec.errors import Malformed, UnsupportedFeature
 from pd4dgs_codec.format.quantise import NO_CLASSES
@@ -118,16 +118,11 @@ class Split:
         return classes
 
 
-def stage_bounds(widths: Widths) -> list[int]:
-    """The first channel of each stage of residuals, and the end of the last stage."""
-    return [widths.predicted * bound // STAGES[-1] for bound in STAGES]
-
-
 def stage_channels(widths: Widths, stage: int) -> range:
     """The channels of stage 0..5; stage 5 has the offsets x."""
     if stage == len(STAGES) - 1:
         return range(widths.predicted, widths.channels, 3)
-    return range(*stage_bounds(widths)[stage : stage + 2])
+    return range(*(widths.predicted * bound // STAGES[-1] for bound in STAGES[stage : stage + 2]))
 
 
 @dataclass(eq=False)

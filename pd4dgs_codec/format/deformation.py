@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
+from pd4dgs_codec.entropy.fitting import histogram
 from pd4dgs_codec.errors import LimitExceeded, Malformed
 from pd4dgs_codec.format.canonical import Fields, as_integer, as_list, as_registered
 from pd4dgs_codec.format.options import EncodeOptions
@@ -23,12 +24,12 @@ from pd4dgs_codec.format.planes import (
     PREDICTORS,
     PlaneShape,
     cells_read,
+    choose_predictor,
     fill_plane,
     read_planes,
     restore,
     write_planes,
 )
-from pd4dgs_codec.format.planes import choose_predictor as choose_predictor
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, dequantise, expect, expect_array, is_step, magnitude, quantise
 from pd4dgs_codec.format.registry import LAYER_KINDS, LayerKind, Section
 from pd4dgs_codec.scene import (
@@ -36,6 +37,7 @@ from pd4dgs_codec.scene import (
     PLANES,
     TRUNK,
     Deformation,
+    Planes,
     Steps,
     Widths,
     instant,
@@ -363,6 +365,13 @@ def decorrelate(symbols: Deformation, kind: LayerKind) -> Decorrelated:
     chosen = [choose_predictor(plane) for plane in tensors[:count]]
     weights = [array.ravel() for array in tensors[count:]]
     return Decorrelated([p for p, *_ in chosen], [r for _, r, _ in chosen], weights)
+
+
+def plane_rate_bits(planes: Planes, step: float) -> float:
+    """The sum of R(a) of the coded residuals of planes at a quantisation step, each plane under the predictor that
+    `decorrelate` picks."""
+    chosen = (choose_predictor(quantise(plane, step, name)) for scale in planes for name, plane in scale.items())
+    return sum(histogram(channel.ravel()).rate_bits for _, residuals, _ in chosen for channel in residuals)
 
 
 def write_sections(coded: Decorrelated, options: EncodeOptions) -> dict[Section, tuple[bytes, float]]:

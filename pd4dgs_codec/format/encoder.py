@@ -172,33 +172,27 @@ def _write_layers(
 ) -> list[list[_Slice]]:
     """The slices of each layer."""
     if not options.slices:
-        return [[_whole_layer(layer, options)] for layer in symbols.layers]
+        return [[_Slice(len(layer.anchor_q), *write_layer(layer, options))] for layer in symbols.layers]
     ends = np.cumsum([len(layer.anchor_q) for layer in symbols.layers])[:-1]
     values = np.split(utility(symbols.scene()), ends)
-    written = [_write_slices(layer, options, u, HEADER) for layer, u in zip(symbols.layers, values, strict=True)]
+    written = [_write_slices(layer, options, u) for layer, u in zip(symbols.layers, values, strict=True)]
     if (chunks := sum(map(len, written))) > MAX_CHUNKS:
         raise EncodeError(f"{chunks} slices, expected at most {MAX_CHUNKS}: let slices take more bytes")
     return written
 
 
-def _whole_layer(layer: LayerSymbols, options: EncodeOptions) -> _Slice:
-    """A layer in one slice."""
-    return _Slice(len(layer.anchor_q), *write_layer(layer, options))
-
-
-def _write_slices(layer: LayerSymbols, options: EncodeOptions, utility: np.ndarray, reserved: int = 0) -> list[_Slice]:
+def _write_slices(layer: LayerSymbols, options: EncodeOptions, utility: np.ndarray) -> list[_Slice]:
     """The slices of a layer, in order, of about options.slices bytes at most.
 
-    utility: float [n], of the layer's anchors; the highest come first. reserved: bytes before the first slice that
-    count as part of it. A first slice that planes and networks alone make larger has no anchors, except in layer 0,
-    where a picture needs some.
+    utility: float [n], of the layer's anchors; the highest come first. A first slice that planes and networks alone
+    make larger has no anchors, except in layer 0, where a picture needs some.
     """
     rows = np.argsort(-utility, kind="stable")
     costs = np.cumsum(layer.bits_per_row()[rows]) / 8
     done, found, past = 0, list[_Slice](), Past[Fitted]()
     scale = 1.0  # bytes that a slice takes per byte expected
     while done < len(rows) or not found:
-        room = options.slices - CHUNK_OVERHEAD - (0 if found else reserved)
+        room = options.slices - CHUNK_OVERHEAD - (0 if found else HEADER)
         least = 1 if found or layer.kind.layer == 0 else 0
         before = costs[done - 1] if done else 0.0
         fixed = 0 if found else len(write_layer(sliced(layer, rows[:0], True), options)[0])

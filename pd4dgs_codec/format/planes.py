@@ -14,8 +14,8 @@ from itertools import accumulate
 
 import numpy as np
 
-from pd4dgs_codec.entropy.bits import BIT, frequency_costs
 from pd4dgs_codec.entropy.channels import decode_joined
+from pd4dgs_codec.entropy.tables import BIT, frequency_costs, symbol_counts
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import Malformed, UnsupportedFeature
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, magnitude
@@ -39,8 +39,6 @@ from pd4dgs_codec.scene import PLANES, Planes, plane_sides
 PlaneShape = tuple[int, int, int]  #: of a plane: channels, rows, columns
 Array = np.ndarray
 
-#: A channel that spans more values is too sparse for its frequencies to be an estimate.
-WIDEST = 1 << 16
 #: Cells by which a position may be off in another renderer, which rounds its coordinates otherwise.
 CELL_SLACK = 0.02
 
@@ -203,24 +201,12 @@ def _candidates(planes: Iterable[tuple[int, Array]]) -> Iterator[tuple[float, in
 def _estimated_bits(residuals: Array) -> float:
     """Cost of residuals int32 [C, H, W]: per channel its order-0 entropy, and log2(n) / 2 per distinct value for the
     description of the distribution. The entropies are sums of integers, so the choice is the same on every machine."""
-    if residuals.size == 0:
-        return 0.0
-    channels = residuals.reshape(len(residuals), -1)
-    size, low = channels.shape[1], channels.min(axis=1).astype(np.int64)
-    span = channels.max(axis=1) - low
-    narrow = span <= WIDEST
-    ends = np.cumsum(np.where(narrow, span + 1, 0))  # of each channel's counts
-    bits = 0.0
-    if narrow.any():
-        places = channels + (ends - span - 1 - low)[:, None]
-        counts = np.bincount((places if narrow.all() else places[narrow]).ravel())
-        counts = counts[counts > 0]
-        costs = int(counts @ frequency_costs(counts)) - int(narrow.sum()) * size * int(frequency_costs(np.array(size)))
-        bits = costs / BIT + 0.5 * (counts.size - int(narrow.sum())) * float(np.log2(size))
-    for channel in channels[~narrow]:
-        mean = np.abs(channel.astype(np.int64) - np.median(channel)).mean() + 1
-        bits += float(size * np.log2(mean) + 2 * size)
-    return bits
+    costs, distinct, size = 0, 0, residuals[0].size
+    for channel in residuals.reshape(len(residuals), -1):
+        _, counts = symbol_counts(channel)
+        costs += int(counts @ frequency_costs(counts)) - size * int(frequency_costs(np.array(size)))
+        distinct += len(counts) - 1
+    return costs / BIT + 0.5 * distinct * float(np.log2(size))
 
 
 # -- cells that nothing samples ----------------------------------------------------------------------------------------

@@ -13,10 +13,10 @@ from itertools import accumulate, repeat
 
 import numpy as np
 
-from pd4dgs_codec.entropy.bits import entropy_bits
 from pd4dgs_codec.entropy.channels import decode_joined, encode_channels
 from pd4dgs_codec.entropy.fitting import Fitted, histogram, split_bits
 from pd4dgs_codec.entropy.priors import Prior
+from pd4dgs_codec.entropy.tables import entropy_bits
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import Malformed
 

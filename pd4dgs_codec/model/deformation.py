@@ -18,13 +18,11 @@ from torch.nn import functional as F
 
 from pd4dgs_codec import scene
 from pd4dgs_codec.draw.layers import Layers
-from pd4dgs_codec.format.deformation import choose_predictor
-from pd4dgs_codec.format.quantise import quantise
+from pd4dgs_codec.format.deformation import plane_rate_bits
 from pd4dgs_codec.model import plane_terms
 from pd4dgs_codec.model.config import DeformationConfig
 from pd4dgs_codec.model.hexplane import HexPlane
 from pd4dgs_codec.model.networks import MLP
-from pd4dgs_codec.model.rate import gaussian_bits
 
 
 class DeformationField(nn.Module):
@@ -117,13 +115,8 @@ class DeformationField(nn.Module):
 
     def bits(self, step: float) -> float:
         """The sum of R(a) of the coded residuals of the features at a quantisation step: one Gaussian per channel of a
-        plane, as with `--priors gauss`, under the predictor that the codec picks."""
-        total = 0.0
-        for planes in self.planes.arrays():
-            for name, plane in planes.items():
-                _, residual, _ = choose_predictor(quantise(plane, step, name))
-                total += gaussian_bits(residual.reshape(len(residual), -1))
-        return total
+        plane, as with `--priors gauss`."""
+        return plane_rate_bits(self.planes.arrays(), step)
 
     # -- residuals -----------------------------------------------------------------------------------------------------
 

@@ -12,7 +12,7 @@ With d = |a - mu|, z = d/sigma, h = Q/(2 sigma), u = (d - Q/2)/sigma, v = (d + Q
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -302,14 +302,3 @@ def channel_moments(x: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation per column of x [n, c]; gradient through both; n >= 1."""
     mu = x.mean(0)
     return mu, ((x - mu).square().mean(0) + MIN_VARIANCE).sqrt()
-
-
-def gaussian_bits(channels: Iterable[Array]) -> float:
-    """The sum of R(a) over integer channels, as the trainer computes it in float64: priors are a channel's moments."""
-    total = 0.0
-    for channel in channels:
-        if channel.size:
-            mu, sigma = channel_moments(torch.from_numpy(channel.astype(np.float64)))
-            symbols, counts = (torch.from_numpy(x) for x in np.unique(channel, return_counts=True))
-            total += float((rate_bits(symbols.double(), mu, sigma, 1.0) * counts).sum())
-    return total

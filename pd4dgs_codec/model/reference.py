@@ -118,10 +118,7 @@ def rasterize(
     pixels = means.new_zeros((1, n, 2)).index_copy(1, index, means2d[None, seen].detach())
     pixels.requires_grad_(torch.is_grad_enabled() and means2d.requires_grad)
     moved = means2d[seen] + (pixels - pixels.detach())[0, index]  # 0, for the gradient by pixels
-    if torch.is_grad_enabled():
-        image, alpha = composite(moved, conics, opacities[seen], colors[seen], width, height)
-    else:
-        image, alpha = composite_blocks(moved, radii[seen], conics, opacities[seen], colors[seen], width, height)
+    image, alpha = composite_blocks(moved, radii[seen], conics, opacities[seen], colors[seen], width, height)
     image = image + (1.0 - alpha) * torch.from_numpy(background).to(means)
     radii = means.new_zeros((1, n, 2)).index_copy(1, index, radii[None, seen]).to(torch.int32)
     return image, alpha[..., 0], {"means2d": pixels, "radii": radii}

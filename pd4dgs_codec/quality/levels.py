@@ -1,6 +1,6 @@
 """The levels of a file ready to render, each decoded from the bytes that a receiver would hold at that level.
 
-`draw.player` renders a decoded level without torch; the torch model renders a checkpoint, or a level on another device.
+`draw.player` renders a decoded level without torch; the torch model renders a checkpoint.
 """
 
 from __future__ import annotations
@@ -50,20 +50,14 @@ class Level:
         return image, 1e3 * (perf_counter() - start)
 
 
-def level_of(scene: Scene, device: str = "cpu") -> Level:
+def level_of(scene: Scene) -> Level:
     """The highest level of a decoded scene."""
-    active = int((scene.mask[-1] > 0).sum())
-    if device == "cpu":
-        return Level(scene.level, Player(scene), active)
-    from pd4dgs_codec.model.convert import from_scene
-
-    return Level(scene.level, from_scene(scene).to(device), active)
+    return Level(scene.level, Player(scene), int((scene.mask[-1] > 0).sum()))
 
 
 def load_levels(
     file: str | Path | bytes,
     max_layer: int | None = None,
-    device: str = "cpu",
     *,
     max_bytes: int | None = None,
     last_only: bool = False,
@@ -78,9 +72,9 @@ def load_levels(
     """
     data = file if isinstance(file, bytes) else _read(file)
     if isinstance(file, bytes) or data.startswith(SIGNATURE[:4]):
-        levels = _of_bytes(data, max_layer, device, max_bytes, last_only)
+        levels = _of_bytes(data, max_layer, max_bytes, last_only)
     elif max_bytes is None:
-        levels = _of_checkpoint(file, max_layer, device)[-1 if last_only else 0 :]
+        levels = _of_checkpoint(file, max_layer)[-1 if last_only else 0 :]
     else:
         raise DataError(f"{file}: a checkpoint has no slices; expected a .pd4 file")
     if background is not None:
@@ -96,7 +90,7 @@ def _read(file: str | Path) -> bytes:
         raise DataError(f"{file}: cannot be read: {error.strerror}") from None
 
 
-def _of_bytes(data: bytes, max_layer: int | None, device: str, max_bytes: int | None, last_only: bool) -> list[Level]:
+def _of_bytes(data: bytes, max_layer: int | None, max_bytes: int | None, last_only: bool) -> list[Level]:
     levels, ends = [], dict[int, int]()
     for row in info(data)["layers"]:
         within = [part["end"] for part in row["slices"] if max_bytes is None or part["end"] <= max_bytes]
@@ -108,17 +102,16 @@ def _of_bytes(data: bytes, max_layer: int | None, device: str, max_bytes: int | 
         start = perf_counter()
         scene = decode(data[: ends[layer]], max_layer=layer, max_bytes=ends[layer])
         seconds = perf_counter() - start
-        levels.append(replace(level_of(scene, device), cumulative_bytes=ends[layer], decode_seconds=seconds))
+        levels.append(replace(level_of(scene), cumulative_bytes=ends[layer], decode_seconds=seconds))
     return levels
 
 
-def _of_checkpoint(path: str | Path, max_layer: int | None, device: str) -> list[Level]:
+def _of_checkpoint(path: str | Path, max_layer: int | None) -> list[Level]:
     import torch
 
     from pd4dgs_codec.model import checkpoint
 
     model, _ = checkpoint.load(path)
-    model = model.to(device)
     with torch.no_grad():
         return [
             Level(level, model, int((model.masks(level) > MASK_THRESHOLD).sum()))

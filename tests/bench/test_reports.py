@@ -111,16 +111,6 @@ def random_view(n: int = 150) -> runtime.View:
     return {**tensors, "camera": Camera(viewmat, K, 50, 35), "background": (0.2, 0.5, 0.9), "near_plane": 0.1}
 
 
-def test_the_reference_in_blocks_is_the_dense_one():
-    from pd4dgs_codec.model.picture import rasterization
-
-    view = random_view()
-    dense = rasterization(**view, backend="reference")[0]
-    with torch.no_grad():
-        blocks = rasterization(**view, backend="reference")[0]
-    np.testing.assert_allclose(blocks, dense, rtol=0, atol=1e-12)
-
-
 def test_rasterisers_are_compared_with_the_reference():
     points = {p["name"]: p for p in runtime.render_points([random_view()], tuple(runtime.BACKENDS), 3)}
     assert points[runtime.ORACLE]["rmse"] == 0

@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pd4dgs_codec.entropy import fit_kernels, fitting
-from pd4dgs_codec.entropy.bits import BIT, entropy_bits
 from pd4dgs_codec.entropy.channels import encode_channels
 from pd4dgs_codec.entropy.fitting import fit_best, histogram, pool
+from pd4dgs_codec.entropy.tables import BIT, entropy_bits
 
 
 def _channel(seed: int) -> np.ndarray:
