@@ -23,11 +23,11 @@ def test_a_file_that_appears_meanwhile_is_not_replaced(tmp_path):
 
 def test_files_appear_together_or_not_at_all(tmp_path):
     names = [str(tmp_path / "out" / f"{i}.png") for i in range(3)]
-    with pytest.raises(RuntimeError), io.whole_files(names[0], names, False) as temporaries:
+    with pytest.raises(RuntimeError), io.whole_files(names, False) as temporaries:
         temporaries[0].write_bytes(b"1")
         raise RuntimeError("in the middle")
     assert list(tmp_path.iterdir()) == []
-    with io.whole_files(names[0], names, False) as temporaries:
+    with io.whole_files(names, False) as temporaries:
         for temporary in temporaries:
             temporary.write_bytes(b"1")
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["0.png", "1.png", "2.png"]
@@ -66,7 +66,7 @@ def test_an_output_keeps_its_mode(tmp_path, mode):
         open(name, "w").close()
         os.chmod(name, mode)
     io.write_bytes(names[0], b"new", overwrite=True)
-    with io.whole_files(names[0], names, True) as temporaries:
+    with io.whole_files(names, True) as temporaries:
         for temporary in temporaries:
             temporary.write_bytes(b"new")
     assert [os.stat(name).st_mode & 0o777 for name in names] == [mode] * 2

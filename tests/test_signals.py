@@ -71,7 +71,7 @@ def test_a_signal_at_any_call_leaves_no_folder(tmp_path, number):
 def test_files_that_belong_together_are_moved_together(tmp_path, monkeypatch):
     replace, names = os.replace, [str(tmp_path / "out" / f"{i}.png") for i in range(3)]
     monkeypatch.setattr(os, "replace", lambda *paths: (signal.raise_signal(signal.SIGTERM), replace(*paths)))
-    with pytest.raises(KeyboardInterrupt), interruptible(), io.whole_files(names[0], names, False) as temporaries:
+    with pytest.raises(KeyboardInterrupt), interruptible(), io.whole_files(names, False) as temporaries:
         for temporary in temporaries:
             temporary.write_bytes(b"1")
     assert len(list((tmp_path / "out").iterdir())) == 3 and os.listdir(tmp_path) == ["out"]

@@ -68,23 +68,16 @@ class Line:
     options: dict[str, Any] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
-class Fault:
-    """A broken line. message: found and expected."""
-
-    number: int
-    message: str
-
-
 class Manifest:
-    """The valid and the broken lines of a manifest. Raises OSError or DataError if it cannot be read or is empty.
+    """The valid lines of a manifest, and its broken ones as (number, found and expected). Raises
+    OSError or DataError if it cannot be read or is empty.
 
     check: raises DataError for options that the command does not take.
     """
 
     def __init__(self, place: str, op: Op, check: Callable[[dict[str, Any]], None]):
         self.lines: list[Line] = []
-        self.faults: list[Fault] = []
+        self.faults: list[tuple[int, str]] = []
         first: dict[str, int] = {}
         with store.opened(place) as stream:
             for number, raw in enumerate(stream, 1):
@@ -97,9 +90,9 @@ class Manifest:
                         raise DataError(f"{what}; expected one of its own")
                     self.lines.append(line)
                 except DataError as error:
-                    self.faults.append(Fault(number, str(error)))
+                    self.faults.append((number, str(error)))
                 except Exception as error:  # what no check foresaw is this line's alone
-                    self.faults.append(Fault(number, one_line(f"{type(error).__name__}: {error}")))
+                    self.faults.append((number, one_line(f"{type(error).__name__}: {error}")))
         if not (self.lines or self.faults):
             raise DataError(f"{place}: holds no lines, expected a JSON object for each scene")
 

@@ -70,28 +70,6 @@ class Engine:
         """Ends all jobs."""
 
 
-@dataclass
-class Summary:
-    """The result of a batch. cpu, work: as in Outcome, over all tries. peak: memory of the largest worker, bytes."""
-
-    done: int = 0
-    already: int = 0
-    retried: int = 0
-    bytes: int = 0
-    seconds: float = 0.0
-    cpu: float = 0.0
-    work: float = 0.0
-    peak: int = 0
-    failures: list[dict[str, Any]] = field(default_factory=list)
-
-    def json(self) -> dict[str, Any]:
-        """As JSON values."""
-        counts = {"done": self.done, "already": self.already, "failed": len(self.failures), "retried": self.retried}
-        times = {"seconds": self.seconds, "cpu_seconds": self.cpu, "work_cpu_seconds": self.work}
-        times = {name: round(seconds, 3) for name, seconds in times.items()}
-        return counts | {"bytes": self.bytes, **times, "peak_memory": self.peak, "failures": self.failures}
-
-
 def run(
     jobs: Iterable[Job],
     command: Command,
@@ -99,30 +77,35 @@ def run(
     settings: Settings,
     retries: int,
     report: Callable[[Job, Outcome, int], None],
-) -> Summary:
+) -> dict[str, Any]:
     """Runs all jobs on an engine: "local", "ray" or "slurm".
 
     A job that fails is tried again `retries` times behind all others, unless that would end the same. report: called
     with each job that is over, its last outcome and its tries. Raises DataError if the engine cannot run.
+
+    Returns the figures of the command's JSON: counts of lines, and over all tries bytes, CPU seconds (work: of the
+    commands alone) and the memory of the largest worker, bytes.
     """
-    summary, tries, begun = Summary(), Counter[int](), time.monotonic()
+    summary: dict[str, Any] = dict.fromkeys(("done", "already", "retried", "bytes", "peak_memory"), 0)
+    summary |= dict.fromkeys(("seconds", "cpu_seconds", "work_cpu_seconds"), 0.0)
+    tries, begun = Counter[int](), time.monotonic()
     waiting, engine = deque(jobs), ENGINES[on](partial(run_job, command=command), settings)
     with contextlib.closing(engine):
         for job, outcome in _outcomes(engine, waiting):
-            summary.cpu += outcome.cpu
-            summary.work += outcome.work
-            summary.bytes += outcome.bytes
-            summary.peak = max(summary.peak, outcome.peak)
+            summary["cpu_seconds"] += outcome.cpu
+            summary["work_cpu_seconds"] += outcome.work
+            summary["bytes"] += outcome.bytes
+            summary["peak_memory"] = max(summary["peak_memory"], outcome.peak)
             tries[job.line.number] += 1
             if outcome.state == FAILED and not outcome.final and tries[job.line.number] <= retries:
-                summary.retried += 1
+                summary["retried"] += 1
                 waiting.append(job)
                 continue
-            summary.done += outcome.state == DONE
-            summary.already += outcome.state == ALREADY
+            if outcome.state in (DONE, ALREADY):
+                summary[outcome.state] += 1
             report(job, outcome, tries[job.line.number])
-    summary.seconds = time.monotonic() - begun
-    return summary
+    summary["seconds"] = time.monotonic() - begun
+    return {key: round(value, 3) if isinstance(value, float) else value for key, value in summary.items()}
 
 
 def _outcomes(engine: Engine, waiting: deque[Job]) -> Iterator[tuple[Job, Outcome]]:

@@ -156,8 +156,8 @@ def _batch(args: argparse.Namespace, console: Console) -> int:
             step()
 
         summary = run_jobs(jobs, command, args.on, settings, args.retries, told)
-    summary.failures = failures.rows
-    result = {"output": args.output, "op": args.op, "on": args.on, **summary.json()}
+    found = {"failed": len(failures.rows), "failures": failures.rows}
+    result = {"output": args.output, "op": args.op, "on": args.on, **summary, **found}
     console.result(result, _text(result))
     return FAILED if failures.rows else OK
 
@@ -168,8 +168,8 @@ class _Failures:
     def __init__(self, args: argparse.Namespace, manifest: Manifest):
         self.prog, self.place, self.folder = "pd4dgs-batch", args.input, Path(args.logs)
         self.rows: list[dict[str, Any]] = []
-        for fault in manifest.faults:
-            self._add(fault.number, None, fault.message)
+        for number, message in manifest.faults:
+            self._add(number, None, message)
 
     def see(self, job: Job, outcome: Outcome, tries: int) -> None:
         """Records a job that has ended."""

@@ -27,7 +27,9 @@ examples:
   pd4dgs-decode http://127.0.0.1:8000/scene.pd4 --max-layer 1 -o prefix.npz
   pd4dgs-decode scene.pd4 --max-layer 0 -o base.npz
   pd4dgs-decode scene.pd4 --max-bytes 100k -o early.npz
-  head -c 300000 scene.pd4 | pd4dgs-decode - --allow-partial -o prefix.pt"""
+  head -c 300000 scene.pd4 | pd4dgs-decode - --allow-partial -o prefix.pt
+
+exit code 3: cut input, decoded as far as possible (--allow-partial)"""
 
 
 def parser() -> options.Parser:

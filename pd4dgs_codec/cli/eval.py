@@ -34,7 +34,7 @@ def parser() -> options.Parser:
     p.add_argument("source", metavar="SOURCE", help="dataset to compare with, see below")
     options.add_max_layer(p, "leave out the layers above this one")
     options.add_reading(p)
-    what = "dycheck: masked metrics; 3dgs: those of 3D Gaussian Splatting, see above (default: dycheck)"
+    what = "dycheck: masked metrics; 3dgs: those of 3D Gaussian Splatting, see below (default: dycheck)"
     p.add_argument("--protocol", choices=("dycheck", "3dgs"), default="dycheck", help=what)
     p.add_argument("--max-bytes", type=options.size, metavar="SIZE", help="measure the first SIZE bytes, such as 50k")
     options.add_background(p, "the file's")

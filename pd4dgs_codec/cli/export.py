@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
 DETAILS = f"""\
 View-dependent colours become spherical harmonics, view-dependent opacities and sizes become means over many viewpoints;
-both are then refined against renderings of the scene. If colours alone are view-dependent (pd4dgs-info --json), all but
-the harmonics is exact, and refinement is off by default. The viewpoints are the training cameras of --data, or else lie
-around the point that the file's camera looks at. --compare measures the loss of quality.
+both are then refined against renderings of the scene. Where only colours are view-dependent (pd4dgs-info --json),
+everything but the harmonics is exact, and refinement is off by default. The viewpoints are the training cameras of
+--data, or else lie around the point that the file's camera looks at. --compare measures the loss of quality.
 
   ply       one PLY file in the layout of 3D Gaussian splatting
   ply-seq   a folder of such files, one per frame
@@ -210,7 +210,7 @@ def _frames(
 def _write_folder(args: argparse.Namespace, count: int, frames: Iterator[bytes]) -> dict[str, Any]:
     folder, most, total = Path(args.output), 0, 0
     names = [str(folder / f"{i:05d}.ply") for i in range(count)]
-    with whole_files(names[0], names, args.overwrite) as temporaries:
+    with whole_files(names, args.overwrite) as temporaries:
         for temporary, data in zip(temporaries, frames, strict=True):
             temporary.write_bytes(data)
             most, total = max(most, int(data[: data.index(b"\nproperty")].split()[-1])), total + len(data)

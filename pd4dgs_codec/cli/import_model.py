@@ -13,8 +13,7 @@ FOLDER is a Scaffold-GS checkpoint: the folder of the run, or its point_cloud/it
 either opacity_mlp.pt, cov_mlp.pt and color_mlp.pt or checkpoints.pth.
 It becomes layer 0, a static scene, without loss; encoding quantises it as usual.
 Models with features that layer 0 lacks (distances as inputs, a feature bank) are refused with the feature's name.
-Runs of 4DGaussians and of Deformable-3DGS have no equal among our models: pd4dgs-train teacher:FOLDER learns from
-their pictures.
+Runs of 4DGaussians and Deformable-3DGS cannot be imported; pd4dgs-train teacher:FOLDER learns from their pictures.
 No code in the files is run.
 
 examples:

@@ -71,10 +71,10 @@ def _input(args: argparse.Namespace, console: Console) -> tuple[bytes, int]:
     if not is_url(args.input):
         data = read_bytes(args.input)
         return data, len(data)
-    from pd4dgs_codec.web.transfer import Transfer, fetch, fetch_header
+    from pd4dgs_codec.web.transfer import Transfer, fetch
 
     with closing(Transfer(args.input)) as transfer:
-        data = fetch(transfer) if args.check or args.bytes or args.hashes else fetch_header(transfer)
+        data = fetch(transfer, max_bytes=None if args.check or args.bytes or args.hashes else 0)
     console.detail(f"fetched {len(transfer.data):,} bytes in {transfer.requests} requests")
     return data, len(data) if transfer.total is None else transfer.total
 

@@ -15,9 +15,7 @@ from pd4dgs_codec.cli.common import UsageError, tell
 
 T = TypeVar("T")
 
-EXIT_CODES = (
-    "exit codes: 0 done, 1 bad data or I/O, 2 wrong usage, 3 cut input decoded as far as possible (--allow-partial)"
-)
+EXIT_CODES = "exit codes: 0 done, 1 bad data or I/O, 2 wrong usage"
 #: Stands for the list of sources in the details of a command; `Parser.format_help` fills it in.
 SOURCES = "<the list of sources>"
 SCENES = """\

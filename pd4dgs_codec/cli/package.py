@@ -96,7 +96,7 @@ def _library(args: argparse.Namespace, console: Console) -> int:
 def _write(args: argparse.Namespace, files: dict[str, bytes]) -> list[dict[str, Any]]:
     """Writes all files or none; returns their names and sizes."""
     names = [str(Path(args.output) / name) for name in files]
-    with whole_files(names[0], names, args.overwrite) as temporaries:
+    with whole_files(names, args.overwrite) as temporaries:
         for temporary, content in zip(temporaries, files.values(), strict=True):
             temporary.write_bytes(content)
     return [{"name": name, "bytes": len(content)} for name, content in files.items()]

@@ -12,7 +12,7 @@ from pd4dgs_codec.cli.serve import add_link, set_by_signals
 from pd4dgs_codec.io import check_output, temporary_folder, write_bytes
 
 DETAILS = """\
-SCENE is a .pd4 file, a checkpoint (which is encoded fast first) or the URL of a .pd4 file.
+SCENE is a .pd4 file, a checkpoint, which is encoded first, or the URL of a .pd4 file.
 The first line on stdout is the address of the page, printed when it can be opened. The default browser opens it.
 Ctrl-C or SIGTERM ends the command. A server of another site must allow cross-origin requests, as pd4dgs-serve does.
 

@@ -8,7 +8,6 @@ order.
 
 from __future__ import annotations
 
-import re
 import struct
 from collections import Counter
 from collections.abc import Iterator
@@ -22,7 +21,7 @@ import numpy as np
 
 from pd4dgs_codec.data.cameras import Lens, UnreadView, checked_rotation, world_to_camera
 from pd4dgs_codec.data.dataset import COLMAP
-from pd4dgs_codec.data.files import LARGEST, Color, inside, number, read_file, whole_number
+from pd4dgs_codec.data.files import LARGEST, Color, inside, last_numbers, number, read_file, whole_number
 from pd4dgs_codec.data.posed import LARGEST_TIME, held_out, posed_dataset
 from pd4dgs_codec.data.videos import synchronised_dataset, video_size
 from pd4dgs_codec.data.view import Dataset
@@ -125,8 +124,7 @@ def _times(folder: Path, names: list[str]) -> list[float]:
     """The time of each picture: from times.txt, else the last number in its name, else its place."""
     path = folder / "times.txt"
     if not path.is_file():
-        numbers = [re.findall(r"\d{1,15}", Path(name).stem) for name in names]
-        return [float(found[-1]) if all(numbers) else float(i) for i, found in enumerate(numbers)]
+        return [float(n) for n in last_numbers(map(Path, names)) or range(len(names))]
     known: dict[str, float] = {}
     for i, line in enumerate(map(str.strip, read_file(path).decode("utf-8", "replace").splitlines()), 1):
         name, _, text = line.rpartition(" ")

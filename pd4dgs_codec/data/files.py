@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import re
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextvars import ContextVar
@@ -159,6 +160,12 @@ def inside(folder: Path, name: str) -> Path:
         if folder.resolve() in path.resolve().parents:
             return path
     raise DataError(f"{folder}: {one_line(repr(name), 120)} is not the name of a file in this folder")
+
+
+def last_numbers(paths: Iterable[Path]) -> list[int] | None:
+    """The last number in each name without its suffix, None if a name has none."""
+    found = [re.findall(r"\d{1,15}", path.stem) for path in paths]
+    return [int(numbers[-1]) for numbers in found] if all(found) else None
 
 
 def find_image(folder: Path, name: str) -> Path:

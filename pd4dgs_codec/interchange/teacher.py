@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.data.dataset import color, load
-from pd4dgs_codec.data.files import read_file, split_options
+from pd4dgs_codec.data.files import last_numbers, read_file, split_options
 from pd4dgs_codec.data.posed import depth_range, held_out, points_box
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError, one_line
@@ -228,12 +228,8 @@ def _folder(folder: Path, fps: float) -> Teacher:
     paths = max(([p for p in folder.iterdir() if p.suffix.lower() == suffix] for suffix in FRAME_SUFFIXES), key=len)
     if not paths:
         raise DataError(f"{folder}: holds no file that ends in {' or '.join(FRAME_SUFFIXES)}, expected one per frame")
-
-    def place(path: Path) -> tuple[int, str]:
-        digits = re.findall(r"\d{1,18}", path.stem)
-        return int(digits[-1]) if digits else 0, path.name
-
-    paths.sort(key=place)
+    paths.sort()
+    paths = [path for _, path in sorted(zip(last_numbers(paths) or range(len(paths)), paths, strict=True))]
     times = tuple(i / max(len(paths) - 1, 1) for i in range(len(paths)))
 
     frame = lru_cache(maxsize=2)(read_splats)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -10,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pd4dgs_codec.data.files import check_downscale, image_info, read_image, shrink_image
+from pd4dgs_codec.data.files import check_downscale, image_info, last_numbers, read_image, shrink_image
 from pd4dgs_codec.data.videos import open_video
 from pd4dgs_codec.errors import DataError
 
@@ -92,8 +91,7 @@ class FrameFolder:
         files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in PICTURES]
         if not files:
             raise DataError(f"{path}: found no picture, expected frames as {', '.join(sorted(PICTURES))}")
-        found = [re.findall(r"\d{1,15}", file.stem) for file in files]
-        numbered = {int(each[-1]) if all(found) else i: files[i] for i, each in enumerate(found)}
+        numbered = dict(zip(last_numbers(files) or range(len(files)), files, strict=True))
         if len(numbered) < len(files):
             raise DataError(f"{path}: two pictures have the same number, expected one per frame")
         self.places = sorted(numbered)

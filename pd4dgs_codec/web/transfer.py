@@ -314,14 +314,9 @@ def check_end(end: int) -> None:
         raise LimitExceeded(f"ends at byte {end:,}, limit {MOST_BYTES:,} without a budget of bytes")
 
 
-def fetch_header(transfer: Transfer) -> bytes:
-    """Preamble and header; fewer bytes if the remote file ends within them. Raises as `fetch` does."""
-    return fetch(transfer, max_bytes=0)
-
-
 def fetch(transfer: Transfer, max_layer: int | None = None, max_bytes: int | None = None) -> bytes:
-    """The file, or its prefix of layers up to max_layer, or of slices within max_bytes; fewer bytes if the remote file
-    ends early.
+    """The file, or its prefix of layers up to max_layer, or of slices within max_bytes, the header in any case; fewer
+    bytes if the remote file ends early.
 
     A prefix takes two requests for exactly its bytes, the whole file one. One byte after the last chunk is fetched, so
     that the decoder sees trailing data. Raises as Transfer.read does, and DecodeError for an invalid header, and for a

@@ -10,7 +10,7 @@ import pytest
 from standin import upper
 
 from pd4dgs_codec.batch.job import OPS, Job, Manifest, Outcome
-from pd4dgs_codec.batch.run import Settings, Summary, run
+from pd4dgs_codec.batch.run import Settings, run
 
 
 class Library:
@@ -36,7 +36,7 @@ class Library:
 
     def run(
         self, on: str = "local", root: str | None = None, retries: int = 2, overwrite: bool = False, **settings: Any
-    ) -> Summary:
+    ) -> dict[str, Any]:
         """One batch over the lines so far; `outcomes` has the last outcome and the tries by output."""
         more = {"version": settings.pop("version")} if "version" in settings else {}
         jobs = (Job(line, "encode", root or str(self.out), 1, overwrite, **more) for line in self.manifest().lines)

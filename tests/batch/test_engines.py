@@ -47,21 +47,21 @@ def temporary(tmp_path, monkeypatch):
 
 
 def test_a_pool_makes_what_one_process_makes(filled):
-    assert filled.run(workers=2).done == 8
+    assert filled.run(workers=2)["done"] == 8
     assert _outputs(filled) == WANTED and filled.made() == sorted(TEXTS.values())
-    assert filled.run(workers=2).already == 8 and len(filled.made()) == 8
+    assert filled.run(workers=2)["already"] == 8 and len(filled.made()) == 8
 
 
 def test_a_job_whose_worker_dies_is_tried_again(filled, temporary):
     filled.add("z.pt", f"die {filled.folder}/flag")
     summary = filled.run(workers=2)
-    assert (summary.done, summary.retried) == (9, 1)
+    assert (summary["done"], summary["retried"]) == (9, 1)
     assert len(filled.made()) == 9
 
 
 def test_a_job_that_always_kills_its_worker_is_named(filled):
     filled.add("z.pt", f"die {filled.folder}/no-such-folder/flag")  # touching that fails: an outcome, not a death
-    assert filled.run(workers=1, retries=1).done == 8
+    assert filled.run(workers=1, retries=1)["done"] == 8
     outcome, tries = filled.outcomes["z.pd4"]
     assert outcome.state == "failed" and tries == 1 and "no-such-folder" in outcome.message
 
@@ -69,14 +69,14 @@ def test_a_job_that_always_kills_its_worker_is_named(filled):
 def test_slow_job_is_ended_and_tried_again(filled, temporary):
     filled.add("z.pt", f"dawdle {filled.folder}/flag")
     summary = filled.run(workers=2, timeout=5.0)
-    assert summary.done == 9 and summary.retried >= 1
+    assert summary["done"] == 9 and summary["retried"] >= 1
 
 
 def test_timed_out_job_names_its_limit(library):
     for n in range(2):
         library.add(f"{n}.pt", f"dawdle {library.folder}/flag{n}")
     summary = library.run(workers=2, timeout=0.5, retries=0)
-    assert summary.done == 0
+    assert summary["done"] == 0
     assert "0.5 s" in library.outcomes["0.pd4"][0].message
 
 
@@ -108,7 +108,7 @@ def test_workers_end_with_a_parent_that_was_killed(filled, tmp_path, temporary):
             pytest.fail("a worker outlived its parent")
     before = len(filled.made())
     summary = filled.run(workers=1)
-    assert summary.already == before and summary.done == 9 - before and len(filled.made()) == 9
+    assert summary["already"] == before and summary["done"] == 9 - before and len(filled.made()) == 9
 
 
 def test_a_worker_whose_parent_is_gone_removes_what_it_was_writing(tmp_path, monkeypatch):
@@ -145,8 +145,8 @@ def test_a_store_that_fails_now_and_then_gets_every_output_once(filled, monkeypa
     for name in ("info", "cat_file", "pipe_file"):
         monkeypatch.setattr(MemoryFileSystem, name, flaky(name))
     summary = filled.run(root="memory://flaky", retries=5)
-    assert summary.done + summary.already == 8 and summary.retried > 0
-    assert filled.run(root="memory://flaky", retries=5).already == 8
+    assert summary["done"] + summary["already"] == 8 and summary["retried"] > 0
+    assert filled.run(root="memory://flaky", retries=5)["already"] == 8
     monkeypatch.undo()
     store = MemoryFileSystem()
     assert {name: store.cat_file(f"/flaky/{name}").decode() for name in WANTED} == WANTED
@@ -159,7 +159,7 @@ def test_slurm_jobs_by_the_local_executor_of_submitit(library):
     library.add("c.pt", f"die {library.folder}/flag")
     folder, slurm = library.folder / "slurm", {"cluster": "local"}
     summary = library.run("slurm", workers=3, retries=1, folder=folder, slurm=slurm)
-    assert summary.done == 2
+    assert summary["done"] == 2
     assert library.outcomes["b.pd4"][0].message.endswith("never")
     assert library.outcomes["c.pd4"][1] == 2
 
@@ -183,9 +183,9 @@ def test_ray_makes_what_one_process_makes_though_a_worker_dies(filled, ray_clust
     filled.add("z.pt", f"die {filled.folder}/flag")
     filled.add("bad.pt", "bad")
     summary = filled.run("ray", workers=2, retries=1, address="local")
-    assert summary.done == 9 and filled.outcomes["z.pd4"][1] == 2 and filled.outcomes["bad.pd4"][1] == 2
+    assert summary["done"] == 9 and filled.outcomes["z.pd4"][1] == 2 and filled.outcomes["bad.pd4"][1] == 2
     assert {name: text for name, text in _outputs(filled).items() if name in WANTED} == WANTED
-    assert filled.run("ray", workers=2, retries=0, address="local").already == 9
+    assert filled.run("ray", workers=2, retries=0, address="local")["already"] == 9
     with pytest.raises(DataError, match="no node .* has the 999 CPU"):
         filled.run("ray", address="local", threads=999)
     assert capsys.readouterr().out == ""  # Ray says of its workers' deaths on stdout
@@ -214,11 +214,11 @@ def test_outputs_on_an_s3_server(filled, monkeypatch):
         s3.mkdir("library")
         s3.pipe_file("library/in/s.pt", b"from s3")
         filled.lines.append(json.dumps({"source": "s3://library/in/s.pt"}))
-        assert filled.run(workers=2, root="s3://library/out").done == 9
+        assert filled.run(workers=2, root="s3://library/out")["done"] == 9
         s3.invalidate_cache()
         found = {n.rpartition("/")[2]: s3.cat_file(n).decode() for n in s3.find("library/out") if n.endswith(".pd4")}
         assert found == WANTED | {"s.pd4": "FROM S3"}
-        assert filled.run(workers=2, root="s3://library/out").already == 9
+        assert filled.run(workers=2, root="s3://library/out")["already"] == 9
         with pytest.raises(DataError, match="nowhere"):
             Root("s3://nowhere/out").check()
     finally:

@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 from pd4dgs_codec.data import synthetic as syn
-from pd4dgs_codec.data.bodies import MOTIONS, THINGS, bodies
+from pd4dgs_codec.data.bodies import MOTIONS, NO_BODY, THINGS, Eye, bodies, enter, place
 from pd4dgs_codec.data.dataset import load
-from pd4dgs_codec.data.raycast import NO_BODY, Eye, enter, place
 
 LENS, SWEEPS = syn.ROOM.lens, syn.PATHS["sweeps"]
 
