@@ -105,6 +105,17 @@ class DeformationField(nn.Module):
         """The linear layer whose output is the residual `head`; None if the field lacks it."""
         return cast(MLP, self.heads[head]).layers[-1] if head in self.heads else None
 
+    def confine(self, instants: int | None) -> None:
+        """Makes the features linear in time between so many evenly spaced instants, by least squares; None: nothing."""
+        if instants is not None:
+            self.planes.confine(self.planes.grid.data, instants)
+
+    def spread_gradients(self, instants: int | None) -> None:
+        """Makes the gradients of the features those of confined ones, each instant's spread over the cells between its
+        neighbours; None: nothing."""
+        if instants is not None and self.planes.grid.grad is not None:
+            self.planes.spread(self.planes.grid.grad, instants)
+
     def regularisers(self, features: Sequence[Tensor]) -> dict[str, Tensor]:
         """The regularisers, unweighted, by name. features: those of the field, or others of their shapes."""
         return plane_terms.regularisers(features[0], self.planes.layout)

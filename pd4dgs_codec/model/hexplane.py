@@ -8,6 +8,7 @@ scales are concatenated. A multi-resolution factor scales x, y, z and never t. O
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -137,6 +138,24 @@ class HexPlane(nn.Module):
             return features
         return sample_reference(round_straight_through(self.grid, step), self.layout, box, points, t)
 
+    def confine(self, cells: Tensor, instants: int) -> None:
+        """Replaces the time planes in `cells`, in the shape of grid, by the nearest ones that are linear between
+        `instants` evenly spaced instants."""
+        self._mix_times(cells, instants, 0)
+
+    def spread(self, cells: Tensor, instants: int) -> None:
+        """Replaces gradients by time planes, in the shape of grid, by the sums at those instants, spread as a change of
+        their values would be."""
+        self._mix_times(cells, instants, 1)
+
+    @torch.no_grad()
+    def _mix_times(self, cells: Tensor, instants: int, which: int) -> None:
+        """Multiplies the time planes along time by that matrix of `_mixtures`; planes without more cells stay."""
+        for scale in self.layout.views(cells):
+            for plane in (scale[name] for name, _, b in PLANES if b == TIME_AXIS and len(scale[name]) > instants):
+                mixture = _mixtures(len(plane), instants)[which].to(plane)
+                plane.copy_((mixture @ plane.flatten(1)).view_as(plane))
+
     @torch.no_grad()
     def arrays(self) -> Planes:
         """Per scale, plane name -> float32 [C, reso[b], reso[a]], as `scene.Deformation` holds them."""
@@ -152,6 +171,16 @@ class HexPlane(nn.Module):
             for name, view in views.items():
                 view.copy_(torch.from_numpy(np.array(scale[name], np.float32)).permute(1, 2, 0))
         return found
+
+
+@lru_cache
+def _mixtures(cells: int, instants: int) -> tuple[Tensor, Tensor]:
+    """Two matrices [cells, cells], where H [cells, instants] interpolates evenly spaced values linearly: H H^+, and
+    H H^T with rows that sum to 1 on average."""
+    place = torch.linspace(0, instants - 1, cells, dtype=torch.float64)
+    hats = (1 - (place[:, None] - torch.arange(instants)).abs()).clamp(min=0)
+    products = hats @ hats.T
+    return hats @ torch.linalg.pinv(hats), products / products.sum(1).mean()
 
 
 def _start(shape: Sequence[int], generator: torch.Generator | None) -> Tensor:

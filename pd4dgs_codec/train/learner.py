@@ -21,6 +21,7 @@ from pd4dgs_codec.train.losses import ModelLoss
 from pd4dgs_codec.train.phases import Phase
 from pd4dgs_codec.train.phases.grow import Grow
 from pd4dgs_codec.train.phases.levels import SelectLevels
+from pd4dgs_codec.train.phases.opening import OpenTime, few_instants
 from pd4dgs_codec.train.phases.prefixes import Prefixes
 from pd4dgs_codec.train.phases.prune import Prune
 from pd4dgs_codec.train.phases.quantisation import FitQuantisation
@@ -52,7 +53,13 @@ class Learner(TrainState):
         self.model_loss = ModelLoss(config, self.generator)
         self.levels, self.prefixes, self.grow = SelectLevels(self.practise), Prefixes(), Grow()
         pruning = (Prune(turn) for turn in range(PRUNING_ROUNDS))
-        self.before_step: list[Phase] = [self.levels, FitQuantisation(), *pruning, self.prefixes]
+        self.before_step: list[Phase] = [
+            OpenTime(self.practise),
+            self.levels,
+            FitQuantisation(),
+            *pruning,
+            self.prefixes,
+        ]
 
     def step(self) -> dict[str, Any]:
         """One training step; returns its log record with every term unweighted."""
@@ -71,12 +78,14 @@ class Learner(TrainState):
         return record
 
     def practise(self, level: int, steps: int) -> None:
-        """Trains `level` for so many steps, from all views and all their pixels, where the run stands."""
+        """Trains `level` for so many steps where the run stands, on trial: nothing is grown."""
         self.practising = True
-        for _ in range(steps):
-            self._learn([(next_view(self, level), level) for _ in range(self.config.views_per_step)], {}, None)
-            self.optimiser.zero_grad()
-        self.practising = False
+        try:
+            for _ in range(steps):
+                self._learn([(next_view(self, level), level) for _ in range(self.config.views_per_step)], {}, None)
+                self.optimiser.zero_grad()
+        finally:
+            self.practising = False
 
     def _apply(self, phases: Sequence[Phase], record: dict[str, Any]) -> None:
         for phase in phases:
@@ -100,9 +109,16 @@ class Learner(TrainState):
         record["gradient_norm"] = norm = self.optimiser.clip_gradients(self.config.max_gradient_norm)
         if not math.isfinite(norm):
             return False
-        self.grow.observe(self, pictures)
+        if not self.practising:
+            self.grow.observe(self, pictures)
+        fields, instants = self.model.deformations.values(), few_instants(self)
+        for field in fields:
+            field.spread_gradients(instants)
         self.optimiser.step(self.schedule.progress(self.position), self.schedule.iterations)
-        self._apply([self.grow], record)
+        for field in fields:
+            field.confine(instants)
+        if not self.practising:
+            self._apply([self.grow], record)
         return True
 
     def _pictures(

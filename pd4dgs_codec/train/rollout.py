@@ -1,9 +1,10 @@
 """Which levels and views a step trains, and which pixels of a view teach a level.
 
 With a key instant t*, level 0 is the scene at t*, to which the others add F(x, t) - F(x, t*). The levels then agree:
-most steps train the highest level, from all views. The first steps, in which the deformation is still, see views near
-t* alone: in views of all times what moves would fade. Later a share of the steps trains level 0: near t*, and from all
-views in the pixels that motion leaves as they are, so that what stands still is complete without it.
+most steps train the highest level, from views whose times spread from t* (`phases.opening`). The first steps, in which
+the deformation is still, see views near t* alone: in views of all times what moves would fade. Later a share of the
+steps trains level 0: near t*, and from all views in the pixels that motion leaves as they are, so that what stands
+still is complete without it.
 
 The rollouts of the paper have no key instant: they teach level 0 the mean over time.
 """
@@ -17,6 +18,7 @@ import torch
 
 from pd4dgs_codec.model.picture import render
 from pd4dgs_codec.train.phases.levels import held_back_views
+from pd4dgs_codec.train.phases.opening import within
 from pd4dgs_codec.train.schedule import CAPACITY_WEIGHTED, LOWEST, TOP, UNIFORM, Probabilities, rollout_probabilities
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
@@ -52,18 +54,29 @@ def draw_levels(state: TrainState) -> tuple[tuple[int, ...], Probabilities]:
 
 def next_view(state: TrainState, level: int) -> int:
     """The training view of the next picture at `level`: each in turn, in random order; views near the key instant at
-    random, but not in practice."""
-    if level == 0 and state.key is not None and not state.practising:
-        still = state.position < state.schedule.coarse_end
-        if still or float(torch.rand((), generator=state.generator)) < NEAR_ODDS:
-            held_back = _held_back(state)
-            near = near_key(state, [index for index in range(len(state.views)) if index not in held_back])
-            return near[int(torch.randint(len(near), (), generator=state.generator))]
+    random."""
+    near = [] if state.key is None else _near(state, level)
+    if near:
+        return near[int(torch.randint(len(near), (), generator=state.generator))]
     if not state.order:
         held_back = _held_back(state)
         drawn = torch.randperm(len(state.views), generator=state.generator).tolist()
         state.order = [index for index in drawn if index not in held_back]
     return state.order.pop()
+
+
+def _near(state: TrainState, level: int) -> list[int]:
+    """The views near the key instant of which the next picture is one; none if it may be of any view."""
+    held_back = _held_back(state)
+    among = [index for index in range(len(state.views)) if index not in held_back]
+    if level > 0:
+        views = within(state, among)
+        return [] if len(views) == len(among) or len(views) < NEAR_VIEWS else views
+    if state.practising:
+        return []
+    still = state.position < state.schedule.coarse_end
+    drawn = still or float(torch.rand((), generator=state.generator)) < NEAR_ODDS
+    return near_key(state, among) if drawn else []
 
 
 def _held_back(state: TrainState) -> set[int]:

@@ -16,6 +16,8 @@ LOWEST: Probabilities = (1.0, 0.0, 0.0)
 RHO_DECAY = 0.95
 #: Share of a run in which level 0 alone is trained.
 COARSE_SHARE = 1 / 10
+#: Share of a run with a key instant after which views of all times teach motion, see `phases.opening`.
+OPENING_SHARE = 1 / 2
 #: Rounds in which anchors of little use are pruned; each anchor can be pruned in one of them.
 PRUNING_ROUNDS = 4
 
@@ -53,6 +55,10 @@ class Schedule:
     def progress(self, iteration: int) -> float:
         """The share of the run, 0..1, that lies before `iteration`; 0 while N is not known."""
         return iteration / self.iterations if self.iterations else 0.0
+
+    def opening(self, iteration: int) -> float:
+        """Progress of the opening of time, 0..1, from the end of the coarse phase."""
+        return min(max((self.progress(iteration) - COARSE_SHARE) / (OPENING_SHARE - COARSE_SHARE), 0.0), 1.0)
 
     def separation(self, iteration: int) -> float:
         """Progress of the masks' separation, 0..1, from the start of the mask terms to exact rounding."""

@@ -73,9 +73,11 @@ class TrainingView:
         rows, columns = (alpha.detach().amax(axis).bool() for axis in (1, 0))
         return within_reach(self.rows | rows), within_reach(self.columns | columns)
 
-    def squared_error(self, image: Tensor) -> float:
-        """Of a picture [H, W, 3] of this view, summed over colours and weighted pixels."""
-        return float(((image - self.image).square().sum(-1) * self.weights).sum())
+    def squared_error(self, image: Tensor, where: Tensor | None = None) -> float:
+        """Of a picture [H, W, 3] of this view, summed over colours and weighted pixels; of those in the mask `where`
+        (bool [H, W]) if given."""
+        errors = (image - self.image).square().sum(-1) * self.weights
+        return float((errors if where is None else errors[where]).sum())
 
 
 class TrainingViews:
@@ -122,7 +124,8 @@ class TrainState:
     statistics: [N] or [N, slots] per anchor, what growing is decided by.
     order: training views drawn and not yet used, the next one last.
     rho: moving average of how much the masks of levels 0 and 2 differ.
-    practising: all views and pixels teach level 0, see `phases.levels`.
+    practising: steps are on trial; all views and pixels teach level 0, see `phases.levels`.
+    opened: all views teach motion, see `phases.opening`.
     """
 
     def __init__(
@@ -147,7 +150,7 @@ class TrainState:
         self.statistics = fresh_statistics(len(model.anchor_q), config.slots)
         self.iteration = self.skipped = 0
         self.share: float | None = None
-        self.rho, self.practising = 0.0, False
+        self.rho, self.practising, self.opened = 0.0, False, False
         self.order: list[int] = []
         self._before = -1  #: the position of the step before; a timed run may advance by more than one
 
@@ -245,6 +248,7 @@ class TrainState:
             "share": self.share or 0.0,
             "passed": self._before,
             "rho": self.rho,
+            "opened": self.opened,
             "skipped": self.skipped,
             "order": self.order,
             "optimiser": self.optimiser.state(),
@@ -276,7 +280,7 @@ class TrainState:
         self.schedule = Schedule(int(state["total"]) or None)
         if self.share is not None:
             self.share, self._before = float(state["share"]), int(state["passed"])
-        self.rho = float(state["rho"])
+        self.rho, self.opened = float(state["rho"]), bool(state["opened"])
         self.order = [int(index) for index in state["order"]]
 
 

@@ -1,4 +1,4 @@
-"""The phases of a run: pruning, selection of levels, step classes, whitening and prefixes."""
+"""The phases of a run: opening of time, pruning, selection of levels, step classes, whitening and prefixes."""
 
 import json
 import math
@@ -20,14 +20,15 @@ from pd4dgs_codec.model.networks import EXACT
 from pd4dgs_codec.model.picture import render, render_image
 from pd4dgs_codec.model.sensitivity import rounding_error
 from pd4dgs_codec.scene import ATTRIBUTES, MASK_THRESHOLD, MAX_CLASS
-from pd4dgs_codec.train import learner, losses, phases
+from pd4dgs_codec.train import learner, losses, phases, rollout
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.loop import Trainer
-from pd4dgs_codec.train.phases import levels, prefixes, prune, quantisation
+from pd4dgs_codec.train.phases import levels, opening, prefixes, prune, quantisation
 from pd4dgs_codec.train.phases.levels import held_back_views
 from pd4dgs_codec.train.phases.prefixes import draw_prefix, rank_anchors
 from pd4dgs_codec.train.phases.prune import Prune, added_error, least, round_of
 from pd4dgs_codec.train.phases.quantisation import classes_within, whiten, whitening_transform
+from pd4dgs_codec.train.rollout import next_view
 from pd4dgs_codec.train.schedule import PRUNING_ROUNDS, Schedule
 
 
@@ -55,7 +56,7 @@ def test_a_run_with_all_phases_resumes_bit_for_bit(dataset, tmp_path, monkeypatc
     """Cut on quarter pictures before anchors grow, between two rounds of pruning, and while prefixes are trained."""
     monkeypatch.setattr("pd4dgs_codec.train.state.LARGE", 24)
     monkeypatch.setattr(prefixes, "FEWEST", 20)
-    config = TrainConfig(preset="tiny", iterations=44, prune=0.05, grading=0.5, small_pictures=0.6)
+    config = TrainConfig(preset="tiny", iterations=44, seed=4, prune=0.05, grading=0.5, small_pictures=0.6)
     trainer, schedule, whitenings = Trainer(config, dataset), Schedule(44), []
     monkeypatch.setattr(quantisation, "whiten", lambda *args: whitenings.append(trainer.iteration) or whiten(*args))
     trainer.run(tmp_path / "whole.pt", log=tmp_path / "log.jsonl")
@@ -93,6 +94,55 @@ def test_short_runs_and_few_views_have_no_measured_phases(dataset, tmp_path, mon
     for off in ({"judge": False}, {"max_layer": 0}, {"rollout": "top"}):
         assert not held_back_views(trainer_of(views, **off).learner)
     assert not held_back_views(trainer_of(replace(dataset, train=dataset.train * 8)).learner)
+
+
+# -- opening of time ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("short_runs_have_phases")
+@pytest.mark.parametrize("gain", [opening.MIN_GAIN - 0.01, opening.MIN_GAIN])
+def test_time_opens_from_the_key_instant_where_motion_predicts(dataset, monkeypatch, gain):
+    """The trial itself changes nothing."""
+    learner, tried = trainer_of(dataset, 100, 10).learner, []
+    before = {name: value.clone() for name, value in learner.model.state_dict().items()}
+    monkeypatch.setattr(opening, "MIN_TRIAL", 2)
+    monkeypatch.setattr(opening, "_predicted", lambda state: tried.append(moved(before, state.model)) or gain)
+    (phase,) = [phase for phase in learner.before_step if isinstance(phase, opening.OpenTime)]
+    assert phase.due(learner)
+    phase.apply(learner, {})
+    assert tried == [True]
+    assert not moved(before, learner.model)
+    counts, instants = [], []
+    for learner.iteration in range(10, 100, 5):
+        window = opening.within(learner, range(len(learner.views)))
+        seen = {next_view(learner, 2) for _ in range(40)}
+        assert seen <= set(window) or len(window) < rollout.NEAR_VIEWS
+        counts.append(len(window))
+        instants.append(opening.few_instants(learner))
+    if gain < opening.MIN_GAIN:
+        assert min(counts) == len(learner.views)
+        assert instants == [None] * 18
+    else:
+        assert counts == sorted(counts) and counts[0] < counts[4] < counts[-1] == len(learner.views)
+        assert instants[0] == 3 and instants[4] is not None and instants[8:] == [None] * 10
+
+
+def moved(before: dict, model) -> bool:
+    """Whether a parameter differs."""
+    return any(not torch.equal(value, before[name]) for name, value in model.state_dict().items())
+
+
+@pytest.mark.usefixtures("short_runs_have_phases")
+def test_steps_while_time_opens_leave_planes_linear_between_few_instants(dataset, monkeypatch):
+    monkeypatch.setattr(opening, "_predicted", lambda state: opening.MIN_GAIN)
+    field = trainer_of(dataset, 100, 20).model.global_deformation
+    times = [plane for scale in field.arrays().planes for name, plane in scale.items() if name.endswith("t")]
+    assert any(np.ptp(plane) > 1e-3 for plane in times)
+    field.confine(3)
+    for before, after in zip(
+        times, (p for s in field.arrays().planes for n, p in s.items() if n[1] == "t"), strict=True
+    ):
+        np.testing.assert_allclose(after, before, atol=1e-5)
 
 
 # -- pruning -----------------------------------------------------------------------------------------------------------

@@ -66,7 +66,7 @@ class SelectLevels(phases.Phase):
         """By how many dB `level` is better in the pixels that it changes than the level below after practice. The state
         is as before if that is MIN_GAIN or more."""
         below = max(layer for layer in (0, *state.model.deformations) if layer < level)
-        pictures = [_images(state, view, (below, level)) for view in views]
+        pictures = [images(state, view, (below, level)) for view in views]
         acts = [(a - b).abs().amax(-1) >= MIN_CONTRAST for a, b in pictures]
         before, logits = state.snapshot(), state.model.mask_logits
         with torch.no_grad():
@@ -78,9 +78,9 @@ class SelectLevels(phases.Phase):
         def measure() -> float:
             errors = [0.0, 0.0]
             for view, mask, (_, with_it) in zip(views, acts, pictures, strict=True):
-                for i, image in enumerate((*_images(state, view, (below,)), with_it)):
-                    errors[i] += float(((image.clamp(0, 1) - view.image)[mask] ** 2 * view.weights[mask, None]).sum())
-            return 10 * math.log10(max(errors[0], 1e-9) / max(errors[1], 1e-9))
+                for i, image in enumerate((*images(state, view, (below,)), with_it)):
+                    errors[i] += view.squared_error(image.clamp(0, 1), mask)
+            return decibels(*errors)
 
         gain = workers.alike(measure)
         if gain >= MIN_GAIN:
@@ -97,10 +97,15 @@ class SelectLevels(phases.Phase):
 
 
 @torch.no_grad()
-def _images(state: TrainState, view: TrainingView, levels: Sequence[int]) -> list[Tensor]:
+def images(state: TrainState, view: TrainingView, levels: Sequence[int]) -> list[Tensor]:
     """The pictures of a view at these levels, as the steps at this position see them, without noise."""
     rounding = state.rounding(noisy=False)
     return [render(state.model, level, view.view.time, view.view.camera, rounding).image for level in levels]
+
+
+def decibels(without: float, with_it: float) -> float:
+    """By how many dB a squared error is smaller than another."""
+    return 10 * math.log10(max(without, 1e-9) / max(with_it, 1e-9))
 
 
 def held_back_views(state: TrainState) -> set[int]:
