@@ -223,8 +223,8 @@ def test_a_level_without_deformation_is_the_level_below():
 # -- what is not evaluated ---------------------------------------------------------------------------------------------
 
 
-def everything(model, level, *_):
-    return (model.masks(level) > MASK_THRESHOLD).nonzero()[:, 0]
+def everything(model, masks, *_):
+    return (masks > MASK_THRESHOLD).nonzero()[:, 0]
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])
@@ -238,7 +238,7 @@ def test_culling_changes_no_pixel(level, monkeypatch):
         viewmat[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
         cameras.append(replace(CAMERA, viewmat=viewmat))
     culled = [(picture(model, level, camera=c), len(gaussians(model, level, camera=c).anchors)) for c in cameras]
-    monkeypatch.setattr(Model, "visible", everything)
+    monkeypatch.setattr(Model, "_visible", everything)
     for camera, (image, evaluated) in zip(cameras, culled, strict=True):
         assert 0 < evaluated < 750  # fewer than half
         np.testing.assert_allclose(picture(model, level, camera=camera), image, atol=1e-5)
