@@ -76,7 +76,7 @@ class Walk:
     def write(self, folder: Path) -> Truth:
         """Makes the video: 30 frames a second, or between 15 and 60."""
         gaps = np.ones(COUNT) if self.even else np.random.default_rng(0).uniform(0.5, 2, COUNT)
-        times = np.cumsum(gaps / 30) - gaps[0] / 30
+        times = np.round(np.cumsum(gaps / 30) - gaps[0] / 30, 3)  # as the list below says
         steps, textures = times / times[-1], [texture(seed) for seed in range(4)]
         pictures = [self.frame(step, textures) for step in steps]
         for k, each in enumerate(pictures):
