@@ -261,17 +261,6 @@ def test_other_versions(path, version):
 # -- writing -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.skipif(os.name != "posix", reason="links and pipes")
-def test_a_link_stays_one_and_a_pipe_is_refused(path, tmp_path):
-    link = tmp_path / "link.pt"
-    link.symlink_to(path)
-    checkpoint.save(link, model(), {"iteration": 9})
-    assert link.is_symlink() and checkpoint.load(path)[1]["iteration"] == 9
-    os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(DataError, match="pipe: is not a regular file"):
-        checkpoint.save(tmp_path / "pipe", model())
-
-
 def test_text_is_not_called_pickled_code(tmp_path):
     (tmp_path / "m.pt").write_text("hello")
     assert "pickled" not in refusal(tmp_path / "m.pt", "not a readable checkpoint")

@@ -187,13 +187,6 @@ def test_a_run_is_cut_at_its_limit_and_leaves_a_checkpoint(
     assert checkpoint.load(tmp_path / "m.pt")[1]["iteration"] == done
 
 
-def test_resuming_from_a_model_without_training_state_is_refused(dataset, tmp_path):
-    trainer = Trainer(TrainConfig(preset="tiny", iterations=5), dataset)
-    checkpoint.save(tmp_path / "m.pt", trainer.model)
-    with pytest.raises(TrainError, match="no training state"):
-        trainer.resume(tmp_path / "m.pt")
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_the_first_signal_ends_the_run_after_a_whole_step(dataset, tmp_path, monkeypatch, number):
     trainer = Trainer(TrainConfig(preset="tiny", iterations=8), dataset)
