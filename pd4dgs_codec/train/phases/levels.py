@@ -73,7 +73,6 @@ class SelectLevels(phases.Phase):
             logits[:, below] += softplus(logits[:, level])  # the anchors of the level, without its motion
         if sum(int(mask.sum()) for mask in acts) < MIN_PIXELS:
             return 0.0
-        self._practise(below, max(MIN_PRACTICE, round(PRACTICE * (state.schedule.iterations or 0))))
 
         def measure() -> float:
             errors = [0.0, 0.0]
@@ -82,9 +81,13 @@ class SelectLevels(phases.Phase):
                     errors[i] += view.squared_error(image.clamp(0, 1), mask)
             return decibels(*errors)
 
-        gain = workers.alike(measure)
-        if gain >= MIN_GAIN:
-            state.return_to(before)
+        gain = math.inf
+        try:
+            self._practise(below, max(MIN_PRACTICE, round(PRACTICE * (state.schedule.iterations or 0))))
+            gain = workers.alike(measure)
+        finally:  # a picture that is not finite ends the phase, and the level stays
+            if gain >= MIN_GAIN:
+                state.return_to(before)
         return gain
 
     def stored(self) -> dict[str, Any]:
