@@ -67,9 +67,9 @@ def whole_file(path: str | Path, overwrite: bool) -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def whole_files(names: Sequence[str], overwrite: bool) -> Iterator[list[Path]]:
+def whole_files(names: Sequence[str], overwrite: bool, told: str | None = None) -> Iterator[list[Path]]:
     """Temporary paths for outputs in one folder that appear together once all are written. The folder is made if
-    missing. An OSError names the first of them."""
+    missing. An OSError names `told`, or the first of them."""
     parent = Path(names[0]).parent
     for name in names:
         if Path(name).exists() and not overwrite:
@@ -77,7 +77,7 @@ def whole_files(names: Sequence[str], overwrite: bool) -> Iterator[list[Path]]:
     existing = next(p for p in (parent, *parent.parents) if p.exists())
     if not existing.is_dir():
         raise DataError(f"{existing}: is a file, expected a folder to write into")
-    with _naming(names[0]), temporary_folder(existing) as folder:
+    with _naming(told or names[0]), temporary_folder(existing) as folder:
         temporaries = [folder / Path(name).name for name in names]
         yield temporaries
         for temporary in temporaries:

@@ -157,7 +157,7 @@ def _write(args: argparse.Namespace, kind: str, pictures: Iterator[np.ndarray], 
             f"found -o {args.output} for {count} images, expected a frame number in it, such as %04d, or --frames 1"
         )
     names = [args.output % i if numbered else args.output for i in range(count)]
-    with whole_files(names, args.overwrite) as temporaries:
+    with whole_files(names, args.overwrite, args.output) as temporaries:
         write_pictures(pictures, temporaries)
     return len(names)
 

@@ -275,9 +275,7 @@ def check_input(
         raise RenderError(f"near_plane is {near_plane}, expected 0 <= near_plane < {projection.FAR:g}")
     check_camera(camera)
     for (name, shape), array in zip(SHAPES.items(), given, strict=True):
-        if not is_floats(array):
-            raise RenderError(f"{name} is {getattr(array, 'dtype', type(array).__name__)}, expected an array of floats")
-        _check_shape(name, array.shape, None if name == "means" else len(given[0]), *shape)
+        _check_floats(name, array, is_floats, None if name == "means" else len(given[0]), *shape)
     behind = np.array(background, np.float32)
     _check_shape("background", behind.shape, 3)
     for name, value in (("colors", total(given[-1])), ("background", total(behind))):
@@ -288,6 +286,12 @@ def check_input(
 
 def _is_floats(array: Any) -> bool:
     return isinstance(array, np.ndarray) and array.dtype.kind == "f"
+
+
+def _check_floats(name: str, array: Any, is_floats: Callable[[Any], bool], *shape: int | None) -> None:
+    if not is_floats(array):
+        raise RenderError(f"{name} is {getattr(array, 'dtype', type(array).__name__)}, expected an array of floats")
+    _check_shape(name, array.shape, *shape)
 
 
 def _check_shape(name: str, found: Sequence[int], *expected: int | None) -> None:
@@ -303,9 +307,7 @@ def check_camera(camera: Camera) -> None:
         if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MAX_SIDE:
             raise RenderError(f"{name} is {value!r}, expected an integer from 1 to {MAX_SIDE}")
     for name, array, side in (("viewmat", camera.viewmat, 4), ("K", camera.K, 3)):
-        if not _is_floats(array):
-            raise RenderError(f"{name} is {getattr(array, 'dtype', type(array).__name__)}, expected an array of floats")
-        _check_shape(name, array.shape, side, side)
+        _check_floats(name, array, _is_floats, side, side)
     viewmat, K = camera.viewmat.tolist(), camera.K.tolist()
     if not all(math.isfinite(v) for row in [*viewmat, *K] for v in row):
         raise RenderError("viewmat or K has a value that is not finite")

@@ -105,16 +105,14 @@ class DeformationField(nn.Module):
         """The linear layer whose output is the residual `head`; None if the field lacks it."""
         return cast(MLP, self.heads[head]).layers[-1] if head in self.heads else None
 
-    def confine(self, instants: int | None) -> None:
-        """Makes the features linear in time between so many evenly spaced instants, by least squares; None: nothing."""
-        if instants is not None:
-            self.planes.confine(self.planes.grid.data, instants)
+    def confine(self, instants: int) -> None:
+        """Makes the features linear in time between so many evenly spaced instants, by least squares."""
+        self.planes.confine(instants)
 
-    def spread_gradients(self, instants: int | None) -> None:
-        """Makes the gradients of the features those of confined ones, each instant's spread over the cells between its
-        neighbours; None: nothing."""
-        if instants is not None and self.planes.grid.grad is not None:
-            self.planes.spread(self.planes.grid.grad, instants)
+    def spread_gradients(self, instants: int) -> None:
+        """Makes the gradients of the features, if there are any, those of confined ones, each instant's spread over the
+        cells between its neighbours."""
+        self.planes.spread_gradients(instants)
 
     def regularisers(self, features: Sequence[Tensor]) -> dict[str, Tensor]:
         """The regularisers, unweighted, by name. features: those of the field, or others of their shapes."""

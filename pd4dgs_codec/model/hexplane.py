@@ -138,15 +138,15 @@ class HexPlane(nn.Module):
             return features
         return sample_reference(round_straight_through(self.grid, step), self.layout, box, points, t)
 
-    def confine(self, cells: Tensor, instants: int) -> None:
-        """Replaces the time planes in `cells`, in the shape of grid, by the nearest ones that are linear between
-        `instants` evenly spaced instants."""
-        self._mix_times(cells, instants, 0)
+    def confine(self, instants: int) -> None:
+        """Replaces the time planes by the nearest ones that are linear between `instants` evenly spaced instants."""
+        self._mix_times(self.grid, instants, 0)
 
-    def spread(self, cells: Tensor, instants: int) -> None:
-        """Replaces gradients by time planes, in the shape of grid, by the sums at those instants, spread as a change of
+    def spread_gradients(self, instants: int) -> None:
+        """Replaces gradients by time planes, if there are any, by the sums at those instants, spread as a change of
         their values would be."""
-        self._mix_times(cells, instants, 1)
+        if self.grid.grad is not None:
+            self._mix_times(self.grid.grad, instants, 1)
 
     @torch.no_grad()
     def _mix_times(self, cells: Tensor, instants: int, which: int) -> None:

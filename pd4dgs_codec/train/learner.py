@@ -111,15 +111,19 @@ class Learner(TrainState):
             return False
         if not self.practising:
             self.grow.observe(self, pictures)
-        fields, instants = self.model.deformations.values(), few_instants(self)
-        for field in fields:
-            field.spread_gradients(instants)
-        self.optimiser.step(self.schedule.progress(self.position), self.schedule.iterations)
-        for field in fields:
-            field.confine(instants)
+        self._update(few_instants(self))
         if not self.practising:
             self._apply([self.grow], record)
         return True
+
+    def _update(self, instants: int | None) -> None:
+        """One update, after which the planes of the deformations have so many instants, if not all their own."""
+        confined = [] if instants is None else [(field, instants) for field in self.model.deformations.values()]
+        for field, few in confined:
+            field.spread_gradients(few)
+        self.optimiser.step(self.schedule.progress(self.position), self.schedule.iterations)
+        for field, few in confined:
+            field.confine(few)
 
     def _pictures(
         self, drawn: list[tuple[int, int]], record: dict[str, Any], only: Tensor | None

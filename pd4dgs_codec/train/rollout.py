@@ -18,7 +18,7 @@ import torch
 
 from pd4dgs_codec.model.picture import render
 from pd4dgs_codec.train.phases.levels import held_back_views
-from pd4dgs_codec.train.phases.opening import within
+from pd4dgs_codec.train.phases.opening import window, within
 from pd4dgs_codec.train.schedule import CAPACITY_WEIGHTED, LOWEST, TOP, UNIFORM, Probabilities, rollout_probabilities
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
@@ -67,6 +67,8 @@ def next_view(state: TrainState, level: int) -> int:
 
 def _near(state: TrainState, level: int) -> list[int]:
     """The views near the key instant of which the next picture is one; none if it may be of any view."""
+    if level > 0 and window(state) >= 1:
+        return []
     held_back = _held_back(state)
     among = [index for index in range(len(state.views)) if index not in held_back]
     if level > 0:

@@ -67,7 +67,7 @@ class SelectLevels(phases.Phase):
         is as before if that is MIN_GAIN or more."""
         below = max(layer for layer in (0, *state.model.deformations) if layer < level)
         pictures = [images(state, view, (below, level)) for view in views]
-        acts = [(a - b).abs().amax(-1) >= MIN_CONTRAST for a, b in pictures]
+        acts = [changes(*pair) for pair in pictures]
         before, logits = state.snapshot(), state.model.mask_logits
         with torch.no_grad():
             logits[:, below] += softplus(logits[:, level])  # the anchors of the level, without its motion
@@ -75,11 +75,8 @@ class SelectLevels(phases.Phase):
             return 0.0
 
         def measure() -> float:
-            errors = [0.0, 0.0]
-            for view, mask, (_, with_it) in zip(views, acts, pictures, strict=True):
-                for i, image in enumerate((*images(state, view, (below,)), with_it)):
-                    errors[i] += view.squared_error(image.clamp(0, 1), mask)
-            return decibels(*errors)
+            without = [images(state, view, (below,))[0] for view in views]
+            return gain_in(views, acts, without, [with_it for _, with_it in pictures])
 
         gain = math.inf
         try:
@@ -106,9 +103,21 @@ def images(state: TrainState, view: TrainingView, levels: Sequence[int]) -> list
     return [render(state.model, level, view.view.time, view.view.camera, rounding).image for level in levels]
 
 
-def decibels(without: float, with_it: float) -> float:
-    """By how many dB a squared error is smaller than another."""
-    return 10 * math.log10(max(without, 1e-9) / max(with_it, 1e-9))
+def changes(without: Tensor, with_it: Tensor) -> Tensor:
+    """bool [H, W]: the pixels in which two pictures differ enough to see."""
+    return (without - with_it).abs().amax(-1) >= MIN_CONTRAST
+
+
+def gain_in(
+    views: Sequence[TrainingView], where: Sequence[Tensor], without: Sequence[Tensor], with_it: Sequence[Tensor]
+) -> float:
+    """By how many dB the squared error of a second picture of each view is less than that of a first one, in the pixels
+    `where`."""
+    first, second = (
+        sum(view.squared_error(image.clamp(0, 1), mask) for view, mask, image in zip(views, where, drawn, strict=True))
+        for drawn in (without, with_it)
+    )
+    return 10 * math.log10(max(first, 1e-9) / max(second, 1e-9))
 
 
 def held_back_views(state: TrainState) -> set[int]:

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from pd4dgs_codec.train import phases, workers
-from pd4dgs_codec.train.phases.levels import MIN_CONTRAST, decibels, images
+from pd4dgs_codec.train.phases.levels import changes, gain_in, images
 from pd4dgs_codec.train.state import TrainState
 
 #: The window, as a share of the longest time from the key instant: at first, and in the trial.
@@ -82,10 +82,7 @@ def _predicted(state: TrainState) -> float:
     """By how many dB the highest level is better than level 0 in views next to the window of the trial, in the pixels
     where the two differ."""
     near = [index for index in range(len(state.views)) if TRIAL < _distance(state, index) <= NEXT * TRIAL]
-    errors = [0.0, 0.0]
-    for index in near[:: max(1, -(-len(near) // VIEWS))]:
-        view = state.picture(index)
-        still, moved = (image.clamp(0, 1) for image in images(state, view, (0, state.model.level)))
-        acts = (still - moved).abs().amax(-1) >= MIN_CONTRAST
-        errors = [error + view.squared_error(image, acts) for error, image in zip(errors, (still, moved), strict=True)]
-    return decibels(*errors)
+    views = [state.picture(index) for index in near[:: max(1, -(-len(near) // VIEWS))]]
+    pictures = [[image.clamp(0, 1) for image in images(state, view, (0, state.model.level))] for view in views]
+    acts = [changes(*pair) for pair in pictures]
+    return gain_in(views, acts, [still for still, _ in pictures], [moved for _, moved in pictures])
