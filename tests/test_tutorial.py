@@ -26,7 +26,7 @@ def run_shell(line: str, folder: Path) -> str:
         line, shell=True, cwd=folder, env=os.environ | {"PATH": path}, capture_output=True, text=True, timeout=1800
     )
     assert done.returncode == 0, f"{line}\n{done.stderr}"
-    return done.stdout
+    return done.stdout + done.stderr  # a notebook shows both
 
 
 def test_the_tutorial_runs_from_the_first_cell_to_the_last(tmp_path, monkeypatch, capsys):

@@ -35,6 +35,8 @@ from pd4dgs_codec.train.schedule import PRUNING_ROUNDS, Schedule
 @pytest.fixture
 def short_runs_have_phases(monkeypatch):
     monkeypatch.setattr(phases, "MIN_ITERATIONS", 10)
+    monkeypatch.setattr(opening, "MIN_TRIAL", 3)
+    monkeypatch.setattr(levels, "MIN_PRACTICE", 3)
 
 
 def trainer_of(dataset, iterations: int = 30, steps: int = 0, **options) -> Trainer:
@@ -90,6 +92,8 @@ def test_short_runs_and_few_views_have_no_measured_phases(dataset, tmp_path, mon
     records = records_of(trainer, tmp_path)
     assert not any({"left_model", "step_classes", "judged_psnr"} & set(record) for record in records)
     monkeypatch.setattr(phases, "MIN_ITERATIONS", 10)
+    monkeypatch.setattr(opening, "MIN_TRIAL", 3)
+    monkeypatch.setattr(levels, "MIN_PRACTICE", 3)
     assert held_back_views(trainer.learner) == {8, 24, 40, 56}
     for off in ({"judge": False}, {"max_layer": 0}, {"rollout": "top"}):
         assert not held_back_views(trainer_of(views, **off).learner)
