@@ -12,8 +12,10 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -33,21 +35,24 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Scene:
-    """A dataset and how it is trained. name: of its results, and its label in tables. iterations: training steps.
-    protocol: of `pd4dgs-eval`; 3dgs for scenes that papers report on. training: further options of `pd4dgs-train`."""
+    """A dataset and how it is trained. name: of its results, and its label in tables. what: it shows, for the page.
+    iterations: training steps. protocol: of `pd4dgs-eval`; 3dgs for scenes that papers report on. training: further
+    options of `pd4dgs-train`. usual: measured where --scenes names none."""
 
     name: str
     source: str
+    what: str
     downscale: int = 1
-    preset: str = "small"
+    preset: str = "tiny"
     iterations: int = 1_500
     protocol: str = "dycheck"
     training: tuple[str, ...] = ()
+    usual: bool = True
 
     @property
     def there(self) -> bool:
         """Whether its data are on this machine."""
-        return self.source.startswith("synthetic:") or Path(self.source).is_dir()
+        return self.source.startswith("synthetic:") or any(Path(self.source).glob("*.json"))
 
     @property
     def reading(self) -> list[str]:
@@ -60,23 +65,47 @@ class Scene:
         return ["--data", *self.reading]
 
 
+MUTANT = str(OFFICIAL / "mutant")
+#: Of scenes that take longer than all others together.
+LARGE: dict[str, Any] = {"preset": "small", "iterations": 10_000, "protocol": "3dgs", "usual": False}
+#: What reads the view direction in the paper; by default colours alone do.
+ALL_VIEW = ("--view-dependent", "opacity+covariance+color")
+JUMP = "path=jump&frames=200"
 SCENES = {
     scene.name: scene
     for scene in (
-        Scene("shelf-hand", str(SHARED / "shelf-hand"), 2, iterations=5_000),
-        # 160 renders of a trained 4D Gaussian model from one orbit: not D-NeRF's scene of this name
-        Scene("orbit", str(SHARED / "bouncing-balls"), 4, iterations=7_000),
-        *(Scene(f"synthetic-{name}", f"synthetic:{name}") for name in ("static", "global", "local", "fast")),
-        Scene("mutant", str(OFFICIAL / "mutant"), 1, "small", 10_000, "3dgs"),
-        Scene("mutant-black", str(OFFICIAL / "mutant"), 1, "small", 10_000, "3dgs", ("--background", "black")),
-        Scene("basketball", str(OFFICIAL / "basketball"), 1, "small", 10_000, "3dgs"),
+        Scene("shelf-hand", str(SHARED / "shelf-hand"), "hand-held capture, 256 x 192", 2, "small", 5_000),
+        # not D-NeRF's scene of this name
+        Scene("orbit", str(SHARED / "bouncing-balls"), "renders of a 4D Gaussian model, 200 x 200", 4, "small", 3_000),
+        Scene("static", "synthetic:static", "nothing moves, 160 x 120"),
+        Scene("global", f"synthetic:global?{JUMP}", "large objects move, 160 x 120"),
+        Scene("local", f"synthetic:local?{JUMP}", "and small parts move on their own, 160 x 120"),
+        Scene("fast", f"synthetic:fast?{JUMP}", "quick motion, 160 x 120"),
+        Scene("flyby", "synthetic:flyby", "a ball flies past a cube, on white, 100 x 100"),
+        Scene("rods", "synthetic:rods", "thin rods move, on white, 100 x 100"),
+        Scene("bend", "synthetic:bend", "a column bends, on white, 100 x 100"),
+        Scene("mutant-200", MUTANT, "D-NeRF, 200 x 200", 4, "small", 8_000, "3dgs"),
+        Scene("mutant-200-view", MUTANT, "the same, all view-dependent", 4, "small", 8_000, "3dgs", ALL_VIEW),
+        Scene("mutant-400", MUTANT, "D-NeRF, 400 x 400", 2, training=ALL_VIEW, **LARGE),
+        Scene("mutant", MUTANT, "D-NeRF, 800 x 800", **LARGE),
+        Scene("mutant-black", MUTANT, "the same on black", training=("--background", "black"), **LARGE),
+        Scene("basketball", str(OFFICIAL / "basketball"), "Panoptic Sports, 640 x 360", **LARGE),
     )
 }
-REAL = ("shelf-hand", "orbit")
-#: Where a second scene would say little more.
-ONE = REAL[:1]
+#: Where a second kind of scene says more, where it would say little, and where many trainings are compared.
+TWO, ONE, TINY = ("shelf-hand", "mutant-200"), ("shelf-hand",), ("bend",)
 #: The scene of --quick.
-QUICK = Scene("quick", "synthetic:local?size=48x36&frames=4", preset="tiny", iterations=10)
+QUICK = Scene("quick", "synthetic:local?size=48x36&frames=4", "", iterations=10)
+
+
+@dataclass(frozen=True)
+class Training:
+    """What Run.trained takes."""
+
+    scene: Scene
+    options: tuple[str, ...] = ()
+    seed: int = 0
+    longer: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -95,7 +124,8 @@ class Run:
         return folder
 
     def trained(self, scene: Scene, *options: str, seed: int = 0, longer: float = 1.0) -> tuple[Path, Row]:
-        """(checkpoint, summary of `pd4dgs-train`) of a scene trained with `options`, `longer` times its steps.
+        """(checkpoint, summary of `pd4dgs-train`) of a scene trained with `options`, `longer` times its steps, on one
+        thread.
 
         A finished training of the same command and the same package is kept; an unfinished one is resumed.
         """
@@ -110,15 +140,24 @@ class Run:
         if kept.get("made_by") == made_by and kept["finished"] and path.is_file():
             return path, kept
         say(f"training {path}")
+        train = command if self.quick else command_apart
         if kept.get("made_by") == made_by and path.is_file():
-            result = command("train", scene.source, "-o", path, "--resume", path, "--log", log)
+            result = train("train", scene.source, "-o", path, "--resume", path, "--log", log, "-j", 1)
         else:
             summary.write_text(json.dumps({"made_by": made_by, "finished": False}))
-            result = command("train", *asked, "-o", path, "--log", log, "-f")
+            path.unlink(missing_ok=True)  # of another package
+            result = train("train", *asked, "-o", path, "--log", log, "-f", "-j", 1)
         summary.write_text(json.dumps(result | {"made_by": made_by}))
         if not result["finished"]:
             raise TrainError(f"{path}: training was interrupted; the same command resumes it")
         return path, result
+
+    def train(self, jobs: Iterable[Training]) -> None:
+        """Trains all of them, the longest first, one on each core: that uses cores better than the
+        threads of one training."""
+        order = sorted(dict.fromkeys(jobs), key=lambda job: -job.scene.iterations * job.longer)
+        with ThreadPoolExecutor(1 if self.quick else os.cpu_count()) as pool:
+            list(pool.map(lambda job: self.trained(job.scene, *job.options, seed=job.seed, longer=job.longer), order))
 
     def packed(self, scene: Scene, *options: str, name: str = "scene") -> Path:
         """The model of seed 0, packed with `options` into NAME.pd4."""
@@ -131,7 +170,7 @@ class Run:
 class Benchmark:
     """scenes: names in SCENES; none where no scene is measured. measure: the rows of one scene (of None without
     scenes). text: the rows of all scenes as Markdown, without a heading. pictures: draws them into a folder and returns
-    the file names."""
+    the file names. trainings: what it needs of a scene, so that they can run side by side before it measures."""
 
     name: str
     title: str
@@ -139,6 +178,7 @@ class Benchmark:
     measure: Callable[[Run, Any], list[Row]]
     text: Callable[[Sequence[Row]], str]
     pictures: Callable[[Sequence[Row], Path], list[str]] = lambda rows, folder: []
+    trainings: Callable[[Run, Any], list[Training]] = lambda run, scene: [Training(scene)]
 
 
 def command(name: str, *arguments: object) -> Row:
@@ -150,6 +190,17 @@ def command(name: str, *arguments: object) -> Row:
     if code:
         raise DataError(f"pd4dgs-{name} {' '.join(words)}: exit code {code}, expected 0")
     result: Row = json.loads(out.getvalue())
+    return result
+
+
+def command_apart(name: str, *arguments: object) -> Row:
+    """The same in a process of its own. What it says on stderr is kept for its error alone."""
+    words = [sys.executable, "-m", "pd4dgs_codec", name, *map(str, arguments), "--json"]
+    done = subprocess.run(words, capture_output=True, text=True, cwd=ROOT)
+    if not done.stdout:
+        told = (done.stderr.strip().splitlines() or ["nothing"])[-1]
+        raise DataError(f"pd4dgs-{name} {' '.join(words[4:])}: exit code {done.returncode}: {told}")
+    result: Row = json.loads(done.stdout)
     return result
 
 
@@ -191,8 +242,9 @@ def commit() -> str:
     return f"{name}, changed" if git("status", "--porcelain", "--", "pd4dgs_codec") else name
 
 
+@cache
 def package_tree() -> str:
-    """What identifies the package's source: git's hash of it, and of what was changed since."""
+    """When it is first asked, what identifies the package's source: git's hash of it, and of what was changed since."""
     return git("rev-parse", "HEAD:pd4dgs_codec") + git("diff", "HEAD", "--shortstat", "--", "pd4dgs_codec")
 
 

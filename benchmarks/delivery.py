@@ -13,7 +13,7 @@ from statistics import median
 from typing import Any
 
 from browser import PATIENCE_MS, launched
-from common import ONE, REAL, Benchmark, Row, Run, Scene, command, levels, number, seconds_at, table
+from common import ONE, TWO, Benchmark, Row, Run, Scene, command, levels, number, seconds_at, table
 
 from pd4dgs_codec.bench.report import drawing
 from pd4dgs_codec.errors import DataError
@@ -23,7 +23,7 @@ from pd4dgs_codec.errors import DataError
 
 def measure_latency(run: Run, scene: Scene) -> list[Row]:
     """What `pd4dgs-bench latency` measures: a row per rate and level."""
-    options = ("--rates", "50M", "--runs", "1") if run.quick else ("--rates", "2M,10M", "--runs", "5")
+    options = ("--rates", "50M", "--runs", "1") if run.quick else ("--rates", "2M,10M", "--runs", "3")
     (found,) = command("bench", "latency", run.packed(scene), *options)["files"]
     first = {"scene": scene.name, "first_start": found["first_start"]}
     return [first | row for row in found["times"]]
@@ -132,7 +132,7 @@ def measure_player(run: Run, scene: Scene) -> list[Row]:
         ends = {row["layer"]: row["end"] for row in command("info", run.packed(scene))["layers"]}
         for rate in RATES:
             with served(folder, "--rate", repr(rate), "--latency", ROUND_TRIP) as url:
-                visits = [first_pictures(browser, url, max(ends)) for _ in range(1 if run.quick else 5)]
+                visits = [first_pictures(browser, url, max(ends)) for _ in range(1 if run.quick else 3)]
             for level, end in ends.items():
                 shown = median(next(n["shown"] for n in noted if n["level"] >= level) for noted in visits)
                 rows.append({"what": "picture", "rate": rate, "level": level, "bytes": end, "shown": shown})
@@ -188,5 +188,5 @@ def player_text(rows: Sequence[Row]) -> str:
 
 
 LATENCY = Benchmark("latency", "First picture", ONE, measure_latency, latency_text)
-SLICES = Benchmark("slices", "Slices", REAL, measure_slices, slices_text, slices_pictures)
+SLICES = Benchmark("slices", "Slices", TWO, measure_slices, slices_text, slices_pictures)
 PLAYER = Benchmark("player", "The player in a browser", ONE, measure_player, player_text)

@@ -14,10 +14,9 @@ from pd4dgs_codec.io import finite, whole_file
 
 DIGITS = 6  #: significant digits of a figure in git
 INTRODUCTION = """\
-`python benchmarks/run.py` made this page: it trains every scene, packs it and measures. Pictures have 256 x 192 pixels
-(shelf-hand), 200 x 200 (orbit, renders of a trained 4D Gaussian model), 160 x 120 (synthetic), 800 x 800 (mutant) and
-640 x 360 (basketball). Times are wall times of a machine that other work may share; sizes and qualities repeat for the
-same package and machine. 1 MB is 1e6 bytes."""
+`python benchmarks/run.py` made this page: it trains every scene, packs it and measures. Times are wall
+times of a machine that other work may share; sizes and qualities repeat for the same package and machine. 1 MB is 1e6
+bytes."""
 
 
 def write(docs: Path, benchmarks: Sequence[Benchmark], sections: Mapping[str, Row]) -> None:

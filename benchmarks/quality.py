@@ -8,7 +8,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from common import SCENES, Benchmark, Row, Run, Scene, command, levels, number, seconds_at, table
+from common import ONE, SCENES, Benchmark, Row, Run, Scene, Training, command, levels, number, seconds_at, table
 
 from pd4dgs_codec.bench.report import drawing
 
@@ -29,15 +29,16 @@ PUBLISHED: dict[str, tuple[tuple[str, float, float | None, float | None], ...]] 
 OFFICIAL_TEXT = (
     "Scenes of D-NeRF (mutant: official split, 20 test views; on white, mutant-black on black) and Panoptic Sports "
     "(basketball: 4 test cameras, 150 instants), by `pd4dgs-eval --protocol 3dgs`: metrics without masks, means over "
-    "pictures. Rows that name a method are published (arXiv 2510.10030, supplement, table 1, where its authors ran "
-    "them again; 4DGS-1K-PP: arXiv 2503.16422, table 6; GIFStream: arXiv 2505.07539); their backgrounds differ."
+    "pictures; 200 and 400 are our pictures' sides, published ones have 800. Rows that name a method are "
+    "published (arXiv 2510.10030, supplement, table 1, where its authors ran them again; 4DGS-1K-PP: arXiv 2503.16422, "
+    "table 6; GIFStream: arXiv 2505.07539); their backgrounds differ."
 )
 #: Bytes of a picture in git.
 LARGEST_PICTURE = 300_000
 
 
 def measure(run: Run, scene: Scene) -> list[Row]:
-    """A row per level of each seed's file, and one of the monolith where nobody has published any."""
+    """A row per level of each seed's file, and for one scene one of the monolith."""
     rows: list[Row] = []
     for seed in range(run.seeds):
         model, training = run.trained(scene, seed=seed)
@@ -46,8 +47,20 @@ def measure(run: Run, scene: Scene) -> list[Row]:
         rows += [told | row for row in packed_levels(scene, model, file)]
         if seed == 0:
             rows[0]["curve"] = curve(model)
-            draw_levels(scene, file, run.images / f"{scene.name}.jpg")
-    return rows if scene.protocol == "3dgs" else [*rows, monolith(run, scene)]
+            if scene.protocol != "3dgs":  # scenes that papers report on name no licence
+                draw_levels(scene, file, run.images / f"{scene.name}.jpg")
+    return [*rows, monolith(run, scene)] if compared(run, scene) else rows
+
+
+def trainings(run: Run, scene: Scene) -> list[Training]:
+    """One a seed, and the monolith."""
+    ours = [Training(scene, seed=seed) for seed in range(run.seeds)]
+    return [*ours, Training(scene, MONOLITH)] if compared(run, scene) else ours
+
+
+def compared(run: Run, scene: Scene) -> bool:
+    """Whether it has a monolith beside it."""
+    return run.quick or scene.name in ONE
 
 
 def packed_levels(scene: Scene, model: Path, file: Path) -> list[Row]:
@@ -97,17 +110,29 @@ def text(rows: Sequence[Row]) -> str:
     """A row per scene and level: medians over the seeds and, of several, the least and the most. Scenes that papers
     report on have a table of their own, with what they report."""
     ours, official = ([row for row in rows if ("psnr" in row) == by] for by in (False, True))
+    names = dict.fromkeys(row["scene"] for row in rows)
     seeds = 1 + max(row["seed"] for row in rows)
     told = f" Medians of {seeds} seeds, with the least and the most." if seeds > 1 else ""
     parts = [
         "Quality is measured on held-out views, from the prefix of the file whose size is in the same row. *monolith*: "
-        "the same scene trained for the highest level alone, without a rate term, stored as float32 under LZMA." + told
+        "the same scene trained for the highest level alone, without a rate term, stored as float32 under LZMA. "
+        "*moving*: pixels whose truth changes over time, where test cameras stand still. Each training has one thread, "
+        f"with another beside it.{told}",
+        table(("scene", "shows", "`pd4dgs-train`"), [described(SCENES[name]) for name in names if name in SCENES]),
     ]
     if ours:
         parts.append(levels_table(ours, "m"))
     if official:
         parts += [OFFICIAL_TEXT, levels_table(official, "")]
     return "\n\n".join(parts)
+
+
+def described(scene: Scene) -> tuple[str, str, str]:
+    """What a scene shows and how it is trained."""
+    source = scene.source if scene.source.startswith("synthetic:") else Path(scene.source).name
+    reading = f"--downscale {scene.downscale} " if scene.downscale > 1 else ""
+    options = f"{reading}--preset {scene.preset} --iterations {scene.iterations} {' '.join(scene.training)}"
+    return scene.name, scene.what, f"`{source} {options.strip()}`"
 
 
 def levels_table(rows: Sequence[Row], m: str) -> str:
@@ -133,10 +158,11 @@ def levels_table(rows: Sequence[Row], m: str) -> str:
             )
         )
     scenes = list(dict.fromkeys(scene for scene, _ in groups))
-    for scene in scenes:
-        for method, psnr, ssim, size in PUBLISHED.get(scene, ()):
+    for name, published in PUBLISHED.items():
+        family = [scene for scene in scenes if scene.split("-")[0] == name]
+        for method, psnr, ssim, size in published if family else ():
             told = ("-", "-") if size is None else (number(1e6 * size, 0), seconds_at(1e6 * size))
-            cells.append((scene, method, *told, number(psnr), *["-"] * moves, number(ssim, 3), "-", "-", "-"))
+            cells.append((family[-1], method, *told, number(psnr), *["-"] * moves, number(ssim, 3), "-", "-", "-"))
     cells.sort(key=lambda row: scenes.index(row[0]))
     head = ["scene", "level", "bytes so far", "s at 2 Mbps", f"{m}PSNR dB", f"{m}SSIM", "anchors", "steps"]
     if moves:
@@ -156,7 +182,8 @@ def pictures(rows: Sequence[Row], folder: Path) -> list[str]:
     """The levels of each scene, and quality over training time, one panel a scene, legible in black and white."""
     shown = [row for row in rows if "curve" in row]
     time_plot([(row["scene"], row["curve"]) for row in shown], folder / "quality-over-time.png")
-    return [f"{row['scene']}.jpg" for row in shown] + ["quality-over-time.png"]
+    drawn = {row["scene"] for row in rows if "psnr" not in row}
+    return [f"{row['scene']}.jpg" for row in shown if row["scene"] in drawn] + ["quality-over-time.png"]
 
 
 def time_plot(curves: Sequence[tuple[str, list[Row]]], path: Path) -> None:
@@ -173,4 +200,4 @@ def time_plot(curves: Sequence[tuple[str, list[Row]]], path: Path) -> None:
         axes[0].legend()
 
 
-BENCHMARK = Benchmark("quality", "Quality and bytes", tuple(SCENES), measure, text, pictures)
+BENCHMARK = Benchmark("quality", "Quality and bytes", tuple(SCENES), measure, text, pictures, trainings)

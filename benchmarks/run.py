@@ -3,10 +3,12 @@
     python benchmarks/run.py                       # everything; benchmarks/README.md has the times
     python benchmarks/run.py --only quality speed  # these sections; the others stay as they are
     python benchmarks/run.py --quick               # a tiny scene, to see that all of it works; docs/ stays as it is
+    python benchmarks/run.py --check               # names the sections that are older than what they measure
 
-Writes docs/results.md, docs/figures/results.json and docs/img/. Trainings and files stay below -o, so that an
-interrupted run continues. Real scenes are read from the folder that PD4DGS_SHARED names, by default ../shared/data
-beside the repository; scenes that are not there are left out. Stops at the first benchmark that fails.
+Writes docs/results.md, docs/figures/results.json and docs/img/ after each section, the most important first. Trainings
+and files stay below -o: the same command with --resume continues an interrupted run. Real scenes are read from the
+folder that PD4DGS_SHARED names, by default ../shared/data beside the repository; scenes that are not there are left
+out. Stops at the first benchmark that fails.
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ import delivery
 import paper
 import quality
 import refining_gif
-from common import QUICK, ROOT, SCENES, Benchmark, Row, Run, commit, present, say
+from common import QUICK, ROOT, SCENES, Benchmark, Row, Run, commit, git, present, say
 from page import write
 
 from pd4dgs_codec.bench.report import machine, machine_line
@@ -33,43 +35,54 @@ from pd4dgs_codec.errors import DataError, Pd4Error
 
 ALL = (
     quality.BENCHMARK,
+    delivery.SLICES,
     paper.PAPER,
     paper.DIAL,
-    delivery.SLICES,
-    delivery.LATENCY,
-    delivery.PLAYER,
+    codec.STABILITY,
+    codec.RIVALS,
     codec.SPEED,
     codec.ERROR,
-    codec.RIVALS,
-    codec.EXPORT,
-    codec.STABILITY,
+    delivery.LATENCY,
+    delivery.PLAYER,
     codec.BATCH,
+    codec.EXPORT,
 )
 #: The scene of the animation.
 ANIMATED = "shelf-hand"
 
 
-def section(benchmark: Benchmark, run: Run, names: Sequence[str], line: str) -> Row:
-    """Measures one benchmark: its figures, and what they were made with."""
+def section(benchmark: Benchmark, run: Run, names: Sequence[str], made: Row) -> Row:
+    """Measures one benchmark: its figures, and what they were made with (`made`: commit and command)."""
     scenes: list[Any] = [None]
     if benchmark.scenes:
         scenes = [QUICK] if run.quick else list(present([n for n in benchmark.scenes if n in names]))
     if not scenes:
         raise DataError(f"{benchmark.name}: none of the scenes {', '.join(benchmark.scenes)} is there")
     start, rows = time.monotonic(), []
+    run.train(job for scene in scenes if scene for job in benchmark.trainings(run, scene))
     for scene in scenes:
         say(f"{benchmark.name}{f': {scene.name}' if scene else ''}")
         rows += benchmark.measure(run, scene)
     return {
         "name": benchmark.name,
-        "commit": commit(),
+        **made,
         "date": datetime.date.today().isoformat(),
-        "command": line,
         "machine": machine_line(machine() | {"load_average": None}),
         "minutes": (time.monotonic() - start) / 60,
         "rows": rows,
         "pictures": benchmark.pictures(rows, run.images),
     }
+
+
+def aged(sections: Sequence[Row]) -> list[str]:
+    """A line for every section that was made before the last change of the package or of the player."""
+    lines = []
+    for found in sections:
+        made = found["commit"].partition(",")[0]
+        newer = git("log", "-1", "--format=%h, %s", f"{made}..HEAD", "--", "pd4dgs_codec", "player")
+        if newer or not git("cat-file", "-t", made):
+            lines.append(f"{found['name']}: made at {found['commit']}, before {newer or 'the history that is here'}")
+    return lines
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -80,28 +93,41 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--scenes", nargs="+", choices=list(SCENES), metavar="SCENE", help=f"of {', '.join(SCENES)}")
     parser.add_argument("--seeds", type=int, default=1, help="trainings of each scene in quality (%(default)s)")
     parser.add_argument("--quick", action="store_true", help="a tiny scene; without the player unless --only names it")
+    parser.add_argument("--resume", action="store_true", help="keep the sections that were made at this commit")
     parser.add_argument("--render", action="store_true", help="make the page from its figures and measure nothing")
+    parser.add_argument("--check", action="store_true", help="name sections older than the package; exit code 1 if any")
     parser.add_argument("-o", "--out", type=Path, default=ROOT / "out" / "benchmarks", help="trainings and files")
     parser.add_argument("--docs", type=Path, help="folder of the page (docs; with --quick OUT/docs)")
     args = parser.parse_args(argv)
     docs = args.docs or (args.out / "docs" if args.quick else ROOT / "docs")
     run = Run(args.out.resolve(), docs / "img", args.quick, args.seeds)
-    run.images.mkdir(parents=True, exist_ok=True)
     asked = args.only or [name for name in names if not (args.quick and name == "player")]
-    line = " ".join(["python benchmarks/run.py", *(sys.argv[1:] if argv is None else argv)])
+    given = sys.argv[1:] if argv is None else argv
+    made = {
+        "commit": commit(),
+        "command": " ".join(["python benchmarks/run.py", *(w for w in given if w != "--resume")]),
+    }
     stored = docs / "figures" / "results.json"
     kept = {found["name"]: found for found in json.loads(stored.read_text())["sections"]} if stored.is_file() else {}
+    if args.check:
+        lines = aged(list(kept.values()))
+        print("\n".join(lines or ["no section is older than what it measures"]))
+        return bool(lines)
+    run.images.mkdir(parents=True, exist_ok=True)
+    scenes = args.scenes or [name for name, scene in SCENES.items() if scene.usual]
+    if args.resume:
+        asked = [name for name in asked if any(kept.get(name, {}).get(key) != made[key] for key in made)]
     try:
         for benchmark in ALL:
             if benchmark.name in asked and not args.render:
-                kept[benchmark.name] = section(benchmark, run, args.scenes or list(SCENES), line)
+                kept[benchmark.name] = section(benchmark, run, scenes, made)
                 write(docs, ALL, kept)
+                if benchmark is delivery.SLICES:
+                    file = run.folder(QUICK if args.quick else SCENES[ANIMATED]) / "slices.pd4"
+                    if file.is_file():
+                        refining_gif.draw(file.read_bytes(), run.images / "refining.gif")
         if args.render:
             write(docs, ALL, kept)
-        elif "slices" in asked:
-            file = run.folder(QUICK if args.quick else SCENES[ANIMATED]) / "slices.pd4"
-            if file.is_file():
-                refining_gif.draw(file.read_bytes(), run.images / "refining.gif")
     except (Pd4Error, OSError, KeyboardInterrupt) as error:
         say(f"run: error: {str(error) or 'interrupted; the same command continues'}")
         return 1

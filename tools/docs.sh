@@ -8,5 +8,4 @@ make_environment .venv-docs docs
 rm -rf out/site
 .venv-docs/bin/python -m sphinx -q -W --keep-going -j auto -c tools/site -d out/site.doctrees "$@" . out/site
 .venv-docs/bin/python tools/notebook.py docs/tutorial.md out/site/tutorial.ipynb
-[ ! -d out/gallery ] || cp -r out/gallery out/site/gallery # made by tools/gallery.py
 echo "The site is in out/site/index.html"

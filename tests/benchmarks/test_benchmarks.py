@@ -14,7 +14,7 @@ import page
 import pytest
 import quality
 import run
-from common import QUICK, ROOT, Run
+from common import QUICK, ROOT, Run, Training
 from PIL import Image
 from refining_gif import LIMIT
 from tiny import TINY
@@ -122,6 +122,35 @@ def test_a_run_stops_at_the_benchmark_that_fails(made, tmp_path, monkeypatch, ca
 def test_a_command_that_fails_is_named():
     with pytest.raises(DataError, match="pd4dgs-info nowhere.pd4 --json: exit code 1, expected 0"):
         common.command("info", "nowhere.pd4")
+    with pytest.raises(DataError, match=r"pd4dgs-info nowhere.pd4 --json: exit code 1: .*nowhere.pd4"):
+        common.command_apart("info", "nowhere.pd4")
+
+
+def test_trainings_side_by_side_are_those_that_are_measured(tmp_path, monkeypatch):
+    """Each once, in a process of its own, the longest first."""
+    ran = []
+
+    def train(name, *words):
+        ran.append(words[words.index("--iterations") + 1])
+        Path(words[words.index("-o") + 1]).touch()
+        return {"finished": True}
+
+    monkeypatch.setattr(common, "command_apart", train)
+    monkeypatch.setattr(common.os, "cpu_count", lambda: 1)
+    here, jobs = Run(tmp_path, tmp_path), [Training(QUICK), Training(QUICK, longer=2), Training(QUICK)]
+    here.train(jobs)
+    assert ran == ["20", "10"]
+    here.train(jobs)
+    assert here.trained(QUICK)[1]["finished"] and len(ran) == 2
+
+
+def test_sections_older_than_the_package_are_named(monkeypatch):
+    newer = {"a1": "", "b2": "c3, Package: change", "gone": ""}
+    monkeypatch.setattr(
+        run, "git", lambda verb, *words: newer[words[2][:-6]] if verb == "log" else "commit" * (words[1] != "gone")
+    )
+    lines = run.aged([{"name": name, "commit": name} for name in newer] + [{"name": "own", "commit": "a1, changed"}])
+    assert [line.partition(":")[0] for line in lines] == ["b2", "gone"] and "c3, Package: change" in lines[0]
 
 
 def test_several_seeds_are_shown_with_their_spread():

@@ -89,8 +89,6 @@ def add_contents(app: Any, docname: str, source: list[str]) -> None:
     """Event source-read: the start page gets the table of contents, and what tools/docs.sh lays beside the pages."""
     if docname == root_doc:
         source[0] += '\n<a href="tutorial.ipynb">The tutorial as a notebook</a>\n'
-        if (ROOT / "out" / "gallery").is_dir():
-            source[0] += '· <a href="gallery/index.html">Gallery of synthetic scenes</a>\n'
         source[0] += "".join(toctree([f"/{page}" for page in pages], caption) for caption, pages in CONTENTS.items())
 
 
