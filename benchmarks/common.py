@@ -95,7 +95,7 @@ SCENES = {
 #: Where a second kind of scene says more, where it would say little, and where many trainings are compared.
 TWO, ONE, TINY = ("shelf-hand", "mutant-200"), ("shelf-hand",), ("bend",)
 #: The scene of --quick.
-QUICK = Scene("quick", "synthetic:local?size=48x36&frames=4", "", iterations=10)
+QUICK = Scene("quick", "synthetic:local?size=48x36&frames=4", "a few pixels", iterations=10)
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ def command_apart(name: str, *arguments: object) -> Row:
     """The same in a process of its own. What it says on stderr is kept for its error alone."""
     words = [sys.executable, "-m", "pd4dgs_codec", name, *map(str, arguments), "--json"]
     done = subprocess.run(words, capture_output=True, text=True, cwd=ROOT)
-    if not done.stdout:
+    if done.returncode:
         told = (done.stderr.strip().splitlines() or ["nothing"])[-1]
         raise DataError(f"pd4dgs-{name} {' '.join(words[4:])}: exit code {done.returncode}: {told}")
     result: Row = json.loads(done.stdout)

@@ -8,7 +8,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from common import ONE, SCENES, Benchmark, Row, Run, Scene, Training, command, levels, number, seconds_at, table
+from common import ONE, QUICK, SCENES, Benchmark, Row, Run, Scene, Training, command, levels, number, seconds_at, table
 
 from pd4dgs_codec.bench.report import drawing
 
@@ -110,7 +110,7 @@ def text(rows: Sequence[Row]) -> str:
     """A row per scene and level: medians over the seeds and, of several, the least and the most. Scenes that papers
     report on have a table of their own, with what they report."""
     ours, official = ([row for row in rows if ("psnr" in row) == by] for by in (False, True))
-    names = dict.fromkeys(row["scene"] for row in rows)
+    shown = [described(scene) for scene in (*SCENES.values(), QUICK) if any(row["scene"] == scene.name for row in rows)]
     seeds = 1 + max(row["seed"] for row in rows)
     told = f" Medians of {seeds} seeds, with the least and the most." if seeds > 1 else ""
     parts = [
@@ -118,8 +118,9 @@ def text(rows: Sequence[Row]) -> str:
         "the same scene trained for the highest level alone, without a rate term, stored as float32 under LZMA. "
         "*moving*: pixels whose truth changes over time, where test cameras stand still. Each training has one thread, "
         f"with another beside it.{told}",
-        table(("scene", "shows", "`pd4dgs-train`"), [described(SCENES[name]) for name in names if name in SCENES]),
     ]
+    if shown:
+        parts.append(table(("scene", "shows", "`pd4dgs-train`"), shown))
     if ours:
         parts.append(levels_table(ours, "m"))
     if official:

@@ -104,7 +104,7 @@ def test_a_training_is_kept_for_the_same_command_and_package(made, monkeypatch, 
     for options, tree in (((), "another package"), (("--quality", "40"), common.package_tree())):
         monkeypatch.setattr(common, "package_tree", lambda tree=tree: tree)
         with pytest.raises(pytest.fail.Exception, match="'train'"):
-            Run(tmp_path, tmp_path).trained(QUICK, *options)
+            Run(tmp_path, tmp_path, quick=True).trained(QUICK, *options)
 
 
 def test_a_run_stops_at_the_benchmark_that_fails(made, tmp_path, monkeypatch, capsys):
@@ -171,7 +171,8 @@ def test_official_scenes_stand_beside_what_is_published():
     row = {"level": 1, "seed": 0, "bytes": 9e5, "mpsnr": 30.0, "mssim": 0.9, "anchors": 7, "steps": 9, "minutes": 1.0}
     official = row | {"psnr": 40.0, "ssim": 0.99}
     rows = [official | {"scene": "mutant"}, official | {"scene": "basketball", "moving_mpsnr": 20.0}]
-    _, ours, told, theirs = quality.text([row | {"scene": "shelf-hand"}, *rows]).split("\n\n")
+    _, what, ours, told, theirs = quality.text([row | {"scene": "shelf-hand"}, *rows]).split("\n\n")
+    assert "`mutant --preset small --iterations 10000`" in what and len(what.splitlines()) == 5
     assert "mPSNR dB" in ours and len(ours.splitlines()) == 3 and "--protocol 3dgs" in told
     head, _, *cells = (line.strip("| ").split(" | ") for line in theirs.splitlines())
     assert head[4:7] == ["PSNR dB", "moving dB", "SSIM"] and {len(line) for line in cells} == {len(head)}
