@@ -3,7 +3,7 @@
 Both are zip archives with a pickle `data.pkl` and one member per storage. The machine below knows the operations and
 the names that such pickles need and refuses all others. What it makes takes memory and time in proportion to the file:
 members that it reads are not compressed, tensors hold no more bytes than the file, lists, dicts and tensors have one
-place each, and keys are short texts or numbers. `torch.load(weights_only=True)` has none of these
+place each, and keys are short texts or small numbers. `torch.load(weights_only=True)` has none of these
 bounds, and refuses TorchScript.
 """
 
@@ -27,6 +27,7 @@ STORAGES = dict(
 )  # fmt: skip
 MAX_PICKLE = 1 << 21  #: bytes of data.pkl
 SHORT, FEW = 256, 4  #: most characters of a key, and of a text that a pickle refers to again; values of such a tuple
+MAX_KEY = 1 << 31  #: of numbers as keys: multiples of 2^61 - 1 have one hash, and a dict of them takes quadratic time
 VALUES = {"BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT", "BINUNICODE", "SHORT_BINUNICODE"}
 CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
 TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
@@ -79,7 +80,7 @@ class _Machine:
         pickles = [member for member in members if member.filename.split("/")[1:] == ["data.pkl"]]
         if len(pickles) != 1 or pickles[0].file_size > MAX_PICKLE:
             raise Refused(f"{len(pickles)} members NAME/data.pkl, expected one of {MAX_PICKLE:,} bytes at most")
-        self.archive, self.left, self.made = archive, size, made
+        self.archive, self.size, self.left, self.made = archive, size, size, made
         self.prefix = pickles[0].filename.removesuffix("data.pkl")
         if f"{self.prefix}byteorder" in archive.NameToInfo and self._read("byteorder") != b"little":
             raise Refused("numbers that are not little-endian")
@@ -163,17 +164,18 @@ class _Machine:
 
     def _build(self, state: Any) -> None:
         """Members of a module; those of an OrderedDict are torch's own notes."""
-        if isinstance(self.stack[-1], Module):
+        if isinstance(self.stack[-1], Module) and isinstance(state, dict):
             self.stack[-1].members.update(state)
         elif not isinstance(self.stack[-1], dict):
-            raise Refused("the pickle gives members to what is no module")
+            raise Refused("the pickle gives members to what is no module, or no members")
 
     def _tensor(self, storage: np.ndarray, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: Any) -> Any:
         """A tensor, a view of its storage."""
         whole = all(type(v) is int and v >= 0 for v in (offset, *size, *stride)) and len(size) == len(stride)
         count = math.prod(size) if whole else -1
         last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True)) if whole and count else offset
-        if not whole or count > len(storage) or (count and last >= len(storage)):
+        # an axis is bounded even where another is empty: its length may become that of an array
+        if not whole or count > len(storage) or (count and last >= len(storage)) or max(size, default=0) > self.size:
             raise Refused("a tensor that reaches beyond its storage")
         self.left -= count * storage.itemsize
         if self.left < 0:
@@ -204,6 +206,6 @@ def _set(items: list[Any], target: Any) -> None:
     if not isinstance(target, dict) or len(items) % 2:
         raise Refused("a pickle that sets items of what is no dict")
     for key in items[::2]:
-        if not (isinstance(key, str) and len(key) <= SHORT or isinstance(key, int)):
-            raise Refused(f"a key that is no short text: {one_line(repr(key), 60)}")
+        if not (isinstance(key, str) and len(key) <= SHORT or isinstance(key, int) and abs(key) <= MAX_KEY):
+            raise Refused(f"a key that is no short text or number: {one_line(repr(key), 60)}")
     target.update(zip(items[::2], items[1::2], strict=True))
