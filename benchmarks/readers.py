@@ -40,6 +40,11 @@ def text(value: str) -> bytes:
     return b"X" + len(value).to_bytes(4, "little") + value.encode()
 
 
+def number(value: int) -> bytes:
+    """A number of at most 15 bytes in a pickle."""
+    return b"\x8a\x0f" + value.to_bytes(15, "little")
+
+
 def checkpoint_with(training: bytes) -> bytes:
     """A checkpoint with this value of "training", and a digest that is found wrong once all of it is walked."""
     head = text("format") + text("pd4dgs-checkpoint") + text("version") + b"K\x01"
@@ -60,6 +65,16 @@ def blank_png(width: int, height: int) -> bytes:
     stream = io.BytesIO()
     Image.new("1", (width, height)).save(stream, "png")
     return stream.getvalue()
+
+
+def many_scans(side: int) -> bytes:
+    """A progressive JPEG of one grey with as many passes over its pixels as are read."""
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.new("L", (side, side), 128).save(stream, "jpeg", progressive=True)
+    raw = stream.getvalue()[:-2]
+    return raw + (100 - raw.count(b"\xff\xda")) * raw[raw.rindex(b"\xff\xda") :] + b"\xff\xd9"
 
 
 def blank_film(side: int, frames: int) -> bytes:
@@ -112,10 +127,10 @@ def read_frames(path: Path) -> None:
 
 
 def read_model(path: Path) -> None:
-    """COLMAP's points and images as text."""
-    from pd4dgs_codec.data.colmap import _Text
+    """COLMAP's points and images."""
+    from pd4dgs_codec.data.colmap import _Binary, _Text
 
-    reader = _Text(path)
+    reader = (_Text if path.suffix == ".txt" else _Binary)(path)
     list(reader.points() if "points" in path.name else reader.images())
 
 
@@ -158,6 +173,11 @@ CASES: dict[str, tuple[str, Callable[[], bytes], Callable[[Path], None]]] = {
     "checkpoint: deflated": (
         "m.pt", lambda: archive(b"}", zipfile.ZIP_DEFLATED, bytes(256 * MEGABYTE)), read_checkpoint
     ),
+    "checkpoint: keys of one hash": (
+        "m.pt",
+        lambda: checkpoint_with(b"}(" + b"".join(number(k * (2**61 - 1)) + b"N" for k in range(1, 99_000)) + b"u"),
+        read_checkpoint,
+    ),
     "model to import: modules": (
         "m.pt", lambda: archive(b"](c__torch__.a\nb\nq\0)\x81" + b"h\0)\x81" * (MEGABYTE // 4) + b"e"), read_import
     ),
@@ -175,8 +195,12 @@ CASES: dict[str, tuple[str, Callable[[], bytes], Callable[[Path], None]]] = {
     ),
     "COLMAP: blank lines": ("images.txt", lambda: b"\n" * MEGABYTE, read_model),
     "COLMAP: points as text": ("points3D.txt", lambda: b"1 0 0 0 0 0 0 0\n" * (MEGABYTE // 16), read_model),
+    "COLMAP: points, binary": (
+        "points3D.bin", lambda: (MEGABYTE // 51).to_bytes(8, "little") + bytes(51 * (MEGABYTE // 51)), read_model
+    ),
     "picture: 16 megapixels (PNG)": ("x.png", lambda: blank_png(4096, 4096), read_picture),
     "picture: 177 megapixels (PNG)": ("x.png", lambda: blank_png(16384, 10800), read_picture),
+    "picture: 16 megapixels in 100 scans (JPEG)": ("x.jpg", lambda: many_scans(4096), read_picture),
     "video: 30 blank frames of 2048 x 2048": ("x.mp4", lambda: blank_film(2048, 30), read_film),
     "library: lists in lists": ("a/index.json", lambda: b"[" * MEGABYTE, read_library),
     "manifest: broken lines": ("m.jsonl", lambda: b"{}\n" * (MEGABYTE // 12), read_manifest),

@@ -29,6 +29,8 @@ FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")  #: of pictures; one of Pillow'
 FREE_BYTES, INFLATES = 1 << 20, 16
 #: Pixels that pictures of any size may have, and more for each byte of theirs: blank ones of 4K are read.
 FREE_PIXELS, PIXELS_PER_BYTE = 1 << 24, 256
+#: Passes of a progressive JPEG over all of its pixels: usual are ten, and a few bytes make one more.
+MAX_SCANS, SCAN = 100, b"\xff\xda"
 #: Pillow's pixel modes with one obvious conversion to RGB; others (CMYK, LAB, floats) are refused.
 GREY16_MODES = {"I;16", "I;16L", "I;16B"}
 READABLE_MODES = {"1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX"} | GREY16_MODES
@@ -204,6 +206,10 @@ def _open(path: Path, what: str = "image", size: tuple[int, int] | None = None) 
     except Exception:  # Pillow raises many kinds
         raise DataError(f"{path}: not an image that can be read, expected {', '.join(FORMATS)}") from None
     check_pixels(picture.width * picture.height, [path], str(path))
+    scans = path.read_bytes().count(SCAN) if picture.format in ("JPEG", "MPO") else 0
+    if scans > MAX_SCANS:
+        picture.close()
+        raise DataError(f"{path}: {scans:,} scans, expected {MAX_SCANS} at most in a JPEG")
     if size is not None and picture.size != tuple(size):
         picture.close()
         raise DataError(f"{path}: {what} is {picture.width}x{picture.height}, expected {size[0]}x{size[1]}")

@@ -105,6 +105,14 @@ def blank() -> bytes:
     return stream.getvalue()
 
 
+def scans() -> bytes:
+    """A progressive JPEG whose last pass comes a hundred times more."""
+    stream = io.BytesIO()
+    Image.new("L", (12, 8), 128).save(stream, "jpeg", progressive=True)
+    raw = stream.getvalue()[:-2]
+    return raw + 100 * raw[raw.rindex(b"\xff\xda") :] + b"\xff\xd9"
+
+
 def renamed(file: dict[str, Any], name: str) -> dict[str, Any]:
     """The transforms with another name for the first frame's image."""
     first, *others = file["frames"]
@@ -198,6 +206,7 @@ CASES: list[tuple[str, str, Any, str]] = [
     ("blender", "transforms.json", lambda file: renamed(file, "\x1b]0;x\x07" * 40), "image is missing"),
     ("blender", "transforms.json", {"frames": FRAMES * 5, "near_far_per_frame": None}, "15 frames are of 3 pictures"),
     ("blender", "r_0.png", lambda _: blank(), "33,554,432 pixels, expected"),
+    ("blender", "r_0.png", lambda _: scans(), "scans, expected 100 at most in a JPEG"),
     ("blender", "r_0.png", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 12 8\n", "not an image that can be read"),
     ("iphone", "splits/train.json", {"frame_names": ["../camera/0_00000"]}, "no entry for frame"),
     ("iphone", "splits/train.json", {"frame_names": ["0_00000"] * 2}, "names a frame twice"),
