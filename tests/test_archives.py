@@ -85,7 +85,7 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
     "a text that stands for gigabytes": (lambda: b"](" + text("x" * 9999) + b"q\x00" + b"h\x00" * 999 + b"e", "places"),
     "a tuple for a key": (lambda: b"}" + b"J\xff\xff\xff\xff" * 2 + b"\x86Ns", "a key that is no short text"),
     "keys that make long names": (lambda: b"}" + text("x" * 999) + b"Ns", "a key that is no short text"),
-    "a number for a key whose hash others have": (lambda: b"}" + numbers((1 << 61) - 1)[:-1] + b"Ns", "a key that is no"),
+    "a number for a key of a common hash": (lambda: b"}" + numbers((1 << 61) - 1)[:-1] + b"Ns", "a key that is no"),
     "members in pairs": (lambda: b"c__torch__.a\nb\n)\x81](" + text("x") + b"N\x86eb", "no module, or no members"),
     "an operation that none needs": (lambda: b"(" + text("a") + b"l", "the operation LIST"),
     "a memo of 2^31 places": (lambda: b"]r\xff\xff\xff\x7f" * 3, "not a zip archive of tensors"),
