@@ -60,6 +60,11 @@ class TrainingProgress:
             limit = f" of {trainer.config.max_seconds:g}" if trainer.timed else ""
             say(f"{steps}, {trainer.seconds:.0f}{limit} s: {psnr} dB, {record['anchors']} anchors")
 
+    def on_trial(self, done: int, steps: int) -> None:
+        """Called before every step on trial with the steps done and their number."""
+        if self.bar is not None:
+            self.bar.set_postfix_str(f"trial of motion or levels: step {done + 1}/{steps}")
+
     def close(self) -> None:
         """Removes the bar."""
         if self.bar is not None:

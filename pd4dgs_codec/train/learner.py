@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -35,6 +35,8 @@ class Learner(TrainState):
     """The state of a training and its steps.
 
     before_step: the phases that act before a step, in their order; `grow` acts after the update.
+    before_practice: called before each step on trial with the steps done and their number; what it raises ends the
+    trial.
     """
 
     def __init__(
@@ -52,6 +54,7 @@ class Learner(TrainState):
         super().__init__(config, dataset, schedule, device, size)
         self.model_loss = ModelLoss(config, self.generator)
         self.levels, self.prefixes, self.grow = SelectLevels(self.practise), Prefixes(), Grow()
+        self.before_practice: Callable[[int, int], None] = lambda done, steps: None
         pruning = (Prune(turn) for turn in range(PRUNING_ROUNDS))
         self.before_step: list[Phase] = [
             OpenTime(self.practise),
@@ -81,7 +84,8 @@ class Learner(TrainState):
         """Trains `level` for so many steps where the run stands, on trial: nothing is grown."""
         self.practising = True
         try:
-            for _ in range(steps):
+            for done in range(steps):
+                self.before_practice(done, steps)
                 self._learn([(next_view(self, level), level) for _ in range(self.config.views_per_step)], {}, None)
                 self.optimiser.zero_grad()
         finally:

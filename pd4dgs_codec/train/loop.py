@@ -45,8 +45,15 @@ class Progress(Protocol):
     def update(self, trainer: Trainer, record: dict[str, Any]) -> None:
         """Called after every step with its log record."""
 
+    def on_trial(self, done: int, steps: int) -> None:
+        """Called before every step on trial with the steps done and their number."""
+
     def close(self) -> None:
         """Called once, when the run ends or raises."""
+
+
+class Stopped(Exception):
+    """A signal came in a trial, which is undone; the same step comes again when the run is resumed."""
 
 
 class Trainer:
@@ -123,9 +130,20 @@ class Trainer:
     ) -> None:
         """Steps until the run ends; a record that cannot be logged ends it too."""
         saved = now = time.monotonic()
+
+        def before_practice(done: int, steps: int) -> None:
+            if any(workers.largest(stop.is_set())):
+                raise Stopped
+            if progress:
+                progress.on_trial(done, steps)
+
+        self.learner.before_practice = before_practice
         while not self.finished:
             position = self.learner.position
-            record = self.learner.step()
+            try:
+                record = self.learner.step()
+            except Stopped:
+                break
             now, begun = time.monotonic(), now
             late = self._spend(*workers.largest(now - begun))  # one clock for all workers
             if self._curve_due(position):

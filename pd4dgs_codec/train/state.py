@@ -214,17 +214,20 @@ class TrainState:
 
     # -- changes ---------------------------------------------------------------------------------------------------
 
-    def snapshot(self) -> list[dict[Any, Any]]:
-        """The parameters and their moments as they are, for `return_to`."""
+    def snapshot(self) -> tuple[Any, ...]:
+        """The parameters, their moments and what draws views and noise as they are, for `return_to`."""
+        values = {p: p.detach().clone() for p in self.optimiser.parameters}
         moments = {p: {n: m.clone() for n, m in own.items()} for p, own in self.optimiser.moments.items()}
-        return [{p: p.detach().clone() for p in self.optimiser.parameters}, moments]
+        return values, moments, self.generator.get_state(), self.noise.generator.get_state(), list(self.order)
 
     @torch.no_grad()
-    def return_to(self, before: list[dict[Any, Any]]) -> None:
+    def return_to(self, before: tuple[Any, ...]) -> None:
         """Undoes all steps since a `snapshot`."""
-        values, self.optimiser.moments = before
+        values, self.optimiser.moments, generator, noise, self.order = before
         for parameter, value in values.items():
             parameter.copy_(value)
+        self.generator.set_state(generator)
+        self.noise.generator.set_state(noise)
 
     def keep_anchors(self, rows: Tensor) -> None:
         """Keeps only the anchors `rows` (int64)."""

@@ -2,12 +2,13 @@
 
 import json
 import math
+import signal
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from runs import assert_resumes_bit_for_bit, read_log
+from runs import assert_resumes_bit_for_bit, assert_same_weights, read_log
 from tiny import TINY, disc
 from trainer_rate import train_rate_bits
 
@@ -147,6 +148,29 @@ def test_steps_while_time_opens_leave_planes_linear_between_few_instants(dataset
         times, (p for s in field.arrays().planes for n, p in s.items() if n[1] == "t"), strict=True
     ):
         np.testing.assert_allclose(after, before, atol=1e-5)
+
+
+@pytest.mark.usefixtures("short_runs_have_phases")
+def test_a_signal_ends_a_trial_which_comes_again(dataset, tmp_path, monkeypatch):
+    config = TrainConfig(preset="tiny", iterations=30)
+    trainer, whole, resumed = (Trainer(config, dataset) for _ in range(3))
+    update, updates = trainer.learner.optimiser.step, []
+
+    def interrupted(*at):
+        if trainer.learner.practising:
+            updates.append(trainer.iteration)
+            if len(updates) == 2:
+                signal.raise_signal(signal.SIGTERM)
+        update(*at)
+
+    monkeypatch.setattr(trainer.learner.optimiser, "step", interrupted)
+    trainer.run(tmp_path / "part.pt")
+    assert trainer.interrupted and updates == [trainer.learner.schedule.coarse_end] * 2
+    assert trainer.iteration == trainer.learner.schedule.coarse_end
+    resumed.resume(tmp_path / "part.pt")
+    resumed.run(tmp_path / "resumed.pt")
+    whole.run(tmp_path / "whole.pt")
+    assert_same_weights(tmp_path / "resumed.pt", tmp_path / "whole.pt")
 
 
 # -- pruning -----------------------------------------------------------------------------------------------------------
