@@ -272,8 +272,8 @@ def test_a_scene_that_needs_no_anchor_keeps_some(dataset, monkeypatch, rollout):
 
 
 def judged(dataset, monkeypatch, least):
-    """(a learner after its levels were judged with `least` as MIN_GAIN, its parameters and moments before)."""
-    monkeypatch.setattr(levels, "MIN_GAIN", least)
+    """(a learner after its levels were judged with `least` as MIN_GAINS, its parameters and moments before)."""
+    monkeypatch.setattr(levels, "MIN_GAINS", dict.fromkeys(levels.MIN_GAINS, least))
     monkeypatch.setattr(levels, "MIN_PRACTICE", 3)
     learner = Trainer(TrainConfig(preset="tiny", iterations=30), replace(dataset, train=dataset.train * 12)).learner
     with torch.no_grad():
