@@ -445,7 +445,7 @@ def read_scales(rows, below):
         for side in row[1:5]:
             limited(side, 4096, "a plane's side", 1)
         for predictor in row[5:]:
-            registered(predictor, range(6), "a predictor")
+            registered(predictor, range(4), "a predictor")
     return rows
 
 
@@ -580,12 +580,8 @@ def restore(residuals, predictor, h, w):
             k[at] += west
         elif predictor == 2:
             k[at] += north
-        elif predictor == 3:
-            k[at] += max(min(west, north), min(max(west, north), west + north - corner))
-        elif predictor == 4:
-            k[at] += west + north - corner
         else:
-            k[at] += (west + north) >> 1
+            k[at] += max(min(west, north), min(max(west, north), west + north - corner))
     return k
 
 
@@ -628,7 +624,7 @@ def histogram_table(classes, top, step):
     return [((s >> h) * (TOTAL - len(classes))) // (sums[-1] >> h) + q for q, s in enumerate(sums)]
 
 
-# 7.7 ANS streams: "A stream is a multiple of 4 bytes: u32 words in the order in which the decoder takes them. It may
+# 7.6 ANS streams: "A stream is a multiple of 4 bytes: u32 words in the order in which the decoder takes them. It may
 # be empty; its first word MUST NOT be 0."
 class Ans:
     def __init__(self, data):
@@ -639,7 +635,7 @@ class Ans:
             self.x = self.x << 32 | self.words[self.at]
             self.at += 1
 
-    # 7.7 ANS streams: "x = (x >> 24)·(cum[s+1] − cum[s]) + q − cum[s] if x < 2^32 and words are left: x = x·2^32 +
+    # 7.6 ANS streams: "x = (x >> 24)·(cum[s+1] − cum[s]) + q − cum[s] if x < 2^32 and words are left: x = x·2^32 +
     # next word"
     def take(self, count, cum):
         if len(cum) == 2:
@@ -655,36 +651,31 @@ class Ans:
             result.append(s)
         return result
 
-    # 7.7 ANS streams: "x MUST be 0 and no word left, else Malformed"
+    # 7.6 ANS streams: "x MUST be 0 and no word left, else Malformed"
     def finish(self):
         need(self.x == 0 and self.at == len(self.words), "an ANS stream does not end in state 0")
 
 
 class Prior:
-    """kmin, n, shift: the window of clause 8.2; cum: its table, for a hist once the classes are known."""
+    """kmin, n: the window of clause 8.2; cum: its table, for a hist once the classes are known."""
 
-    def __init__(self, kmin, n, shift, cum):
-        self.kmin, self.n, self.shift, self.cum = kmin, n, shift, cum
-        self.end = kmin + (n << shift)
+    def __init__(self, kmin, n, cum):
+        self.kmin, self.n, self.cum = kmin, n, cum
+        self.end = kmin + n
         self.classes = None  # of a hist: (step, top, differences, table of the classes)
 
 
-# 8.1 Parameter block: "a new prior: u8 shift 1..12, u8 family 1..3, the family's parameters"
+# 8.1 Parameter block: "a new prior of this family"
 # 8.2 Priors: "The floor of a mixture is that of its first normal; the bit is reserved in the second."
 def read_prior(reader, family):
-    shift = 0
-    if family == 4:
-        shift, family = reader.byte(12), reader.byte()
-        need(shift, "a scaled prior of shift 0")
-        need(family, "a scaled constant")
     need(family <= 3, f"prior family {family}", "UnsupportedFeature")
     kmin = reader.zigzag(K)
     if family == 0:
-        return Prior(kmin, 1, 0, [0, TOTAL])
+        return Prior(kmin, 1, [0, TOTAL])
     n = 2 + reader.varint((1 << 14) - 2)
-    need(kmin + ((n - 1) << shift) <= K, "a window passes the largest symbol")
+    need(kmin + n - 1 <= K, "a window passes the largest symbol")
     if family == 3:
-        return read_histogram(reader, Prior(kmin, n, shift, None))
+        return read_histogram(reader, Prior(kmin, n, None))
     mu8, si, floor = read_normal(reader, n)
     cdf = norm_cdf(n, mu8, si)
     if family == 2:
@@ -693,7 +684,7 @@ def read_prior(reader, family):
         need(w, "a mixture of weight 0")
         need(not reserved, "a mixture with a reserved bit")
         cdf = [((256 - w) * c1 + w * c2) >> 8 for c1, c2 in zip(cdf, norm_cdf(n, mu8, si))]  # clause 7.4
-    return Prior(kmin, n, shift, table_of(cdf, 16 if floor else 1))
+    return Prior(kmin, n, table_of(cdf, 16 if floor else 1))
 
 
 # 8.2 Priors: "Of a normal, mu8 = g + 128·(n − 1) and si = (v >> 1) − 640. Bit 0 of v is the floor: fl = 1 if it is 0,
@@ -731,7 +722,7 @@ def take_classes(stream, prior):
     prior.cum = histogram_table(classes, top, step)
 
 
-# 8.3 Exceptions: "the symbol is kmin − 1 − (c >> 1) if c is odd, else kmin + n·2^shift + (c >> 1)." "There MUST NOT be
+# 8.3 Exceptions: "the symbol is kmin − 1 − (c >> 1) if c is odd, else kmin + n + (c >> 1)." "There MUST NOT be
 # more exceptions than symbols, the symbol MUST lie in −K..K and its position within the channel, else Malformed."
 def read_exceptions(reader, count, prior):
     number = 1 + reader.varint(VARINT_MAX)
@@ -779,16 +770,9 @@ def decode_channels(data, counts, known=None):
     return channels
 
 
-# 8.4 Symbols: "for shift 0 the entries s of the prior's table; else first all entries, then all low bits r under the
-# uniform table of shift bits. The symbol is kmin + s·2^shift + r, and MUST NOT exceed K, else Malformed. Exceptions
-# are then put in their places."
+# 8.4 Symbols: "the entries s of the prior's table. The symbol is kmin + s. Exceptions are then put in their places."
 def take_channel(stream, count, prior, exceptions):
-    left = count - len(exceptions)
-    symbols = [prior.kmin + (s << prior.shift) for s in stream.take(left, prior.cum)]
-    if prior.shift:
-        uniform = [q << (24 - prior.shift) for q in range((1 << prior.shift) + 1)]  # clause 7.6
-        symbols = [k + r for k, r in zip(symbols, stream.take(left, uniform))]
-        need(not symbols or max(symbols) <= K, "a symbol over K")
+    symbols = [prior.kmin + s for s in stream.take(count - len(exceptions), prior.cum)]
     if not exceptions:
         return symbols
     inside = iter(symbols)

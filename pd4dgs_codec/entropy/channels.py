@@ -5,20 +5,19 @@ new prior's parameters, else the prior defined (family - 8) definitions before t
 exceptions, if any: their number, and for each the gap to the previous position and the distance outside the window.
 Definitions of earlier payloads count too if the caller passes them on.
 After the last channel the ANS words: the classes of each histogram prior in order of definition, then each channel's
-symbols, those of a scaled prior as all table entries followed by all low bits.
+symbols.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cache
 from itertools import accumulate
 
 import numpy as np
 
 from pd4dgs_codec.entropy import EFFORTS, PRIORS
-from pd4dgs_codec.entropy.ans import MAX_COUNT, AnsDecoder, Model, ans_encode, model_of
+from pd4dgs_codec.entropy.ans import MAX_COUNT, AnsDecoder, ans_encode
 from pd4dgs_codec.entropy.fitting import Fit, Fitted, fit_best, histogram, plan_priors
 from pd4dgs_codec.entropy.priors import (
     FIRST_REUSE,
@@ -28,13 +27,11 @@ from pd4dgs_codec.entropy.priors import (
     Hist,
     Prior,
     Window,
-    family_code,
     make_models,
     read_prior,
     with_class_symbols,
-    write_prior,
 )
-from pd4dgs_codec.entropy.tables import BIT, uniform_table
+from pd4dgs_codec.entropy.tables import BIT
 from pd4dgs_codec.entropy.varint import VARINT_MAX, ByteReader, put_varint
 from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
 
@@ -117,12 +114,8 @@ def _encode(
         inside, exceptions = _split(array, prior.window)
         if _write_channel(out, prior, exceptions, defined):
             fresh.append(fitted)
-        entries, shift = inside - prior.window.kmin, prior.window.shift
-        symbols.append(entries >> shift)
+        symbols.append(inside - prior.window.kmin)
         cums.append(prior.cum)
-        if shift:
-            symbols.append(entries & ((1 << shift) - 1))
-            cums.append(uniform_table(shift))
     tables = [f.prior for f in fresh if isinstance(f.prior, Hist)]
     words = ans_encode([*(p.class_symbols for p in tables), *symbols], [*(p.class_cum for p in tables), *cums])
     return bytes(out) + words, fresh
@@ -140,10 +133,10 @@ def _split(array: np.ndarray, window: Window) -> tuple[np.ndarray, _Exceptions]:
 def _write_channel(out: bytearray, prior: Prior, exceptions: _Exceptions, defined: list[Prior]) -> bool:
     """Returns whether the channel defines its prior, which is then appended to `defined`."""
     back = next((i for i, known in enumerate(reversed(defined)) if known is prior), None)
-    family = family_code(prior) if back is None else FIRST_REUSE + back
+    family = prior.id if back is None else FIRST_REUSE + back
     put_varint(out, 2 * family + (len(exceptions.positions) > 0))
     if back is None:
-        write_prior(out, prior)
+        prior.write(out)
         defined.append(prior)
     if not len(exceptions.positions):
         return back is None
@@ -235,7 +228,7 @@ _Head = tuple[int, int, _Exceptions | None]
 def _joined(one: _Head, next: _Head, defined: list[Prior]) -> _Head | None:
     """One head for two channels of one prior, if their symbols follow each other under its table."""
     (index, some, exceptions), (_, more, others) = one, next
-    apart = exceptions or others or defined[index].window.shift or some + more > MAX_COUNT
+    apart = exceptions or others or some + more > MAX_COUNT
     return None if apart else (index, some + more, None)
 
 
@@ -253,22 +246,13 @@ def _read_channel(reader: ByteReader, count: int, defined: list[Prior]) -> _Head
     return index, count, _read_exceptions(reader, count, defined[index].window) if token & 1 else None
 
 
-@cache
-def _low_bits(shift: int) -> Model | None:
-    return model_of(uniform_table(shift))
-
-
 def _take_channel(stream: AnsDecoder, prior: Prior, exceptions: _Exceptions | None, out: np.ndarray) -> None:
     """Decodes a channel into `out` int32 [count]."""
-    window, left = prior.window, len(out) - (0 if exceptions is None else len(exceptions.positions))
-    inside = stream.take(left, prior.model)
-    if window.shift:
-        inside = (inside << window.shift) + stream.take(left, _low_bits(window.shift))
-        if left and int(inside.max()) + window.kmin > K_MAX:
-            raise Malformed(f"symbol {int(inside.max()) + window.kmin}, limit {K_MAX}")
+    kmin = prior.window.kmin
+    inside = stream.take(len(out) - (0 if exceptions is None else len(exceptions.positions)), prior.model)
     if exceptions is None:
-        np.add(inside, window.kmin, out=out)
+        np.add(inside, kmin, out=out)
         return
     listed = np.zeros(len(out), dtype=bool)
     listed[exceptions.positions] = True
-    out[listed], out[~listed] = exceptions.values, inside + np.int32(window.kmin)
+    out[listed], out[~listed] = exceptions.values, inside + np.int32(kmin)

@@ -458,13 +458,13 @@ def cost_matrix(
     """Cost of each channel under each prior without its description, int64 [channels, priors].
 
     values, counts: int64, of all channels one after the other, which end at `ends` [channels]. windows: int64
-    [priors, 4] of (kmin, n, shift, first of its entries in `costs`); costs int64: of all entries, low bits included.
+    [priors, 3] of (kmin, n, first of its entries in `costs`); costs int64: of all entries.
     Symbols outside a window are listed: their number, and a position step and a distance each, an estimate.
     """
     matrix = np.empty((len(ends), len(windows)), np.int64)
     for column in range(len(windows)):
-        kmin, n, shift, at = windows[column]
-        end = kmin + (n << shift)
+        kmin, n, at = windows[column]
+        end = kmin + n
         first = 0
         for channel in range(len(ends)):
             cost, number, value_bytes, total = 0, 0, 0, 0
@@ -472,7 +472,7 @@ def cost_matrix(
                 value, count = values[i], counts[i]
                 total += count
                 if kmin <= value < end:
-                    cost += count * costs[at + ((value - kmin) >> shift)]
+                    cost += count * costs[at + value - kmin]
                 else:
                     distance = 2 * (kmin - value if value < kmin else value - end)
                     number += count

@@ -31,7 +31,6 @@ from pd4dgs_codec.entropy.priors import (
     Normal,
     Prior,
     Window,
-    write_prior,
 )
 from pd4dgs_codec.entropy.tables import BIT, order0_bits, symbol_counts
 
@@ -67,7 +66,7 @@ class Histogram:
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A prior and its costs. costs: int64 [n], of its table's entries, low bits included. price: of its description.
+    """A prior and its costs. costs: int64 [n], of its table's entries. price: of its description.
     own: of the symbols that it was fitted to."""
 
     prior: Prior
@@ -96,7 +95,7 @@ def costs_of(histograms: Sequence[Histogram], priors: Sequence[Fitted]) -> np.nd
     """Cost of coding each histogram's symbols under each prior, int64 [histograms, priors]; see `cost_matrix`."""
     windows = [p.prior.window for p in priors]
     first = np.cumsum([0, *(len(p.costs) for p in priors[:-1])])
-    shapes = np.array([(w.kmin, w.n, w.shift, at) for w, at in zip(windows, first.tolist(), strict=True)], np.int64)
+    shapes = np.array([(w.kmin, w.n, at) for w, at in zip(windows, first.tolist(), strict=True)], np.int64)
     matrix: np.ndarray = loops().cost_matrix(
         np.concatenate([h.values for h in histograms]),
         np.concatenate([h.counts for h in histograms]),
@@ -143,8 +142,8 @@ def _fit_gauss_in(h: Histogram, window: Window) -> Fitted:
 def _fitted(prior: Prior, costs: np.ndarray, own: int, classes: int = 0) -> Fitted:
     """classes: cost of a histogram's classes, which are coded with the symbols."""
     out = bytearray()
-    write_prior(out, prior)
-    return Fitted(prior, costs + BIT * prior.window.shift, 8 * BIT * len(out) + classes, own)
+    prior.write(out)
+    return Fitted(prior, costs, 8 * BIT * len(out) + classes, own)
 
 
 def _richer_priors(h: Histogram, found: Fitted, effort: int) -> list[Fitted]:
@@ -173,26 +172,32 @@ def _dense(h: Histogram, window: Window) -> np.ndarray:
         inside = (values >= window.kmin) & (values < window.end)
         values, counts = values[inside], counts[inside]
     dense = np.zeros(window.n, np.int64)
-    np.add.at(dense, (values - window.kmin) >> window.shift, counts)
+    np.add.at(dense, values - window.kmin, counts)
     return dense
 
 
 def _beside(h: Histogram, window: Window) -> int:
-    """Cost of low bits and exceptions, which the table does not include."""
-    if not window.shift and window.kmin <= h.values[0] and h.values[-1] < window.end:
+    """Cost of exceptions, which the table does not include."""
+    if window.kmin <= h.values[0] and h.values[-1] < window.end:
         return 0
-    free = Fitted(Const(window), np.full(window.n, BIT * window.shift), 0, 0)
+    free = Fitted(Const(window), np.zeros(window.n, np.int64), 0, 0)
     return int(costs_of([h], [free])[0, 0])
 
 
 def _windows(h: Histogram) -> list[Window]:
-    """The full range, and narrower windows without its outliers.
+    """The full range, or its fullest window of the largest size, and narrower windows without its outliers.
 
     An outlier costs 20 bits inside the window and at least 24 as an exception: trimming gains only for wide windows.
     """
-    windows = [_window(int(h.values[0]), int(h.values[-1]))]
-    if h.values[-1] - h.values[0] < 512:
-        return windows
+    low, high = int(h.values[0]), int(h.values[-1])
+    if high - low < 512:
+        return [_window(low, high)]
+    if high - low >= MAX_WINDOW:
+        ends = np.searchsorted(h.values, h.values + MAX_WINDOW)  # of a window from each value on
+        inside = np.diff(np.concatenate([[0], np.cumsum(h.counts)])[np.stack([np.arange(len(ends)), ends])], axis=0)
+        fullest = int(inside.argmax())
+        low, high = int(h.values[fullest]), int(h.values[ends[fullest] - 1])
+    windows = [_window(low, high)]
     below = np.cumsum(h.counts)
     median = h.values[np.searchsorted(below, below[-1] / 2)]
     order = np.argsort(-np.abs(h.values - median))  # farthest first
@@ -210,10 +215,9 @@ def _windows(h: Histogram) -> list[Window]:
 
 
 def _window(low: int, high: int) -> Window:
-    shift = max(0, (high - low).bit_length() - (MAX_WINDOW.bit_length() - 1))
     if low == high:  # a table has at least two entries, and both must be symbols
         return Window(min(low, K_MAX - 1), 2)
-    return Window(low, ((high - low) >> shift) + 1, shift)
+    return Window(low, high - low + 1)
 
 
 # -- sharing -----------------------------------------------------------------------------------------------------------

@@ -1,8 +1,6 @@
 """The registry of priors: parameters <-> bytes, and the integer table of each.
 
-A prior covers a window of symbols kmin .. kmin + (n << shift) - 1. With shift > 0 the table codes (k - kmin) >> shift
-and the low bits follow with equal probabilities, so a wide channel needs no table of more than 2**14 entries. Symbols
-outside the window are exceptions, listed beside the prior.
+A prior covers a window of symbols kmin .. kmin + n - 1. Symbols outside it are exceptions, listed beside the prior.
 
 Adding a prior: a subclass of `_Tabled` with an id, `cum`, `write` and `read`, and its name in `Prior`. `make_models` is
 only faster: a family that it does not list makes its tables one by one.
@@ -35,13 +33,11 @@ MAX_WINDOW = 1 << 14
 #: Most entries of all tables that a section defines, beyond one per symbol: without earlier definitions, and with them.
 #: Eight bytes can define a table of 2**14 entries, 128 KiB, in each section of each slice.
 FREE_ENTRIES, MORE_ENTRIES = 1 << 18, 1 << 10
-MAX_SHIFT = 12
 MU8_MAX = 1 << 31
 FLOORS = (1, 16)  #: 16 / 2**24 is the clip of R(a)
 CLASS_STEPS = (8, 16, 32, 64)  #: histogram classes per prior, in 1/64 octave
 
 CONST, GAUSS, GMM2, HIST = 0, 1, 2, 3
-SCALED = 4  #: a prefix: shift, then the family; never a prior's own id
 FIRST_REUSE = 8  #: family codes from here on refer to an earlier prior
 
 
@@ -49,25 +45,24 @@ FIRST_REUSE = 8  #: family codes from here on refer to an earlier prior
 class Window:
     kmin: int
     n: int
-    shift: int = 0
 
     @property
     def end(self) -> int:
         """The first symbol above the window."""
-        return self.kmin + (self.n << self.shift)
+        return self.kmin + self.n
 
     def write(self, out: bytearray) -> None:
         put_zigzag(out, self.kmin)
         put_varint(out, self.n - 2)
 
     @classmethod
-    def read(cls, reader: ByteReader, shift: int) -> Window:
+    def read(cls, reader: ByteReader) -> Window:
         at = reader.offset
         kmin = reader.zigzag(K_MAX, "the window's first symbol")
         n = 2 + reader.varint(MAX_WINDOW - 2, "the window's size")
-        if kmin + ((n - 1) << shift) > K_MAX:
-            raise Malformed(f"a window of {n} << {shift} from {kmin} passes the largest symbol {K_MAX}", offset=at)
-        return cls(kmin, n, shift)
+        if kmin + n - 1 > K_MAX:
+            raise Malformed(f"a window of {n} from {kmin} passes the largest symbol {K_MAX}", offset=at)
+        return cls(kmin, n)
 
 
 @dataclass(frozen=True)
@@ -111,7 +106,7 @@ class Const(_Tabled):
         put_zigzag(out, self.window.kmin)
 
     @classmethod
-    def read(cls, reader: ByteReader, shift: int) -> Const:
+    def read(cls, reader: ByteReader) -> Const:
         return cls(Window(reader.zigzag(K_MAX, "a constant"), 1))
 
 
@@ -129,8 +124,8 @@ class Gauss(_Tabled):
         self.normal.write(out, self.window.n, FLOORS.index(self.floor))
 
     @classmethod
-    def read(cls, reader: ByteReader, shift: int) -> Gauss:
-        window = Window.read(reader, shift)
+    def read(cls, reader: ByteReader) -> Gauss:
+        window = Window.read(reader)
         normal, floor = Normal.read(reader, window.n)
         return cls(window, normal, FLOORS[floor])
 
@@ -153,8 +148,8 @@ class Mixture(_Tabled):
         out.append(self.weight)
 
     @classmethod
-    def read(cls, reader: ByteReader, shift: int) -> Mixture:
-        window = Window.read(reader, shift)
+    def read(cls, reader: ByteReader) -> Mixture:
+        window = Window.read(reader)
         first, floor = Normal.read(reader, window.n)
         second, reserved = Normal.read(reader, window.n)
         weight = reader.byte("a mixture's weight")
@@ -214,8 +209,8 @@ class Hist(_Tabled):
             put_varint(out, self.class_mean16)
 
     @classmethod
-    def read(cls, reader: ByteReader, shift: int) -> Hist:
-        window = Window.read(reader, shift)
+    def read(cls, reader: ByteReader) -> Hist:
+        window = Window.read(reader)
         mode = reader.bits("a histogram's mode", 3)
         step, differences = CLASS_STEPS[mode & 3], bool(mode & 4)
         top = reader.varint(top_limit(step), "a histogram's largest class")
@@ -318,26 +313,8 @@ def top_limit(step: int) -> int:
     return 1 + 31 * 64 // step
 
 
-def family_code(prior: Prior) -> int:
-    """The code that introduces a new prior in the parameter block."""
-    return SCALED if prior.window.shift else prior.id
-
-
-def write_prior(out: bytearray, prior: Prior) -> None:
-    """Append everything after the family code."""
-    if prior.window.shift:
-        out += bytes((prior.window.shift, prior.id))
-    prior.write(out)
-
-
 def read_prior(reader: ByteReader, family: int) -> Prior:
-    """Inverse of write_prior. Raises UnsupportedFeature for an id outside the registry."""
-    shift = 0
-    if family == SCALED:
-        shift = reader.byte("a prior's shift", MAX_SHIFT)
-        family = reader.byte("a prior's id")
-        if shift == 0 or family == CONST:
-            raise Malformed("a scaled prior with shift 0 or a constant", offset=reader.offset)
+    """A prior of a family, by its own `read`. Raises UnsupportedFeature for one outside the registry."""
     if family not in _FAMILIES:
         raise UnsupportedFeature(f"prior {family} is not in the registry {sorted(_FAMILIES)}", offset=reader.offset)
-    return _FAMILIES[family].read(reader, shift)
+    return _FAMILIES[family].read(reader)

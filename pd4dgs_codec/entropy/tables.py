@@ -10,8 +10,7 @@ import math
 
 import numpy as np
 
-PRECISION = 24
-TOTAL = 1 << PRECISION
+TOTAL = 1 << 24
 SI_MIN, SI_MAX = -640, 1280  #: sigma = Q * 2 ** (si / 64)
 
 # The two constants of NormTable v1. Computing them in float64 is safe: no entry comes closer than 1e-4 to a rounding
@@ -86,11 +85,6 @@ def histogram_tables_of_each(freqs: np.ndarray, sizes: np.ndarray) -> np.ndarray
     cum //= np.repeat(total >> shift, lengths)
     cum += _counted(lengths)
     return cum
-
-
-def uniform_table(bits: int) -> np.ndarray:
-    """cum int64 [2**bits + 1] of equally likely symbols, 0 <= bits <= 24."""
-    return np.arange((1 << bits) + 1, dtype=np.int64) << (PRECISION - bits)
 
 
 # -- costs -----------------------------------------------------------------------------------------------------------

@@ -7,7 +7,6 @@ column 0 W and NW are taken equal to N, and at (0, 0) all three are 0 (clause 11
 
 from __future__ import annotations
 
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
@@ -45,12 +44,11 @@ CELL_SLACK = 0.02
 
 @dataclass(frozen=True)
 class Predictor:
-    """A predictor. `restore` undoes it by running sums; None if that takes a scan of the samples in order."""
+    """A predictor. `restore` undoes it by running sums; None for the median, which takes a scan."""
 
     name: str
     predict: Callable[[Array, Array, Array], Array]  #: (W, N, NW) -> prediction
     restore: Callable[[Array], Array] | None = None  #: int64 residuals [C, H, W] -> samples
-    of_one: bool = False  #: whether predict(W, 0, 0) is W, as a border needs
 
 
 def _median(w: Array, n: Array, nw: Array) -> Array:
@@ -78,9 +76,7 @@ PREDICTORS: dict[int, Predictor] = {
     0: Predictor("none", lambda w, n, nw: np.zeros_like(w), lambda r: r),
     1: Predictor("left", lambda w, n, nw: w, _restore_left),
     2: Predictor("up", lambda w, n, nw: n, _restore_up),
-    3: Predictor("median", _median, of_one=True),
-    4: Predictor("gradient", lambda w, n, nw: w + n - nw, lambda r: np.cumsum(np.cumsum(r, axis=1), axis=2)),
-    5: Predictor("average", lambda w, n, nw: (w + n) >> 1),
+    3: Predictor("median", _median),
 }
 
 
@@ -99,18 +95,11 @@ def restore(planes: Sequence[tuple[int, Array]]) -> list[Array]:
 
     C is the same throughout. Raises Malformed if a sample's magnitude exceeds MAX_SYMBOL.
     """
-    result: list[Array] = [r for _, r in planes]
-    scanned: dict[int, list[int]] = defaultdict(list)
-    for index, (predictor, r) in enumerate(planes):
+    scanned = iter(_scan([r for predictor, r in planes if PREDICTORS[predictor].restore is None]))
+    result = list[Array]()
+    for predictor, r in planes:
         undo = PREDICTORS[predictor].restore
-        if undo is None:
-            scanned[predictor].append(index)
-        else:
-            result[index] = undo(r.astype(np.int64))
-    for predictor, members in scanned.items():
-        restored = _scan([planes[i][1] for i in members], PREDICTORS[predictor])
-        for i, k in zip(members, restored, strict=True):
-            result[i] = k
+        result.append(undo(r.astype(np.int64)) if undo else next(scanned))
     for (predictor, _), k in zip(planes, result, strict=True):
         if magnitude(k) > MAX_SYMBOL:
             name = PREDICTORS[predictor].name
@@ -118,8 +107,8 @@ def restore(planes: Sequence[tuple[int, Array]]) -> list[Array]:
     return [k.astype(np.int32, copy=False) for k in result]
 
 
-def _scan(planes: Sequence[Array], predictor: Predictor) -> list[Array]:
-    """Undo `predictor` on int32 [C, H, W] along anti-diagonals: all cells with equal i + j are independent.
+def _scan(planes: Sequence[Array]) -> list[Array]:
+    """Undo the median on int32 [C, H, W] along anti-diagonals: all cells with equal i + j are independent.
 
     Planes of like size go together, so that none has more than twice the diagonals of another: the steps are no more
     than 4 (H + W) of the largest however many planes there are, and memory stays linear in the cells.
@@ -129,26 +118,25 @@ def _scan(planes: Sequence[Array], predictor: Predictor) -> list[Array]:
     while order:
         longest = sum(planes[order[0]].shape[1:])
         alike = [i for i in order if 2 * sum(planes[i].shape[1:]) >= longest]
-        for i, k in zip(alike, _scan_together([planes[i] for i in alike], predictor), strict=True):
+        for i, k in zip(alike, _scan_together([planes[i] for i in alike]), strict=True):
             result[i] = k
         order = order[len(alike) :]
     return result
 
 
-def _scan_together(planes: Sequence[Array], predictor: Predictor) -> list[Array]:
+def _scan_together(planes: Sequence[Array]) -> list[Array]:
     """`_scan` of planes by descending number of diagonals.
 
     Diagonals are the rows of a table, and the rows of all planes its columns: cell (i, j) stands in row i + j, in the
     column of i. So W stands above it, N above and one to the left, NW one further up, for all cells of a row at once,
-    with no list of neighbours. Those that a border does not have are 0 here: before a plane's first row stands a column
-    of zeros, and what is left of its first column was never written. Where that makes a difference, residuals at the
-    borders are made to fit.
-    Median and average never leave their neighbours' range, so a magnitude is at most (h + w) * max|r|: below 2^37
-    always, and nearly always small enough for narrow lanes, which take a half or a quarter of the time. The table has
-    at most 4.5 lanes a sample: 2.25 if a plane has as many rows as columns (the shorter side are the rows here), and
-    twice that for planes that end early.
+    with no list of neighbours. Those that a border does not have are 0 here, which gives the same median: before a
+    plane's first row stands a column of zeros, and what is left of its first column was never written.
+    The median never leaves its neighbours' range, so a magnitude is at most (h + w) * max|r|: below 2^37 always, and
+    nearly always small enough for narrow lanes, which take a half or a quarter of the time. The table has at most 4.5
+    lanes a sample: 2.25 if a plane has as many rows as columns (the shorter side are the rows here), and twice that for
+    planes that end early.
     """
-    turned = [r if r.shape[1] <= r.shape[2] else r.swapaxes(1, 2) for r in planes]  # neither predictor tells W from N
+    turned = [r if r.shape[1] <= r.shape[2] else r.swapaxes(1, 2) for r in planes]  # the median does not tell W from N
     ends = np.cumsum([r.shape[1] + 1 for r in turned])
     zeros = ends - [r.shape[1] + 1 for r in turned]
     diagonals, channels = [sum(r.shape[1:]) - 1 for r in turned], len(turned[0])
@@ -162,17 +150,12 @@ def _scan_together(planes: Sequence[Array], predictor: Predictor) -> list[Array]
     ]
     for view, r in zip(views, turned, strict=True):
         view[...] = r.astype(lane)
-        for border in () if predictor.of_one else (view[:, 0], view[:, :, 0]):  # running sums
-            sums = np.cumsum(border, axis=1, dtype=lane)
-            border[:, 1:] = sums[:, 1:] - predictor.predict(sums[:, :-1], *np.zeros((2, 1, 1), lane))
     rows, count = table.reshape(len(table), -1), len(turned)
     for d in range(1, len(table)):
         while diagonals[count - 1] <= d:
             count -= 1
         end, above = int(ends[count - 1]) * channels, rows[d - 1]
-        rows[d, channels:end] += predictor.predict(
-            above[channels:end], above[: end - channels], rows[d - 2, : end - channels]
-        )
+        rows[d, channels:end] += _median(above[channels:end], above[: end - channels], rows[d - 2, : end - channels])
         table[d, zeros] = 0
     upright = (k if k.shape == r.shape else k.swapaxes(1, 2) for k, r in zip(views, planes, strict=True))
     return [np.ascontiguousarray(k).astype(np.int32) for k in upright]

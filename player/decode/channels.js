@@ -4,15 +4,14 @@ import { AnsDecoder } from "./ans.js";
 import { ByteReader, MAX_VARINT } from "./bytes.js";
 import { limitExceeded, malformed, unsupported } from "./errors.js";
 import { FREE_ENTRIES, MAX_CODED, MAX_COUNT, MAX_WINDOW, MORE_ENTRIES } from "./limits.js";
-import { CONSTANT, Table, histogramTable, mixtureTable, normTable, uniformTable } from "./tables.js";
+import { CONSTANT, Table, histogramTable, mixtureTable, normTable } from "./tables.js";
 
 const CONST = 0;
 const GAUSS = 1;
 const HISTOGRAM = 3;
-const SCALED = 4;
 const FIRST_REUSE = 8;
 
-/** The symbols kmin .. kmin + n·2^shift - 1. @typedef {{kmin: number, n: number, shift: number}} Window */
+/** The symbols kmin .. kmin + n - 1. @typedef {{kmin: number, n: number}} Window */
 
 /**
  * @typedef {object} Prior
@@ -68,18 +67,10 @@ export function decodeChannels(bytes, counts, out, priors = []) {
 /** @param {AnsDecoder} stream @param {Prior} prior @param {Exceptions | null} exceptions @param {Int32Array} out
  * @param {number} at @param {number} count */
 function takeChannel(stream, prior, exceptions, out, at, count) {
-  const { kmin, shift } = prior.window;
+  const { kmin } = prior.window;
   const coded = exceptions ? count - exceptions.positions.length : count;
   prior.table ??= new Table(prior.makeTable());
   stream.symbols(prior.table, out, at, coded);
-  if (shift) {
-    const low = new Int32Array(coded);
-    stream.symbols(uniformTable(shift), low, 0, coded);
-    for (let i = at; i < at + coded; i++) {
-      out[i] = (out[i] << shift) + low[i - at];
-      if (out[i] + kmin > MAX_CODED) throw malformed(`a symbol of ${out[i] + kmin}, limit ${MAX_CODED}`);
-    }
-  }
   if (kmin) for (let i = at; i < at + coded; i++) out[i] += kmin;
   if (!exceptions) return;
   // From the last one on, symbols move up to make room for the exceptions.
@@ -97,7 +88,7 @@ function takeChannel(stream, prior, exceptions, out, at, count) {
 function readExceptions(reader, count, window) {
   const number = 1 + reader.varint(MAX_VARINT, "the number of exceptions");
   if (number > count) throw malformed(`${number} exceptions among ${count} symbols`);
-  const end = window.kmin + window.n * 2 ** window.shift;
+  const end = window.kmin + window.n;
   const positions = [];
   const values = [];
   let position = -1;
@@ -118,19 +109,10 @@ function readExceptions(reader, count, window) {
 function readPrior(reader, family) {
   if (family === CONST) {
     const kmin = reader.zigzag(MAX_CODED, "a constant");
-    return { window: { kmin, n: 1, shift: 0 }, table: CONSTANT, makeTable: () => CONSTANT.cum };
-  }
-  let shift = 0;
-  if (family === SCALED) {
-    shift = reader.byte("the shift of a prior");
-    if (shift > 12) throw limitExceeded(`a prior of shift ${shift}, limit 12`);
-    if (shift < 1) throw malformed("a scaled prior of shift 0");
-    family = reader.byte("the family of a scaled prior");
-    if (family < GAUSS) throw malformed("a scaled constant");
-    if (family > HISTOGRAM) throw unsupported(`a scaled prior of family ${family}`);
+    return { window: { kmin, n: 1 }, table: CONSTANT, makeTable: () => CONSTANT.cum };
   }
   if (family > HISTOGRAM) throw unsupported(`a prior of family ${family}`);
-  const window = readWindow(reader, shift);
+  const window = readWindow(reader);
   if (family === HISTOGRAM) return readHistogram(reader, window);
   const first = readNormal(reader, window.n);
   if (family === GAUSS) return { window, makeTable: () => normTable(window.n, first.mu8, first.si, first.floor) };
@@ -141,13 +123,13 @@ function readPrior(reader, family) {
   return { window, makeTable: () => mixtureTable(window.n, first, second, weight) };
 }
 
-/** @param {ByteReader} reader @param {number} shift @returns {Window} */
-function readWindow(reader, shift) {
+/** @param {ByteReader} reader @returns {Window} */
+function readWindow(reader) {
   const kmin = reader.zigzag(MAX_CODED, "the start of a window");
   const n = 2 + reader.varint(MAX_WINDOW - 2, "the length of a window");
-  const last = kmin + (n - 1) * 2 ** shift;
+  const last = kmin + n - 1;
   if (last > MAX_CODED) throw malformed(`a window whose last entry is ${last}, limit ${MAX_CODED}`);
-  return { kmin, n, shift };
+  return { kmin, n };
 }
 
 /** @param {ByteReader} reader @param {number} n */

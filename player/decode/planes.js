@@ -15,7 +15,7 @@ import {
 /** @import { PlaneShape } from "./parameters.js" */
 
 /** How many predictors 11.3 has. */
-export const PREDICTORS = 6;
+export const PREDICTORS = 4;
 
 /**
  * The samples of each plane.
@@ -108,7 +108,7 @@ function restore(plane, { channels, height, width, predictor }) {
 }
 
 /** Each sample is checked before others are predicted from it, so that a sum stays small. @param {Int32Array} plane
- * @param {number} from @param {number} end @param {number} width @param {number} predictor 1..5 */
+ * @param {number} from @param {number} end @param {number} width @param {number} predictor 1..3 */
 function restoreChannel(plane, from, end, width, predictor) {
   check(plane[from]);
   // every predictor gives W in row 0 and N in column 0
@@ -122,9 +122,7 @@ function restoreChannel(plane, from, end, width, predictor) {
       let k = plane[at];
       if (predictor === 1) k += w;
       else if (predictor === 2) k += n;
-      else if (predictor === 3) k += median(w, n, w + n - nw);
-      else if (predictor === 4) k += w + n - nw;
-      else k += (w + n) >> 1;
+      else k += median(w, n, w + n - nw);
       check(k);
       plane[at] = w = k;
       nw = n;

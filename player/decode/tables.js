@@ -1,4 +1,4 @@
-// Clauses 7.2 to 7.6: frequency tables, lists cum of n + 1 integers from 0 to 2^24. All products stay below 2^53.
+// Clauses 7.2 to 7.5: frequency tables, lists cum of n + 1 integers from 0 to 2^24. All products stay below 2^53.
 
 const TOTAL = 2 ** 24;
 
@@ -112,10 +112,3 @@ export class Table {
 
 /** The table of one symbol. */
 export const CONSTANT = /* @__PURE__ */ new Table(Int32Array.of(0, TOTAL));
-
-/** @type {Table[]} */
-const UNIFORM = [];
-
-/** The table of `bits` uniform bits (7.6). @param {number} bits 1..12 */
-export const uniformTable = (bits) =>
-  (UNIFORM[bits] ??= new Table(Int32Array.from({ length: 2 ** bits + 1 }, (_, i) => i << (24 - bits))));

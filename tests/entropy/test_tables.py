@@ -33,7 +33,6 @@ from pd4dgs_codec.entropy.tables import (
     TOTAL,
     histogram_table,
     histogram_tables_of_each,
-    uniform_table,
 )
 
 
@@ -97,7 +96,6 @@ def test_histogram_table_follows_the_weights(freqs):
 def test_histogram_table_at_its_limits():
     assert histogram_table(np.array([0, 3, 1])).tolist() == [0, 1, 1 + (2**24 - 3) * 3 // 4 + 1, 2**24]
     assert is_table(histogram_table(np.full(1 << 14, 2**31 - 1)), 1 << 14)
-    assert uniform_table(2).tolist() == [0, 2**22, 2**23, 3 * 2**22, 2**24]
 
 
 def test_tables_are_frozen():

@@ -119,7 +119,7 @@ def many_anchors(mode):
 
 BIG = {
     "planes by the median": partial(constant_planes, 3),
-    "planes by sums": partial(constant_planes, 4),
+    "planes by sums": partial(constant_planes, 1),
     "planes in stages": constant_stages,
     "exceptions": many_exceptions,
     "tables": most_tables,

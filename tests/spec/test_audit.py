@@ -57,7 +57,7 @@ def test_each_registered_key_section_prior_and_predictor_has_a_row():
     coded = "\n".join(row[0] for row in rows("Coded channels"))
     (predictors,) = re.findall(r"\| predictors \| ([\d.]*)", registries)
     assert set(map(int, re.findall(r"predictor (\d)", coded))) == numbers(predictors)
-    assert set(map(int, re.findall(r"prior family (\d)", coded))) == {0, 1, 2, 3, 4}
+    assert set(map(int, re.findall(r"prior family (\d)", coded))) == {0, 1, 2, 3}
 
 
 def test_each_clause_that_a_row_names_is_there():

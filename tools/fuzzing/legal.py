@@ -147,18 +147,17 @@ def prior(rng: random.Random, k: np.ndarray, most: int) -> Prior:
     low, high = int(k.min()), int(k.max())
     if most < 2 or rng.random() < 0.15:
         return Const(Window(rng.choice((low, high, K, -K)), 1))
-    shift = rng.choice((0, 0, 0, 1, 12, rng.randint(1, 12)))
-    span = (high - low >> shift) + 1
+    span = high - low + 1
     n = rng.choice((2, 3, 7, min(span, 300), min(span, 90) + rng.randrange(2)))
     if rng.random() < 0.01:
         n = rng.choice((span, 1 << 14))
-    n = min(most, max(2, n), 1 + (2 * K >> shift))
+    n = min(most, max(2, n))
     least = rng.choice((low, low, low, low - rng.randrange(3), high, K, -K))
-    window = Window(max(-K, min(least, K - ((n - 1) << shift))), n, shift)
+    window = Window(max(-K, min(least, K - n + 1)), n)
     floor = rng.choice((1, 16))
     family = rng.randrange(3)
     if family == 0:
-        return replace(gauss(window.kmin, n, floor=floor, shift=shift), normal=_normal(rng, n))
+        return replace(gauss(window.kmin, n, floor=floor), normal=_normal(rng, n))
     if family == 1:
         return Mixture(window, _normal(rng, n), _normal(rng, n), _near(rng, 1, 255), floor)
     return _histogram(rng, window)
@@ -344,7 +343,7 @@ def _scales(rng: random.Random, channels: int) -> list[Scale]:
     for _ in range(rng.choices((1, 2, 8), (9, 3, 0.3))[0]):
         sides = [rng.choices((1, 2, 3, 5, 40), (8, 8, 8, 4, 1))[0] for _ in range(4)]
         samples = {n: symbols(rng, channels, sides[b], sides[a], most=rng.choice((M, 3))) for n, a, b in PLANES}
-        chosen = [rng.randrange(6) for _ in PLANES]
+        chosen = [rng.randrange(4) for _ in PLANES]
         fits = [
             abs(residual(p, samples[n]).astype(np.int64)).max() <= K
             for p, (n, _, _) in zip(chosen, PLANES, strict=True)

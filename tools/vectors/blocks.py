@@ -27,10 +27,7 @@ from pd4dgs_codec.entropy.priors import (
     Normal,
     Prior,
     Window,
-    family_code,
-    write_prior,
 )
-from pd4dgs_codec.entropy.tables import uniform_table
 from pd4dgs_codec.entropy.varint import put_varint, put_zigzag
 from pd4dgs_codec.format import canonical
 from pd4dgs_codec.format.container import MAJOR, SIGNATURE
@@ -101,9 +98,9 @@ def pattern(*shape: int, low: int = -3, high: int = 3, seed: int = 0) -> np.ndar
 # -- coded channels (clause 8) -----------------------------------------------------------------------------------------
 
 
-def gauss(low: int, n: int, *, si: int = 64, offset: int = 0, floor: int = 1, shift: int = 0) -> Gauss:
+def gauss(low: int, n: int, *, si: int = 64, offset: int = 0, floor: int = 1) -> Gauss:
     """A Gaussian prior over n entries from `low`. offset: of its mean from the middle of the window, entries / 256."""
-    return Gauss(Window(low, n, shift), Normal(offset + 128 * (n - 1), si), floor)
+    return Gauss(Window(low, n), Normal(offset + 128 * (n - 1), si), floor)
 
 
 SMALL = gauss(-3, 7)
@@ -116,9 +113,10 @@ def default_prior(symbols: np.ndarray) -> Prior:
         return Const(Window(low, 1))
     if -3 <= low and high <= 3:
         return SMALL
-    shift = max(0, (high - low).bit_length() - 14)
-    n = max(2, ((high - low) >> shift) + 1)
-    return gauss(low, n, si=64 * n.bit_length() - 128, shift=shift)
+    n, most = high - low + 1, (1 << 24) - 1
+    if n > 1 << 14:  # around the median; the others are exceptions
+        low, n = int(np.sort(symbols)[len(symbols) // 2]) - 7, 15
+    return gauss(min(max(low, -most), most - n + 1), n, si=64 * n.bit_length() - 128)
 
 
 Known = list[tuple[bytes, bytes]]  # definitions of priors, with the classes of histograms
@@ -142,21 +140,18 @@ def coded(
         window = prior.window
         inside = (k >= window.kmin) & (k < window.end)
         parameters = bytearray()
-        write_prior(parameters, prior)
-        key = bytes([family_code(prior)]) + parameters, np.asarray(getattr(prior, "classes", ())).tobytes()
+        prior.write(parameters)
+        key = bytes([prior.id]) + parameters, np.asarray(getattr(prior, "classes", ())).tobytes()
         if key in defined:
             block += varint(2 * (FIRST_REUSE + defined[::-1].index(key)) + (not inside.all()))
         else:
-            block += varint(2 * family_code(prior) + (not inside.all())) + parameters
+            block += varint(2 * prior.id + (not inside.all())) + parameters
             defined.append(key)
             if isinstance(prior, Hist):
                 tables.append((prior.class_symbols, prior.class_cum))
         if not inside.all():
             block += _exceptions(k, inside, window)
-        entries = k[inside] - window.kmin
-        parts.append((entries >> window.shift, prior.cum))
-        if window.shift:
-            parts.append((entries & ((1 << window.shift) - 1), uniform_table(window.shift)))
+        parts.append((k[inside] - window.kmin, prior.cum))
     return block + ans_encode([symbols for symbols, _ in tables + parts], [cum for _, cum in tables + parts])
 
 

@@ -41,7 +41,7 @@ import numpy as np
 
 import pd4dgs_codec.entropy.priors
 from pd4dgs_codec.entropy.ans import ans_encode
-from pd4dgs_codec.entropy.priors import Const, Hist, Prior, Window, write_prior
+from pd4dgs_codec.entropy.priors import Const, Hist, Prior, Window
 from pd4dgs_codec.format import canonical
 from pd4dgs_codec.format.planes import restore
 
@@ -310,11 +310,11 @@ def predicted(k: np.ndarray, block: Block | None = None, **fields: Any) -> File:
     return with_section(ATTRIBUTES, section, make_file(layer))
 
 
-def histogram(d: int, top: int, count: int, differences: bool, si16: int = 20, m: int = 0, shift: int = 0) -> Hist:
-    """A histogram from -3 on (scaled: from -5000 on), the extreme classes at its edges."""
+def histogram(d: int, top: int, count: int, differences: bool, si16: int = 20, m: int = 0) -> Hist:
+    """A histogram from -3 on, the extreme classes at its edges."""
     classes = pattern(count, low=0, high=top, seed=top)
     classes[0], classes[1], classes[-1] = 0, min(1, top), top
-    return Hist(Window(-5000 if shift else -3, count, shift), d, top, differences, si16, m, classes)
+    return Hist(Window(-3, count), d, top, differences, si16, m, classes)
 
 
 def tables_at_limit(more: bool = False) -> File:
@@ -452,7 +452,7 @@ def hist_codes(prior: Hist, block: bytes | None = None, classes: list[int] | Non
     """Section MASKS of the codes 5, 9, 7. block: instead of the prior's parameters. classes: instead of its symbols in
     the stream; the codes behind them are written for what they mean, if that is a table at all."""
     out = bytearray(varint(2 * prior.id))
-    write_prior(out, prior)
+    prior.write(out)
     symbols = prior.class_symbols if classes is None else np.array(classes)
     meant = np.cumsum(symbols - prior.top) if prior.differences else symbols
     if not 0 < meant.max() <= prior.top:
@@ -477,7 +477,7 @@ def costly(which: int) -> File:
     """A few hundred bytes that declare some 3 million symbols. 0: planes of one channel, to be predicted sample by
     sample. 1: stages with eight classes of many cells, the dearest in memory."""
     if which == 0:
-        flat = Scale(1, (4096, 256, 256, 256), (4,) * 6, constant(0))
+        flat = Scale(1, (4096, 256, 256, 256), (3,) * 6, constant(0))
         first = make_layer(0, networks={0: (64, 10), 1: (64, 70), 2: (64, 30)})
         return make_file(first, make_layer(1, (), before=1, scales=[flat]))
     file = deformed(*[Scale(4, s, fill=constant(0)) for s in ((4095, 5, 1, 16), (64, 256, 64, 256), (4095, 2, 2, 99))])
