@@ -245,7 +245,7 @@ def read_preamble(data):
 # 5.2 Chunk list: "In mode lzma each occurs at most once."
 # 5.5 Digest: "The first 16 bytes of the SHA-256 of the payloads of all critical chunks that were encoded together"
 def read_header(data):
-    header = fields(unpack(data), (1, 2, *range(4, 17)), (1, 2, *range(4, 12), 13, 14, 15), "header")
+    header = fields(unpack(data), range(1, 16), (1, 2, *range(4, 12), 13, 14, 15), "header")
     steps, box, (start, end), background, (near, far), _ = (
         reals(header[key], f"header key {key}", count)
         for key, count in ((4, 3), (6, 6), (7, 2), (8, 3), (9, 2), (10, 3))
@@ -264,7 +264,7 @@ def read_header(data):
     need(type(header[14]) is bytes and len(header[14]) == 16, "the digest of the layers is not 16 bytes")
     for value, least, most in zip(a_list(header[15], "the widths", 3), (1, 1, 0), (64, 16, 7)):
         limited(value, most, "a width", least)
-    for centre in a_list(header[16], "the centres", channel_count(header)) if 16 in header else ():
+    for centre in a_list(header[3], "the centres", channel_count(header)) if 3 in header else ():
         limited(centre, MAX_SYMBOL, "a centre", -MAX_SYMBOL)
     read_chunk_list(header[1])
     registered(header[2], (0, 1), "the coding mode")
@@ -501,7 +501,7 @@ def check_sizes(layer, payload_bytes, before):
     """before: N, S and L of the slices before it. Sets those with it."""
     samples = sum(c * h * w for _, _, (c, h, w) in plane_shapes(layer))
     need(samples <= 1 << 28, f"{samples} plane samples", "LimitExceeded")
-    row = channel_count(layer.header) + 4 + (16 in layer.header)
+    row = channel_count(layer.header) + 4 + (3 in layer.header)
     symbols = layer.rises + row * layer.rows + samples + sum(size for _, size in weight_shapes(layer))
     layer.declared = [a + b for a, b in zip(before, (layer.rows, symbols, payload_bytes))]
     rows, symbols, size = layer.declared
@@ -518,7 +518,7 @@ def read_sections(layer, parts):
 
     planes, weights, past = plane_shapes(layer), weight_shapes(layer), layer.past
     counts = {MASKS: [layer.rises, layer.rows], ATTRIBUTE_SECTION: []}
-    counts[ATTRIBUTE_SECTION] = [layer.rows] * (channel_count(layer.header) + (16 in layer.header))
+    counts[ATTRIBUTE_SECTION] = [layer.rows] * (channel_count(layer.header) + (3 in layer.header))
     counts[PLANE_SECTION] = [h * w for _, _, (c, h, w) in planes for _ in range(c)]
     counts[WEIGHTS] = [size for _, size in weights]
     positions = decode_positions(part(POSITIONS, layer.rows), layer.rows, past.of(POSITIONS))
@@ -528,12 +528,12 @@ def read_sections(layer, parts):
         decoded = decode_lzma_symbols(part(SYMBOLS, sum(flat)), flat)
         for section in counts:
             channels[section], decoded = decoded[: len(counts[section])], decoded[len(counts[section]) :]
-        step_classes(channels[ATTRIBUTE_SECTION][0] if 16 in layer.header else [])
+        step_classes(channels[ATTRIBUTE_SECTION][0] if 3 in layer.header else [])
     else:
         for section, sizes in counts.items():
             data = part(section, sum(sizes))
             if section == ATTRIBUTE_SECTION and sum(sizes):
-                channels[section] = decode_attributes(data, *layer.header[15][:2], layer.rows, past, 16 in layer.header)
+                channels[section] = decode_attributes(data, *layer.header[15][:2], layer.rows, past, 3 in layer.header)
             elif section == PLANE_SECTION and sizes:
                 channels[section] = decode_planes(data, [shape for _, _, shape in planes])
             else:
@@ -551,7 +551,7 @@ def keep_symbols(layer, positions, channels, planes, weights):
     need(all(v >= 3 for v in own), "a mask code under 3")
     layer.symbols = {"anchor": [v for cell in positions for v in cell], "mask_rise": rise, "mask_own": own}
     first = 0
-    if 16 in layer.header:
+    if 3 in layer.header:
         layer.symbols["step_class"], first = channels[ATTRIBUTE_SECTION][0], 1
     for name, width in attribute_channels(layer.header).items():  # [width, n], channel by channel
         layer.symbols[name] = [k for channel in channels[ATTRIBUTE_SECTION][first : first + width] for k in channel]
@@ -615,13 +615,13 @@ def table_of(cdf, floor):
 
 
 # 7.5 Histogram tables: "cum[q] = ((W(q) >> h) · (2^24 − n)) // (W(n) >> h) + q, q = 0..n"
-def histogram_table(classes, top, step):
+def histogram_table(heights, top, step):
     sums = [0]
-    for c in classes:
+    for c in heights:
         b = (top - c) * step
         sums.append(sums[-1] + (M[b & 63] >> (b >> 6) if c > 0 else 0))
     h = max(0, sums[-1].bit_length() - 28)
-    return [((s >> h) * (TOTAL - len(classes))) // (sums[-1] >> h) + q for q, s in enumerate(sums)]
+    return [((s >> h) * (TOTAL - len(heights))) // (sums[-1] >> h) + q for q, s in enumerate(sums)]
 
 
 # 7.6 ANS streams: "A stream is a multiple of 4 bytes: u32 words in the order in which the decoder takes them. It may
@@ -657,12 +657,12 @@ class Ans:
 
 
 class Prior:
-    """kmin, n: the window of clause 8.2; cum: its table, for a hist once the classes are known."""
+    """kmin, n: the window of clause 8.2; cum: its table, for a hist once the heights are known."""
 
     def __init__(self, kmin, n, cum):
         self.kmin, self.n, self.cum = kmin, n, cum
         self.end = kmin + n
-        self.classes = None  # of a hist: (step, top, differences, table of the classes)
+        self.heights = None  # of a hist: (unit, top, differences, table of the heights)
 
 
 # 8.1 Parameter block: "a new prior of this family"
@@ -695,31 +695,31 @@ def read_normal(reader, n):
     return mu8, (v >> 1) - 640, v & 1
 
 
-# 8.2 Priors: "without differences the symbols are the classes, of a table of top + 1 symbols with mu8 = 16·m; with
-# differences symbol r adds r − top to the class before (0 before the first), of a table of 2·top + 1 symbols with mu8
+# 8.2 Priors: "without differences the symbols are the heights, of a table of top + 1 symbols with mu8 = 16·m; with
+# differences symbol r adds r − top to the height before (0 before the first), of a table of 2·top + 1 symbols with mu8
 # = 256·top."
 def read_histogram(reader, prior):
     mode = reader.bits(3)
     step, differences = 8 << (mode & 3), mode >> 2
     top = reader.varint(1 + 1984 // step)
-    need(top, "a histogram without classes")
+    need(top, "a histogram without heights")
     si = 16 * reader.byte(63) - 160
     n, mu8 = (2 * top + 1, 256 * top) if differences else (top + 1, 16 * reader.varint(16 * top))
-    prior.classes = (step, top, differences, table_of(norm_cdf(n, mu8, si), 1))
+    prior.heights = (step, top, differences, table_of(norm_cdf(n, mu8, si), 1))
     return prior
 
 
-# 8.2 Priors: "A class outside 0..top, or all classes 0, is Malformed."
-# 8.4 Symbols: "The ANS stream holds the classes of each hist prior in the order of definition"
-def take_classes(stream, prior):
-    step, top, differences, cum = prior.classes
-    classes, last = [], 0
+# 8.2 Priors: "A height outside 0..top, or all heights 0, is Malformed."
+# 8.4 Symbols: "The ANS stream holds the heights of each hist prior in the order of definition"
+def take_heights(stream, prior):
+    step, top, differences, cum = prior.heights
+    heights, last = [], 0
     for symbol in stream.take(prior.n, cum):
         last = last + symbol - top if differences else symbol
-        classes.append(last)
-    need(0 <= min(classes) and max(classes) <= top, "a histogram's class out of range")
-    need(any(classes), "a histogram of classes 0 alone")
-    prior.cum = histogram_table(classes, top, step)
+        heights.append(last)
+    need(0 <= min(heights) and max(heights) <= top, "a histogram's height out of range")
+    need(any(heights), "a histogram of heights 0 alone")
+    prior.cum = histogram_table(heights, top, step)
 
 
 # 8.3 Exceptions: "the symbol is kmin − 1 − (c >> 1) if c is odd, else kmin + n + (c >> 1)." "There MUST NOT be
@@ -762,8 +762,8 @@ def decode_channels(data, counts, known=None):
         heads.append((prior, read_exceptions(reader, count, prior) if token & 1 else {}))
     stream = Ans(reader.take(reader.left))
     for prior in defined[first:]:
-        if prior.classes:
-            take_classes(stream, prior)
+        if prior.heights:
+            take_heights(stream, prior)
     heads = iter(heads)
     channels = [take_channel(stream, count, *next(heads)) if count else [] for count in counts]
     stream.finish()
@@ -1146,7 +1146,7 @@ def decode_lzma_symbols(data, counts):
     if not data:
         return [[] for _ in counts]
     reader = Reader(data)
-    _, planar = reader.byte(224), reader.bits(1)
+    planar = reader.bits(1)
     bases, forms = [], []
     for count in counts:
         need(count <= MAX_COUNT, f"a channel of {count} symbols", "LimitExceeded")
@@ -1275,7 +1275,7 @@ def dequantise_layer(layer):
     attributes = attribute_channels(layer.header)
     steps = dict(zip(attributes, layer.header[4])) | {"anchor": layer.header[5]}
     classes = layer.symbols.get("step_class", [0] * layer.rows)
-    centres = iter(layer.header.get(16, [0] * channel_count(layer.header)))
+    centres = iter(layer.header.get(3, [0] * channel_count(layer.header)))
     for name, symbols in layer.symbols.items():
         if name in attributes:  # [width, n] -> [n, width]
             own = [next(centres) for _ in range(attributes[name])]
@@ -1294,7 +1294,7 @@ def add_slice(layer, part):
     cells = [cell for own in (layer, part) for cell in zip(*[iter(own.symbols["anchor"])] * 3)]
     low = [min((cell[axis] for cell in cells), default=0) for axis in range(3)]
     order = sorted(range(len(cells)), key=lambda row: morton_code([v - m for v, m in zip(cells[row], low)]))
-    classes = [("step_class", 1)] if 16 in layer.header else []
+    classes = [("step_class", 1)] if 3 in layer.header else []
     for name, width in (("mask_own", 1), *classes, *attribute_channels(layer.header).items()):
         channels = []
         for c in range(width):

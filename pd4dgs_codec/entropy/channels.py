@@ -4,7 +4,7 @@ Payload: for each non-empty channel a varint token, (family << 1 | has_exception
 new prior's parameters, else the prior defined (family - 8) definitions before the latest; then the channel's
 exceptions, if any: their number, and for each the gap to the previous position and the distance outside the window.
 Definitions of earlier payloads count too if the caller passes them on.
-After the last channel the ANS words: the classes of each histogram prior in order of definition, then each channel's
+After the last channel the ANS words: the heights of each histogram prior in order of definition, then each channel's
 symbols.
 """
 
@@ -29,7 +29,7 @@ from pd4dgs_codec.entropy.priors import (
     Window,
     make_models,
     read_prior,
-    with_class_symbols,
+    with_height_symbols,
 )
 from pd4dgs_codec.entropy.tables import BIT
 from pd4dgs_codec.entropy.varint import VARINT_MAX, ByteReader, put_varint
@@ -117,7 +117,7 @@ def _encode(
         symbols.append(inside - prior.window.kmin)
         cums.append(prior.cum)
     tables = [f.prior for f in fresh if isinstance(f.prior, Hist)]
-    words = ans_encode([*(p.class_symbols for p in tables), *symbols], [*(p.class_cum for p in tables), *cums])
+    words = ans_encode([*(p.height_symbols for p in tables), *symbols], [*(p.height_cum for p in tables), *cums])
     return bytes(out) + words, fresh
 
 
@@ -212,12 +212,12 @@ def decode_joined(payload: bytes | memoryview, counts: Sequence[int], known: lis
 
 
 def _complete(defined: list[Prior], first: int, stream: AnsDecoder) -> None:
-    """Makes the models of the priors from `first` on, and decodes the classes of the histograms among them."""
+    """Makes the models of the priors from `first` on, and decodes the heights of the histograms among them."""
     make_models(defined[first:])
     places = [at for at in range(first, len(defined)) if isinstance(defined[at], Hist)]
     histograms = [prior for prior in defined[first:] if isinstance(prior, Hist)]
-    classes = [stream.take(prior.window.n, prior.class_model) for prior in histograms]
-    for at, prior in zip(places, with_class_symbols(histograms, classes), strict=True):
+    heights = [stream.take(prior.window.n, prior.height_model) for prior in histograms]
+    for at, prior in zip(places, with_height_symbols(histograms, heights), strict=True):
         defined[at] = prior
 
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.entropy.priors import CLASS_STEPS, FLOORS
+from pd4dgs_codec.entropy.priors import FLOORS, HEIGHT_STEPS
 from pd4dgs_codec.entropy.tables import (
     BIT,
     LOG2,
@@ -46,12 +46,12 @@ GAUSS_BITS, MIXTURE_BITS = 8, 10
 GAUSS_ROUNDS = 12
 #: A round that gains less ends the descent.
 ENOUGH = BIT // 8
-#: Widths of the Gaussian of a histogram's classes.
-CLASS_WIDTHS = 64
+#: Widths of the Gaussian of a histogram's heights.
+HEIGHT_WIDTHS = 64
 #: Of R(a): the clip of probabilities, and the least standard deviation, in units of Q.
 P_MIN, SIGMA_MIN = 1e-6, 2.0**-10
 
-_STEPS = np.array(CLASS_STEPS)
+_STEPS = np.array(HEIGHT_STEPS)
 _LOW, _HIGH = FLOORS  # the higher floor keeps outliers from steering the fit
 
 
@@ -358,20 +358,20 @@ def mixture(dense: np.ndarray, effort: int) -> tuple[int, int, int, int, int, in
 
 
 @_compiled
-def _class_width(counts: np.ndarray, mu8: int, symbols: int) -> tuple[int, int]:
-    """(class_si16, cost) of the cheapest Gaussian around mu8 for counts int64 [n] of class symbols, `symbols` in all:
+def _height_width(counts: np.ndarray, mu8: int, symbols: int) -> tuple[int, int]:
+    """(height_si16, cost) of the cheapest Gaussian around mu8 for counts int64 [n] of height symbols, `symbols` in all:
     from their spread downhill."""
     spread = 0.0
     for k in range(len(counts)):
         spread += (256.0 * k - mu8) ** 2 * counts[k]
     si = 64 * math.log2(max(math.sqrt(spread / symbols) / 256, 0.1))
-    width = min(max(np.int64(np.rint((si + 160) / 16)), 0), CLASS_WIDTHS - 1)
+    width = min(max(np.int64(np.rint((si + 160) / 16)), 0), HEIGHT_WIDTHS - 1)
     cdf = np.empty(len(counts) - 1, np.int64)
     _cdf28(mu8, 16 * width - 160, cdf)
     least = _table_cost(cdf, 1, counts)
     for step in (-1, 1):
         moved = False
-        while 0 <= width + step < CLASS_WIDTHS:
+        while 0 <= width + step < HEIGHT_WIDTHS:
             _cdf28(mu8, 16 * (width + step) - 160, cdf)
             cost = _table_cost(cdf, 1, counts)
             if cost >= least:
@@ -383,9 +383,9 @@ def _class_width(counts: np.ndarray, mu8: int, symbols: int) -> tuple[int, int]:
 
 
 @_compiled
-def classes(dense: np.ndarray) -> tuple[int, int, int, int, int, int, int, np.ndarray, np.ndarray]:
-    """The frequencies themselves, rounded to classes: (index of the step or -1 if none fits, differences, top,
-    class_si16, class_mean16, cost of dense, cost of the classes, costs of the entries, classes int64 [n])."""
+def heights(dense: np.ndarray) -> tuple[int, int, int, int, int, int, int, np.ndarray, np.ndarray]:
+    """The frequencies themselves, rounded to heights: (index of the step or -1 if none fits, differences, top,
+    height_si16, height_mean16, cost of dense, cost of the heights, costs of the entries, heights int64 [n])."""
     n, largest = len(dense), dense[0]
     for k in range(n):
         largest = max(largest, dense[k])
@@ -394,7 +394,7 @@ def classes(dense: np.ndarray) -> tuple[int, int, int, int, int, int, int, np.nd
         if dense[k] > 0:
             octaves[k] = frequency_cost(dense[k]) - frequency_cost(largest)
     below, weights = np.empty(n, np.int64), np.empty(n, np.int64)
-    costs, best_costs, best_classes = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
+    costs, best_costs, best_heights = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
     least, best = np.int64(1) << 62, (-1, 0, 0, 0, 0, np.int64(1) << 62, 0)
     for number in range(len(_STEPS)):
         step = _STEPS[number]
@@ -434,7 +434,7 @@ def classes(dense: np.ndarray) -> tuple[int, int, int, int, int, int, int, np.nd
                 counts[value - previous + top if differences else value] += 1
                 previous = value
             mean16 = 0 if differences else (32 * total + n) // (2 * n)
-            width, described = _class_width(counts, 256 * top if differences else 16 * mean16, n)
+            width, described = _height_width(counts, 256 * top if differences else 16 * mean16, n)
             size = 1 + (top >= 1 << 7)
             if not differences:
                 size += 1 + (mean16 >= 1 << 7) + (mean16 >= 1 << 14)
@@ -443,8 +443,8 @@ def classes(dense: np.ndarray) -> tuple[int, int, int, int, int, int, int, np.nd
                 best = (number, differences, top, width, mean16, cost, described)
                 for k in range(n):
                     best_costs[k] = costs[k]
-                    best_classes[k] = top - below[k] if dense[k] > 0 else 0
-    return best[0], best[1], best[2], best[3], best[4], best[5], best[6], best_costs, best_classes
+                    best_heights[k] = top - below[k] if dense[k] > 0 else 0
+    return best[0], best[1], best[2], best[3], best[4], best[5], best[6], best_costs, best_heights
 
 
 @_compiled

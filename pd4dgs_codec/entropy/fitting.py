@@ -18,9 +18,9 @@ from types import ModuleType
 import numpy as np
 
 from pd4dgs_codec.entropy.priors import (
-    CLASS_STEPS,
     FLOORS,
     FREE_ENTRIES,
+    HEIGHT_STEPS,
     K_MAX,
     MAX_WINDOW,
     MORE_ENTRIES,
@@ -139,11 +139,11 @@ def _fit_gauss_in(h: Histogram, window: Window) -> Fitted:
     return _fitted(Gauss(window, Normal(mu8, si), FLOORS[floor]), costs, cost + _beside(h, window))
 
 
-def _fitted(prior: Prior, costs: np.ndarray, own: int, classes: int = 0) -> Fitted:
-    """classes: cost of a histogram's classes, which are coded with the symbols."""
+def _fitted(prior: Prior, costs: np.ndarray, own: int, heights: int = 0) -> Fitted:
+    """heights: cost of a histogram's heights, which are coded with the symbols."""
     out = bytearray()
     prior.write(out)
-    return Fitted(prior, costs, 8 * BIT * len(out) + classes, own)
+    return Fitted(prior, costs, 8 * BIT * len(out) + heights, own)
 
 
 def _richer_priors(h: Histogram, found: Fitted, effort: int) -> list[Fitted]:
@@ -157,10 +157,10 @@ def _richer_priors(h: Histogram, found: Fitted, effort: int) -> list[Fitted]:
         mu1, si1, mu2, si2, weight, floor, cost, costs = loops().mixture(dense, effort)
         mixture = Mixture(window, Normal(mu1, si1), Normal(mu2, si2), weight, FLOORS[floor])
         priors.append(_fitted(mixture, costs, cost + beside))
-    if spare > len(seen):  # a class costs a bit or more
-        step, differences, top, width, mean16, cost, described, costs, classes = loops().classes(dense)
+    if spare > len(seen):  # a height costs a bit or more
+        step, differences, top, width, mean16, cost, described, costs, heights = loops().heights(dense)
         if step >= 0:
-            hist = Hist(window, CLASS_STEPS[step], top, bool(differences), width, mean16, classes)
+            hist = Hist(window, HEIGHT_STEPS[step], top, bool(differences), width, mean16, heights)
             priors.append(_fitted(hist, costs, cost + beside, described))
     return priors
 

@@ -1,8 +1,8 @@
 """The same symbols under LZMA, in the layout that suits LZMA best.
 
-Payload: one byte of lc + 9 * (lp + 5 * pb), one byte of flags (bit 0: the bytes of wide numbers lie in separate
-planes), then per non-empty channel a varint of (zigzag(base) << 2 | log2(width)); then one raw LZMA2 stream of the
-channels in order, each as little-endian signed integers k - base of the narrowest width.
+Payload: one byte of flags (bit 0: the bytes of wide numbers lie in separate planes), then per non-empty channel a
+varint of (zigzag(base) << 2 | log2(width)); then one raw LZMA2 stream of the channels in order, each as little-endian
+signed integers k - base of the narrowest width.
 """
 
 from __future__ import annotations
@@ -42,7 +42,6 @@ def decode_channels_lzma(payload: bytes | memoryview, counts: Sequence[int]) -> 
         if not 0 <= count <= MAX_COUNT:
             raise LimitExceeded(f"array {index}: {count} numbers, limit {MAX_COUNT}")
     reader = ByteReader(payload)
-    reader.byte("lc, lp and pb", 9 * 5 * 5 - 1)  # informative: LZMA2 stores its own
     planar = bool(reader.bits("the layout's flags", 1))
     bases, dtypes = list[int](), list[np.dtype]()
     for count in counts:
@@ -117,8 +116,8 @@ def _compress(head: bytes, numbers: Sequence[np.ndarray], effort: int) -> bytes:
     if len(trials) > 1:
         samples = {planar: _sample(data) for planar, data in layouts.items()}
         trials.sort(key=lambda trial: len(_packed(samples[trial[0]], trial[1])))
-    planar, (lc, lp, pb) = trials[0]
-    return bytes((lc + 9 * (lp + 5 * pb), planar)) + head + _packed(layouts[planar], (lc, lp, pb))
+    planar, setting = trials[0]
+    return bytes([planar]) + head + _packed(layouts[planar], setting)
 
 
 def _decompress(

@@ -35,7 +35,7 @@ MAX_WINDOW = 1 << 14
 FREE_ENTRIES, MORE_ENTRIES = 1 << 18, 1 << 10
 MU8_MAX = 1 << 31
 FLOORS = (1, 16)  #: 16 / 2**24 is the clip of R(a)
-CLASS_STEPS = (8, 16, 32, 64)  #: histogram classes per prior, in 1/64 octave
+HEIGHT_STEPS = (8, 16, 32, 64)  #: units of a histogram's heights, in 1/64 octave
 
 CONST, GAUSS, GMM2, HIST = 0, 1, 2, 3
 FIRST_REUSE = 8  #: family codes from here on refer to an earlier prior
@@ -160,9 +160,9 @@ class Mixture(_Tabled):
 
 @dataclass(frozen=True, eq=False)
 class Hist(_Tabled):
-    """A histogram: frequencies rounded to `top` classes of `step` / 64 octaves, counted up to the largest; 0 is absent.
+    """A histogram: frequencies as heights in units of `step` / 64 octaves, up to `top`; 0 is absent.
 
-    The classes (or their differences) are coded in the ANS stream, before all channels, under a Gaussian of their own.
+    The heights (or their differences) are coded in the ANS stream, before all channels, under a Gaussian of their own.
     """
 
     id: ClassVar[int] = HIST
@@ -170,54 +170,54 @@ class Hist(_Tabled):
     step: int
     top: int
     differences: bool
-    class_si16: int  #: si = 16 * class_si16 - 160
-    class_mean16: int  #: mu8 = 16 * class_mean16; 0 and not stored for differences, whose mean is 0
-    classes: np.ndarray | None  #: int [n] in 0..top; None until the stream has given them
+    height_si16: int  #: si = 16 * height_si16 - 160
+    height_mean16: int  #: mu8 = 16 * height_mean16; 0 and not stored for differences, whose mean is 0
+    heights: np.ndarray | None  #: int [n] in 0..top; None until the stream has given them
 
     @property
-    def class_normal(self) -> tuple[int, Normal]:
-        """Number of entries and Gaussian of the classes' table."""
-        n, mu8 = (2 * self.top + 1, 256 * self.top) if self.differences else (self.top + 1, 16 * self.class_mean16)
-        return n, Normal(mu8, 16 * self.class_si16 - 160)
+    def height_normal(self) -> tuple[int, Normal]:
+        """Number of entries and Gaussian of the heights' table."""
+        n, mu8 = (2 * self.top + 1, 256 * self.top) if self.differences else (self.top + 1, 16 * self.height_mean16)
+        return n, Normal(mu8, 16 * self.height_si16 - 160)
 
     @cached_property
-    def class_cum(self) -> np.ndarray:
+    def height_cum(self) -> np.ndarray:
         return normal_tables([self])[0]
 
     @cached_property
-    def class_model(self) -> Model | None:
-        return model_of(self.class_cum)
+    def height_model(self) -> Model | None:
+        return model_of(self.height_cum)
 
     @property
-    def class_symbols(self) -> np.ndarray:
-        """The classes as symbols of class_cum, int64 [n]."""
-        classes = np.asarray(self.classes, dtype=np.int64)
-        return np.diff(classes, prepend=0) + self.top if self.differences else classes
+    def height_symbols(self) -> np.ndarray:
+        """The heights as symbols of height_cum, int64 [n]."""
+        heights = np.asarray(self.heights, dtype=np.int64)
+        return np.diff(heights, prepend=0) + self.top if self.differences else heights
 
     @cached_property
     def cum(self) -> np.ndarray:
-        classes = np.asarray(self.classes, dtype=np.int64)
-        below = (self.top - classes) * self.step
-        return histogram_table(np.where(classes > 0, OCTAVE[below & 63] >> (below >> 6), 0))
+        heights = np.asarray(self.heights, dtype=np.int64)
+        below = (self.top - heights) * self.step
+        return histogram_table(np.where(heights > 0, OCTAVE[below & 63] >> (below >> 6), 0))
 
     def write(self, out: bytearray) -> None:
         self.window.write(out)
-        out.append(CLASS_STEPS.index(self.step) | 4 * self.differences)
+        out.append(HEIGHT_STEPS.index(self.step) | 4 * self.differences)
         put_varint(out, self.top)
-        out.append(self.class_si16)
+        out.append(self.height_si16)
         if not self.differences:
-            put_varint(out, self.class_mean16)
+            put_varint(out, self.height_mean16)
 
     @classmethod
     def read(cls, reader: ByteReader) -> Hist:
         window = Window.read(reader)
         mode = reader.bits("a histogram's mode", 3)
-        step, differences = CLASS_STEPS[mode & 3], bool(mode & 4)
-        top = reader.varint(top_limit(step), "a histogram's largest class")
+        step, differences = HEIGHT_STEPS[mode & 3], bool(mode & 4)
+        top = reader.varint(top_limit(step), "a histogram's largest height")
         if top == 0:
-            raise Malformed("a histogram without classes", offset=reader.offset)
-        si16 = reader.byte("a histogram's class width", 63)
-        mean16 = 0 if differences else reader.varint(16 * top, "a histogram's class mean")
+            raise Malformed("a histogram without heights", offset=reader.offset)
+        si16 = reader.byte("a histogram's spread of heights", 63)
+        mean16 = 0 if differences else reader.varint(16 * top, "a histogram's mean height")
         return cls(window, step, top, differences, si16, mean16, None)
 
 
@@ -231,11 +231,11 @@ BATCH = 1 << 14
 
 
 def make_models(priors: Sequence[Prior]) -> None:
-    """Fills in `model` of Gaussians and mixtures, and `class_model` of histograms, many in one pass."""
+    """Fills in `model` of Gaussians and mixtures, and `height_model` of histograms, many in one pass."""
     for batch in _batches([prior for prior in priors if isinstance(prior, Gauss | Mixture | Hist)]):
         for prior, model in zip(batch, models_of_each(*normal_tables(batch)), strict=True):
             # where cached_property keeps it
-            prior.__dict__["class_model" if isinstance(prior, Hist) else "model"] = model
+            prior.__dict__["height_model" if isinstance(prior, Hist) else "model"] = model
 
 
 def _batches(priors: Sequence[AnyPrior]) -> Iterator[list[AnyPrior]]:
@@ -252,11 +252,11 @@ def _batches(priors: Sequence[AnyPrior]) -> Iterator[list[AnyPrior]]:
 
 
 def normal_tables(priors: Sequence[Prior]) -> tuple[np.ndarray, np.ndarray]:
-    """(concatenated tables int64, their sizes int64 [m]): of histograms, the tables of their classes."""
+    """(concatenated tables int64, their sizes int64 [m]): of histograms, the tables of their heights."""
     rows = list[tuple[int, Normal, int]]()
     for prior in priors:
         if isinstance(prior, Hist):
-            rows.append((*prior.class_normal, 1))
+            rows.append((*prior.height_normal, 1))
         elif isinstance(prior, Const):
             rows.append((1, Normal(0, 0), 1))
         else:
@@ -273,32 +273,32 @@ def normal_tables(priors: Sequence[Prior]) -> tuple[np.ndarray, np.ndarray]:
     return tables_of_each(cdf, sizes, floors), sizes
 
 
-def with_class_symbols(priors: Sequence[Hist], symbols: Sequence[np.ndarray]) -> list[Hist]:
-    """The histograms, at least one, with the classes of their symbols of class_cum, int32 [n] each, and with `model`.
+def with_height_symbols(priors: Sequence[Hist], symbols: Sequence[np.ndarray]) -> list[Hist]:
+    """The histograms, at least one, with the heights of their symbols of height_cum, int32 [n] each, and with `model`.
 
-    Raises Malformed for classes out of range."""
+    Raises Malformed for heights out of range."""
     whole = list[Hist]()
     rest = iter(symbols)
     for batch in _batches(priors):
         sizes = np.array([prior.window.n for prior in batch], np.int64)
         tops, steps = (np.array([getattr(p, name) for p in batch], np.int64) for name in ("top", "step"))
         of_each = np.repeat(np.arange(len(batch)), sizes)
-        classes = np.concatenate([next(rest) for _ in batch]).astype(np.int64)
+        heights = np.concatenate([next(rest) for _ in batch]).astype(np.int64)
         summed = np.array([prior.differences for prior in batch])[of_each]
-        running = np.cumsum(np.where(summed, classes - tops[of_each], 0))
+        running = np.cumsum(np.where(summed, heights - tops[of_each], 0))
         firsts = np.cumsum(sizes) - sizes
         before = np.concatenate([[0], running])[firsts]
-        classes = np.where(summed, running - before[of_each], classes)
-        low, high = np.minimum.reduceat(classes, firsts), np.maximum.reduceat(classes, firsts)
+        heights = np.where(summed, running - before[of_each], heights)
+        low, high = np.minimum.reduceat(heights, firsts), np.maximum.reduceat(heights, firsts)
         wrong = np.flatnonzero((low < 0) | (high > tops) | (high == 0))
         if wrong.size:
             at = wrong[0]
-            raise Malformed(f"histogram classes {low[at]}..{high[at]}, expected 0..{tops[at]}, not all 0")
-        below = (tops[of_each] - classes) * steps[of_each]
-        freqs = np.where(classes > 0, OCTAVE[below & 63] >> (below >> 6), 0)
+            raise Malformed(f"histogram heights {low[at]}..{high[at]}, expected 0..{tops[at]}, not all 0")
+        below = (tops[of_each] - heights) * steps[of_each]
+        freqs = np.where(heights > 0, OCTAVE[below & 63] >> (below >> 6), 0)
         models = models_of_each(histogram_tables_of_each(freqs, sizes), sizes)
         for prior, first, model in zip(batch, firsts.tolist(), models, strict=True):
-            whole.append(replace(prior, classes=classes[first : first + prior.window.n]))
+            whole.append(replace(prior, heights=heights[first : first + prior.window.n]))
             whole[-1].__dict__["model"] = model
     return whole
 
@@ -309,7 +309,7 @@ def _columns(normals: Sequence[Normal]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def top_limit(step: int) -> int:
-    """The largest class a histogram may have: classes reach 31 octaves below the largest frequency."""
+    """The largest height a histogram may have: heights reach 31 octaves below the largest frequency."""
     return 1 + 31 * 64 // step
 
 

@@ -2,7 +2,7 @@
 
 By clause 11.5 and rounding half to even, |x - x_hat| <= Q/2 plus half a unit in the last place of x_hat, because the
 product k Q is rounded to binary32. Voxel indices and mask codes are integers and come back exactly. The header declares
-one bound per class of tensors (clause 5.4), the classes being the fields of Steps. An anchor of step class c has 2^c
+one bound per kind of tensors (clause 5.4), the kinds being the fields of Steps. An anchor of step class c has 2^c
 times the steps and the bounds.
 """
 

@@ -78,7 +78,7 @@ class LayerReport:
 @dataclass(frozen=True)
 class Report:
     """The report of an encode. left_out: rows of what, why, lossless and bytes, about what it would have taken. errors:
-    declared and largest errors by class of tensors, empty if not verified. metadata_bytes: of the metadata's chunk, 0
+    declared and largest errors by kind of tensors, empty if not verified. metadata_bytes: of the metadata's chunk, 0
     without one."""
 
     mode: str

@@ -20,15 +20,15 @@ from pd4dgs_codec.format.registry import BY_CHUNK_TYPE, LAYER_KINDS, MAX_CHUNKS,
 from pd4dgs_codec.scene import ATTRIBUTES, MAX_FEATURE, MAX_SLOTS, SCAFFOLD_NETWORKS, Camera, SceneInfo, Widths
 
 # Keys of the header map.
-CHUNKS, MODE = 1, 2
+CHUNKS, MODE, CENTRE = range(1, 4)
 STEPS, VOXEL_SIZE, BOX, TIME_RANGE, BACKGROUND, NEAR_FAR, UP, UNIT = range(4, 12)
-CAMERA, ERROR_BOUNDS, DIGEST, WIDTHS, CENTRE = range(12, 17)
-KEYS = {CHUNKS, MODE, *range(STEPS, CENTRE + 1)}
+CAMERA, ERROR_BOUNDS, DIGEST, WIDTHS = range(12, 16)
+KEYS = set(range(CHUNKS, WIDTHS + 1))
 # Keys of the camera map.
 VIEWMAT, INTRINSICS, WIDTH, HEIGHT = range(1, 5)
 
 #: Keys of the map of error bounds, by field of Steps.
-TENSOR_CLASSES = {
+TENSOR_KINDS = {
     "feature": 0,
     "scaling_log": 1,
     "offset": 2,
@@ -38,7 +38,7 @@ TENSOR_CLASSES = {
     "planes_local": 6,
     "weights_local": 7,
 }
-#: The classes of layer 0; the others belong to layers that a file may lack.
+#: The kinds of layer 0; the others belong to layers that a file may lack.
 ALWAYS_BOUNDED = (*ATTRIBUTES, LAYER_KINDS[0].weights_step)
 
 MAX_CAMERA_SIDE = 65535
@@ -90,7 +90,7 @@ def pack_header(header: Header) -> bytes:
             HEIGHT: int(camera.height),
         }
     bounds = header.error_bounds
-    fields[ERROR_BOUNDS] = {number: bounds[name] for name, number in TENSOR_CLASSES.items() if name in bounds}
+    fields[ERROR_BOUNDS] = {number: bounds[name] for name, number in TENSOR_KINDS.items() if name in bounds}
     fields |= {DIGEST: header.digest, WIDTHS: _pack_widths(grid.widths)}
     if grid.widths.graded:
         fields[CENTRE] = grid.centre.tolist()
@@ -224,11 +224,9 @@ def _unpack_centre(header: Fields, widths: Widths) -> np.ndarray:
 def _unpack_error_bounds(header: Fields) -> dict[str, float]:
     if ERROR_BOUNDS not in header:
         raise Malformed(f"header: key {ERROR_BOUNDS}, the error bounds, is missing")
-    fields = Fields(header.get(ERROR_BOUNDS), "header error bounds", set(TENSOR_CLASSES.values()))
+    fields = Fields(header.get(ERROR_BOUNDS), "header error bounds", set(TENSOR_KINDS.values()))
     bounds = {
-        name: fields.real(number)
-        for name, number in TENSOR_CLASSES.items()
-        if number in fields or name in ALWAYS_BOUNDED
+        name: fields.real(number) for name, number in TENSOR_KINDS.items() if number in fields or name in ALWAYS_BOUNDED
     }
     for name, bound in bounds.items():
         if bound < 0:

@@ -18,7 +18,7 @@ const FIRST_REUSE = 8;
  * @property {Window} window
  * @property {() => Int32Array} makeTable
  * @property {Table} [table] made from makeTable's frequencies when it is first used
- * @property {(stream: AnsDecoder) => void} [readClasses] reads a histogram's classes from the stream
+ * @property {(stream: AnsDecoder) => void} [readHeights] reads a histogram's heights from the stream
  */
 
 /** Symbols outside the window, at ascending positions. @typedef {{positions: number[], values: number[]}} Exceptions */
@@ -55,7 +55,7 @@ export function decodeChannels(bytes, counts, out, priors = []) {
     channels.push({ count, prior, exceptions: token & 1 ? readExceptions(reader, count, prior.window) : null });
   }
   const stream = new AnsDecoder(reader.rest());
-  for (let i = before; i < priors.length; i++) priors[i].readClasses?.(stream);
+  for (let i = before; i < priors.length; i++) priors[i].readHeights?.(stream);
   let at = 0;
   for (const { count, prior, exceptions } of channels) {
     takeChannel(stream, prior, exceptions, out, at, count);
@@ -145,27 +145,27 @@ function readHistogram(reader, window) {
   if (mode > 7) throw malformed(`mode ${mode} of a histogram, whose bits from 3 on are reserved`);
   const step = 8 << (mode & 3);
   const differences = (mode & 4) !== 0;
-  const top = reader.varint(1 + Math.floor(1984 / step), "the largest class of a histogram");
-  if (!top) throw malformed("a histogram without classes");
-  const width = reader.byte("the width of a histogram's classes");
-  if (width > 63) throw limitExceeded(`a class width of ${width}, limit 63`);
-  const mu8 = differences ? 256 * top : 16 * reader.varint(16 * top, "the mean of a histogram's classes");
+  const top = reader.varint(1 + Math.floor(1984 / step), "the largest height of a histogram");
+  if (!top) throw malformed("a histogram without heights");
+  const width = reader.byte("the width of a histogram's heights");
+  if (width > 63) throw limitExceeded(`a spread of heights of ${width}, limit 63`);
+  const mu8 = differences ? 256 * top : 16 * reader.varint(16 * top, "the mean of a histogram's heights");
   const { n } = window;
-  const classes = new Int32Array(n);
+  const heights = new Int32Array(n);
   return {
     window,
-    makeTable: () => histogramTable(classes, top, step),
-    readClasses(stream) {
+    makeTable: () => histogramTable(heights, top, step),
+    readHeights(stream) {
       const table = normTable((differences ? 2 * top : top) + 1, mu8, 16 * width - 160, 1);
-      stream.symbols(new Table(table), classes, 0, n);
+      stream.symbols(new Table(table), heights, 0, n);
       let any = 0;
       for (let s = 0, before = 0; s < n; s++) {
-        if (differences) classes[s] += before - top;
-        before = classes[s];
-        if (before < 0 || before > top) throw malformed(`a class of ${before} in a histogram, expected 0..${top}`);
+        if (differences) heights[s] += before - top;
+        before = heights[s];
+        if (before < 0 || before > top) throw malformed(`a height of ${before} in a histogram, expected 0..${top}`);
         any |= before;
       }
-      if (!any) throw malformed("a histogram whose classes are all 0");
+      if (!any) throw malformed("a histogram whose heights are all 0");
     },
   };
 }

@@ -31,7 +31,7 @@ export const channelCount = ({ feature, slots }) => feature + 6 + 3 * slots;
 export const LAYER_TYPES = 3;
 
 /** The keys of a header (5.1), and of a camera. */
-const KEYS = [1, 2, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16];
+const KEYS = [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15];
 const CAMERA_KEYS = [1, 2, 3, 4];
 const CLASSES = [0, 1, 2, 3, 4, 5, 6, 7];
 /** The error bounds that every file has: of the attributes and of layer 0's weights. */
@@ -73,7 +73,7 @@ export function readHeader(bytes) {
     slots: asInteger(count, 1, MAX_SLOTS, "header: slots"),
     views: asInteger(views, 0, MAX_VIEWS, "header: networks that take the view direction"),
   };
-  const centres = fields.has(16) ? readCentres(fields.get(16), channelCount(widths)) : null;
+  const centres = fields.has(3) ? readCentres(fields.get(3), channelCount(widths)) : null;
   const layers = chunks.filter(({ type }) => type < LAYER_TYPES).map(({ type }) => type);
   if (mode === 1 && new Set(layers).size < layers.length) throw malformed("header: mode lzma, and a layer in slices");
   if (mode === 1) throw unsupported("header: mode lzma, expected mode ans"); // an ans-only decoder (clause 16)

@@ -74,14 +74,14 @@ export function mixtureTable(n, first, second, weight) {
 /**
  * A histogram, 7.5.
  *
- * @param {Int32Array} classes 0..top, not all 0 @param {number} top @param {number} step
+ * @param {Int32Array} heights 0..top, not all 0 @param {number} top @param {number} step
  */
-export function histogramTable(classes, top, step) {
-  const n = classes.length;
+export function histogramTable(heights, top, step) {
+  const n = heights.length;
   const sums = new Float64Array(n + 1);
   for (let s = 0; s < n; s++) {
-    const b = (top - classes[s]) * step; // at most 1984 where it is used
-    sums[s + 1] = sums[s] + (classes[s] ? M[b & 63] >>> (b >> 6) : 0);
+    const b = (top - heights[s]) * step; // at most 1984 where it is used
+    sums[s + 1] = sums[s] + (heights[s] ? M[b & 63] >>> (b >> 6) : 0);
   }
   let scale = 1; // 2^-h, which leaves the sums at most 28 binary digits
   while (sums[n] * scale >= 2 ** 28) scale /= 2;

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from strategies import norm_table
 
 from pd4dgs_codec.entropy.priors import (
-    CLASS_STEPS,
+    HEIGHT_STEPS,
     Const,
     Gauss,
     Hist,
@@ -23,7 +23,7 @@ from pd4dgs_codec.entropy.priors import (
     make_models,
     normal_tables,
     top_limit,
-    with_class_symbols,
+    with_height_symbols,
 )
 from pd4dgs_codec.entropy.tables import (
     NORMAL,
@@ -120,28 +120,28 @@ def test_tables_made_together_are_those_made_alone():
         for i in range(9)
     ]
     cums, sizes = normal_tables(priors[1:])
-    alone = [prior.class_cum if isinstance(prior, Hist) else prior.cum for prior in priors[1:]]
+    alone = [prior.height_cum if isinstance(prior, Hist) else prior.cum for prior in priors[1:]]
     for found, expected in zip(np.split(cums, np.cumsum(sizes + 1)[:-1]), alone, strict=True):
         np.testing.assert_array_equal(found, expected)
     make_models(priors)
-    assert all({"model", "class_model"} & {*prior.__dict__} for prior in priors[1:])
+    assert all({"model", "height_model"} & {*prior.__dict__} for prior in priors[1:])
 
 
 def test_histograms_completed_together_are_those_made_alone():
     rng = np.random.default_rng(4)
     whole = []
     for n in [2, 3, 1 << 14, *rng.integers(2, 60, 40).tolist()]:
-        step = int(rng.choice(CLASS_STEPS))
-        classes = rng.integers(0, (top := int(rng.integers(1, top_limit(step) + 1))) + 1, n)
-        classes[rng.integers(n)] = top
-        whole.append(Hist(Window(0, n), step, top, bool(rng.integers(2)), 0, 0, classes))
-    found = with_class_symbols(
-        [replace(prior, classes=None) for prior in whole], [p.class_symbols.astype(np.int32) for p in whole]
+        step = int(rng.choice(HEIGHT_STEPS))
+        heights = rng.integers(0, (top := int(rng.integers(1, top_limit(step) + 1))) + 1, n)
+        heights[rng.integers(n)] = top
+        whole.append(Hist(Window(0, n), step, top, bool(rng.integers(2)), 0, 0, heights))
+    found = with_height_symbols(
+        [replace(prior, heights=None) for prior in whole], [p.height_symbols.astype(np.int32) for p in whole]
     )
     for prior, expected in zip(found, whole, strict=True):
-        np.testing.assert_array_equal(prior.classes, expected.classes)
+        np.testing.assert_array_equal(prior.heights, expected.heights)
         assert "model" in prior.__dict__
-        assert prior.cum.tolist() == refdec.histogram_table(expected.classes.tolist(), prior.top, prior.step)
+        assert prior.cum.tolist() == refdec.histogram_table(expected.heights.tolist(), prior.top, prior.step)
     weights = [rng.integers(0, 1 << 31, n) for n in (2, 5, 1 << 14, 33)]
     weights.append(np.array([0, 1, 0]))
     cums = histogram_tables_of_each(np.concatenate(weights), np.array([len(w) for w in weights]))

@@ -12,7 +12,7 @@ from pd4dgs_codec.format.check import ErrorBound
 from pd4dgs_codec.format.container import read_preamble
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode, encode_with_report
-from pd4dgs_codec.format.header import TENSOR_CLASSES, unpack_header
+from pd4dgs_codec.format.header import TENSOR_KINDS, unpack_header
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.format.registry import LAYER_KINDS
 
@@ -32,7 +32,7 @@ def scene_off_the_grid():
 def test_every_step_in_use_is_reported_with_an_error_within_its_bound():
     scene = scene_off_the_grid()
     _, report = encode_with_report(scene, layers=2, effort=1)
-    assert [row.what for row in report.errors] == list(TENSOR_CLASSES)
+    assert [row.what for row in report.errors] == list(TENSOR_KINDS)
     for row in report.errors:
         step = getattr(scene.steps, row.what)
         assert row.step == step and 0.5 * step <= row.bound <= 0.51 * step
@@ -78,7 +78,7 @@ def test_bounds_allow_for_the_rounding_of_large_values():
 def test_an_error_above_the_declared_bound_is_refused(monkeypatch):
     """The bound is read back from the bytes written, not taken from where it was computed."""
     low = {name: 0.4 * step for name, step in vars(scene_off_the_grid().steps).items()}
-    low = {name: float(np.float32(low[name])) for name in TENSOR_CLASSES}
+    low = {name: float(np.float32(low[name])) for name in TENSOR_KINDS}
     monkeypatch.setattr(encoder, "rounding_bounds", lambda *args: low)
     with pytest.raises(EncodeError, match=r"verification: feature: .* expected at most 0.025.* between them"):
         encode(scene_off_the_grid(), layers=2, effort=1)

@@ -67,6 +67,6 @@ def test_each_clause_that_a_row_names_is_there():
                 assert re.search(rf"^#+ {re.escape(clause)} ", FORMAT, re.MULTILINE), (row[0], clause)
 
 
-def test_findings_that_rows_name_are_explained():
+def test_decisions_that_rows_name_are_explained():
     named = set(re.findall(r"\bF\d+\b", "".join(section(title) for title in TABLES)))
-    assert named and named <= set(re.findall(r"\*\*(F\d+)\.", section("Findings")))
+    assert named and named <= set(re.findall(r"\*\*(F\d+)\.", section("Decisions")))

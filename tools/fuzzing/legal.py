@@ -172,10 +172,10 @@ def _histogram(rng: random.Random, window: Window) -> Hist:
     step = rng.choice((8, 16, 32, 64))
     top, differences = _near(rng, 1, top_limit(step)), rng.random() < 0.5
     numbers = np.random.default_rng(rng.randrange(1 << 32))
-    classes = numbers.integers(0, top, window.n, endpoint=True) * (numbers.random(window.n) < rng.choice((0.1, 1)))
-    classes[rng.randrange(window.n)] = _near(rng, 1, top)
+    heights = numbers.integers(0, top, window.n, endpoint=True) * (numbers.random(window.n) < rng.choice((0.1, 1)))
+    heights[rng.randrange(window.n)] = _near(rng, 1, top)
     mean = 0 if differences else _near(rng, 0, 16 * top)
-    return Hist(window, step, top, differences, _near(rng, 0, 63), mean, classes)
+    return Hist(window, step, top, differences, _near(rng, 0, 63), mean, heights)
 
 
 # -- slices ------------------------------------------------------------------------------------------------------------
@@ -290,8 +290,7 @@ def _lzma(rng: random.Random, layer: Layer) -> dict[int, bytes | None]:
     stream = rng.choice((lzma2.stored, lzma2.packed))
     base = rng.choice((0, 0, None, K, -K, 1000))
     how = {"base": base, "width": rng.choice((None, 2)), "planar": rng.random() < 0.5, "stream": stream}
-    section = blocks.lzma_symbols(layer.channels, **how)  # type: ignore[arg-type]
-    return none | {SYMBOLS: bytes([_near(rng, 0, 224)]) + section[1:]}
+    return none | {SYMBOLS: blocks.lzma_symbols(layer.channels, **how)}  # type: ignore[arg-type]
 
 
 # -- layers ------------------------------------------------------------------------------------------------------------
@@ -405,7 +404,7 @@ def _header(choices: Choices, layers: Sequence[Layer]) -> dict[int, Any]:
     header: dict[int, Any] = {2: choices.mode, 4: [_step(rng, k, most=every) for k in rows]}
     header[5] = _step(rng, *(x.cells for x in layers))
     if choices.centres is not None:
-        header[16] = choices.centres
+        header[3] = choices.centres
     if rng.random() < 0.3:
         box = sorted(rng.choice((-LARGEST, -1.0, -0.0, 2.0**-149, LARGEST)) for _ in range(2))
         header |= {6: [box[0]] * 3 + [box[1]] * 3, 7: [-LARGEST, LARGEST], 8: [0.0, 1.0, 2.0**-149], 9: [-0.0, LARGEST]}

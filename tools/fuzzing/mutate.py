@@ -236,7 +236,7 @@ def stages_of(section: bytes, number: int, header: dict[int, Any], meta: dict[in
             if byte < 128:
                 return value
 
-    graded, (feature, slots, _) = 16 in header, header[15]
+    graded, (feature, slots, _) = 3 in header, header[15]
     if number == ATTRIBUTES and section[0] in (1, 2):
         count = 8
         if graded:

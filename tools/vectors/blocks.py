@@ -141,14 +141,14 @@ def coded(
         inside = (k >= window.kmin) & (k < window.end)
         parameters = bytearray()
         prior.write(parameters)
-        key = bytes([prior.id]) + parameters, np.asarray(getattr(prior, "classes", ())).tobytes()
+        key = bytes([prior.id]) + parameters, np.asarray(getattr(prior, "heights", ())).tobytes()
         if key in defined:
             block += varint(2 * (FIRST_REUSE + defined[::-1].index(key)) + (not inside.all()))
         else:
             block += varint(2 * prior.id + (not inside.all())) + parameters
             defined.append(key)
             if isinstance(prior, Hist):
-                tables.append((prior.class_symbols, prior.class_cum))
+                tables.append((prior.height_symbols, prior.height_cum))
         if not inside.all():
             block += _exceptions(k, inside, window)
         parts.append((k[inside] - window.kmin, prior.cum))
@@ -357,7 +357,7 @@ def lzma_symbols(
 ) -> bytes:
     """Section SYMBOLS. base: of all channels; None takes the first symbol of each. width: log2 of the bytes of every
     number; None takes the narrowest."""
-    out, data = bytes([lzma2.PROPERTIES, planar]), b""
+    out, data = bytes([planar]), b""
     for channel in channels:
         if channel.size:
             own = int(channel[0]) if base is None else base
@@ -686,7 +686,7 @@ def make_file(*layers: Layer, header: Mapping[int, Any] | None = None) -> File:
         chunks += [Chunk(number, x.payload(), f, x) for f, x in zip(flags, own, strict=True)]
     widths = layers[0].widths
     views = sum(1 << i for i, inputs in enumerate(widths.inputs.values()) if inputs > widths.feature)
-    centres = {16: [i % 5 - 2 for i in range(widths.channels)]} if widths.graded else {}
+    centres = {3: [i % 5 - 2 for i in range(widths.channels)]} if widths.graded else {}
     return File(tuple(chunks)).with_header({15: [widths.feature, widths.slots, views], **centres, **(header or {})})
 
 
@@ -698,7 +698,7 @@ def _hashes(slices: list[Layer], header: Mapping[int, Any]) -> dict[str, Any]:
     k = np.concatenate([x.attributes for x in slices], axis=1)[:, order]
     classes = classes[order] if classes.size else classes
     values = k.astype(np.int64) << (classes if classes.size else 0)
-    values += np.array(header.get(16, [0] * len(k)), np.int64)[:, None]
+    values += np.array(header.get(3, [0] * len(k)), np.int64)[:, None]
 
     def dequantised(symbols: np.ndarray, step: Any) -> np.ndarray:
         return (symbols.astype(np.float64) * np.asarray(step, np.float64)).astype("<f4")

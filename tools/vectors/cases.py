@@ -311,10 +311,10 @@ def predicted(k: np.ndarray, block: Block | None = None, **fields: Any) -> File:
 
 
 def histogram(d: int, top: int, count: int, differences: bool, si16: int = 20, m: int = 0) -> Hist:
-    """A histogram from -3 on, the extreme classes at its edges."""
-    classes = pattern(count, low=0, high=top, seed=top)
-    classes[0], classes[1], classes[-1] = 0, min(1, top), top
-    return Hist(Window(-3, count), d, top, differences, si16, m, classes)
+    """A histogram from -3 on, the extreme heights at its edges."""
+    heights = pattern(count, low=0, high=top, seed=top)
+    heights[0], heights[1], heights[-1] = 0, min(1, top), top
+    return Hist(Window(-3, count), d, top, differences, si16, m, heights)
 
 
 def tables_at_limit(more: bool = False) -> File:
@@ -448,16 +448,16 @@ def steep(prior: Prior, sign: int = 1) -> File:
     return make_file(make_layer(), steep_plane(sign=sign).with_sections({PLANE: plain_planes(residuals, {0: prior})}))
 
 
-def hist_codes(prior: Hist, block: bytes | None = None, classes: list[int] | None = None) -> bytes:
-    """Section MASKS of the codes 5, 9, 7. block: instead of the prior's parameters. classes: instead of its symbols in
+def hist_codes(prior: Hist, block: bytes | None = None, heights: list[int] | None = None) -> bytes:
+    """Section MASKS of the codes 5, 9, 7. block: instead of the prior's parameters. heights: instead of its symbols in
     the stream; the codes behind them are written for what they mean, if that is a table at all."""
     out = bytearray(varint(2 * prior.id))
     prior.write(out)
-    symbols = prior.class_symbols if classes is None else np.array(classes)
+    symbols = prior.height_symbols if heights is None else np.array(heights)
     meant = np.cumsum(symbols - prior.top) if prior.differences else symbols
     if not 0 < meant.max() <= prior.top:
         meant = np.full(prior.window.n, 5)
-    stream = ans_encode([symbols, np.array([2, 6, 4])], [prior.class_cum, replace(prior, classes=meant).cum])
+    stream = ans_encode([symbols, np.array([2, 6, 4])], [prior.height_cum, replace(prior, heights=meant).cum])
     return (bytes(out) if block is None else block) + stream
 
 
