@@ -241,7 +241,7 @@ BROKEN_STATES = {
     "order": [0, 6],
     "generator": torch.zeros(3),
     "optimiser": {"state": {0: {"step": torch.zeros(()), "exp_avg": torch.zeros(3), "exp_avg_sq": torch.zeros(3)}}},
-    "densifier": dict.fromkeys(("pull", "visits", "opacity", "anchor_visits"), torch.zeros(3)),
+    "densifier": {name: torch.zeros(3) for name in ("pull", "visits", "opacity", "anchor_visits")},
     "iteration": -3,
     "total": 10**30,
     "skipped": "many",
