@@ -23,7 +23,7 @@ from pd4dgs_codec.errors import Pd4Error  # noqa: E402
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--source", default="synthetic:local", help="dataset folder or synthetic:NAME (%(default)s)")
+    parser.add_argument("--source", default="synthetic:fast", help="dataset folder or synthetic:NAME (%(default)s)")
     parser.add_argument("--preset", default="tiny", choices=("tiny", "small", "paper"))
     parser.add_argument("--max-seconds", type=float, default=150.0, help="training time (%(default)s)")
     parser.add_argument("--downscale", type=int, default=1)
@@ -31,7 +31,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("-o", "--out", type=Path, default=Path("out"), help="folder for all results (%(default)s)")
     args = parser.parse_args(argv)
     try:
-        run(Scene("demo", args.source, args.downscale, args.preset), args.seed, args.max_seconds, args.out / "demo")
+        scene = Scene("demo", args.source, "the demo's", args.downscale, args.preset)
+        run(scene, args.seed, args.max_seconds, args.out / "demo")
     except (Pd4Error, OSError, KeyboardInterrupt) as error:
         print(f"demo: error: {str(error) or 'interrupted'}", file=sys.stderr)
         return 1
