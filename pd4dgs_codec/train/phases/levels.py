@@ -28,7 +28,7 @@ EVERY = 16
 MIN_VIEWS = 4
 #: A level stays if it is better by so many dB: level 2 by more, since level 1 has seen a tenth of the steps and has not
 #: caught up in its practice ...
-MIN_GAINS = {1: 0.5, 2: 2.0}
+MIN_GAINS = {1: 1.0, 2: 2.0}
 #: ... in the pixels in which it changes some colour by so much, if there are so many of them, ...
 MIN_CONTRAST, MIN_PIXELS = 0.02, 32
 #: ... than the level below after so many further steps: a share of the run, and so many at least.
@@ -110,10 +110,10 @@ def changes(without: Tensor, with_it: Tensor) -> Tensor:
 
 
 def gain_in(
-    views: Sequence[TrainingView], where: Sequence[Tensor], without: Sequence[Tensor], with_it: Sequence[Tensor]
+    views: Sequence[TrainingView], where: Sequence[Tensor | None], without: Sequence[Tensor], with_it: Sequence[Tensor]
 ) -> float:
     """By how many dB the squared error of a second picture of each view is less than that of a first one, in the pixels
-    `where`."""
+    `where`, bool [H, W]; None: in all."""
     first, second = (
         sum(view.squared_error(image.clamp(0, 1), mask) for view, mask, image in zip(views, where, drawn, strict=True))
         for drawn in (without, with_it)

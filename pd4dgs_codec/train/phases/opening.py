@@ -4,7 +4,7 @@ In views far from the key instant what moves is somewhere else, and no gradient 
 views near the key instant first, in a window of times that grows until it holds all. Meanwhile their planes have few
 instants and are linear in between: what moves steadily is then already where later views show it. What moves to and fro
 is not, and learns less in a narrow window. Which of the two a scene is shows in a trial: the motion learnt in a narrow
-window predicts the views next to it, or all views take part at once.
+window predicts views well outside it, or all views take part at once.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Any
 import torch
 
 from pd4dgs_codec.train import phases, workers
-from pd4dgs_codec.train.phases.levels import changes, gain_in, images
+from pd4dgs_codec.train.phases.levels import gain_in, images
 from pd4dgs_codec.train.state import TrainState
 
 #: The window, as a share of the longest time from the key instant: at first, and in the trial.
@@ -24,10 +24,10 @@ FIRST, TRIAL = 1 / 12, 1 / 6
 FEW_INSTANTS = ((0.3, 3), (0.5, 5), (0.7, 9), (1.0, 17))
 #: Steps of the trial: a share of the run, and so many at least.
 TRIAL_SHARE, MIN_TRIAL = 1 / 15, 75
-#: Motion predicts if it gains so many dB over the still level 0 in the pixels that it changes, ...
-MIN_GAIN = 4.0
-#: ... in at most so many views whose distance from the key instant is 1 to NEXT times the window.
-VIEWS, NEXT = 12, 1.5
+#: Motion predicts if it gains so many dB over the still level 0 in whole pictures, so that what it misses counts, ...
+MIN_GAIN = 4.2
+#: ... of at most so many views whose distance from the key instant is so many times the window.
+VIEWS, BEYOND = 12, (1.5, 2.0)
 
 
 class OpenTime(phases.Phase):
@@ -79,10 +79,9 @@ def _distance(state: TrainState, index: int) -> float:
 
 @torch.no_grad()
 def _predicted(state: TrainState) -> float:
-    """By how many dB the highest level is better than level 0 in views next to the window of the trial, in the pixels
-    where the two differ."""
-    near = [index for index in range(len(state.views)) if TRIAL < _distance(state, index) <= NEXT * TRIAL]
-    views = [state.picture(index) for index in near[:: max(1, -(-len(near) // VIEWS))]]
-    pictures = [[image.clamp(0, 1) for image in images(state, view, (0, state.model.level))] for view in views]
-    acts = [changes(*pair) for pair in pictures]
-    return gain_in(views, acts, [still for still, _ in pictures], [moved for _, moved in pictures])
+    """By how many dB the highest level is better than level 0 in views well outside the window of the trial."""
+    least, most = (TRIAL * times for times in BEYOND)
+    far = [index for index in range(len(state.views)) if least < _distance(state, index) <= most]
+    views = [state.picture(index) for index in far[:: max(1, -(-len(far) // VIEWS))]]
+    still, moved = ([images(state, view, (level,))[0] for view in views] for level in (0, state.model.level))
+    return gain_in(views, [None] * len(views), still, moved)
