@@ -137,6 +137,24 @@ def test_a_place_that_no_store_has_is_a_failure_of_its_line_alone(library, place
     assert said.isprintable() and said
 
 
+@pytest.mark.parametrize("place", STORES)
+def test_a_place_that_no_store_has_holds_no_manifest(place):
+    with pytest.raises((DataError, OSError)):
+        Manifest(place, OPS["encode"], lambda options: None)
+
+
+def test_what_no_check_foresaw_is_a_failure_of_its_line_alone(library):
+    def check(options):
+        if options:
+            raise ZeroDivisionError("never\n\x1b[2J")
+
+    library.add("a.pt", "first", options={"effort": 1})
+    library.add("b.pt", "fine")
+    library.manifest()
+    found = Manifest(str(library.folder / "m.jsonl"), OPS["encode"], check)
+    assert found.faults == [(1, "ZeroDivisionError: never \\x1b[2J")] and [line.number for line in found.lines] == [2]
+
+
 def test_two_lines_with_one_output_are_named(library):
     library.add("a.pt", "first", output="x.pd4")
     library.add("b.pt", "second", output="x.pd4")

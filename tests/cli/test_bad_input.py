@@ -277,7 +277,7 @@ def test_usage_errors_as_json(cli):
     assert result.code == 2 and json.loads(result.out)["error"]["type"] == "UsageError"
 
 
-EVIL = "\x1b]0;title\x07\x9b2J\u202e"
+EVIL = "\x1b]0;title\x07\n\x9b2J\u202e"
 
 
 def test_names_of_files_and_titles_cannot_move_the_cursor(cli, scene_pd4, tmp_path):

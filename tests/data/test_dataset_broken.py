@@ -7,6 +7,7 @@ import json
 import os
 import stat
 import struct
+import time
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +21,7 @@ from PIL import Image
 
 NAN = float("nan")
 FRAMES = [{"file_path": f"r_{i}", "time": i / 10, "transform_matrix": pose(0.2 * i)} for i in range(3)]
+SECONDS = 20  #: of processor time, which no case may take: most take a hundredth
 UNREAD = ("frames", "rigs")  #: files of COLMAP's that no reader opens
 SOCKET = object()  #: a change of a file: it is none, as a pipe would be, for which a reader could wait
 XYZ = "property float x\nproperty float y\nproperty float z\n"
@@ -318,7 +320,9 @@ def test_broken_folders(layout, scene, tmp_path, refused):
         path = folder / name
         whole = path.read_bytes() if path.exists() else None
         changed(path, change)
+        start = time.process_time()
         refused(folder, text)
+        assert time.process_time() - start < SECONDS, name
         path.unlink(missing_ok=True)
         if whole is not None:
             path.write_bytes(whole)

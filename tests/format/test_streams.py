@@ -15,7 +15,7 @@ from pd4dgs_codec import decode, open_stream
 from pd4dgs_codec.errors import ChecksumMismatch
 from pd4dgs_codec.format.info import info
 
-SLICES, ROWS = 60, 64
+SLICES, ROWS = 120, 64
 
 
 @cache
@@ -61,7 +61,7 @@ SPLITS = {
     "whole": lambda: (),
     "slices": lambda: ends()[:-1],
     "within slices": lambda: [end - 7 for end in ends()],
-    "runs of bytes": lambda: range(50, len(many_slices()), 50),
+    "single bytes": lambda: range(1, len(many_slices())),
 }
 
 
