@@ -97,7 +97,7 @@ def text(rows: Sequence[Row]) -> str:
     parts = []
     for row in rows:
         if row["table"] == "parts":
-            psnr, size = PUBLISHED[row["model"]]
+            psnr, size = PUBLISHED.get(row["model"], (None, None))
             parts.append(
                 (row["scene"], row["model"], number(row["mpsnr"]), number(row["bytes"], 0), number(row["layer0"], 0))
                 + (number(psnr), number(size))
