@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import datetime
 import json
+import os
 import sys
 import time
 from collections.abc import Sequence
@@ -99,6 +100,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("-o", "--out", type=Path, default=ROOT / "out" / "benchmarks", help="trainings and files")
     parser.add_argument("--docs", type=Path, help="folder of the page (docs; with --quick OUT/docs)")
     args = parser.parse_args(argv)
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # each process that is timed would compile its modules anew
     docs = args.docs or (args.out / "docs" if args.quick else ROOT / "docs")
     run = Run(args.out.resolve(), docs / "img", args.quick, args.seeds)
     asked = args.only or [name for name in names if not (args.quick and name == "player")]
