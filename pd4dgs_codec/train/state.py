@@ -171,6 +171,10 @@ class TrainState:
         """Whether this step is the first at or past position `start`."""
         return (self.position - 1 if self.share is None else self._before) < start <= self.position
 
+    def steps_in(self, share: float) -> int:
+        """How many steps a share of the run takes at its pace so far: in a timed run fewer than that share of N."""
+        return round(share * self.iteration / max(self.schedule.progress(self.position), 1e-9))
+
     def rounding(self, *, noisy: bool = True) -> Rounding:
         """How the steps at this position simulate quantisation; without its noise if not `noisy`."""
         if not self.config.noise:

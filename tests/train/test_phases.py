@@ -132,6 +132,14 @@ def test_time_opens_from_the_key_instant_where_motion_predicts(dataset, monkeypa
         assert instants[0] == 3 and instants[4] is not None and instants[8:] == [None] * 10
 
 
+def test_a_share_of_a_run_is_counted_in_its_own_steps(dataset):
+    learner = trainer_of(dataset, 1500).learner
+    learner.iteration = 150
+    assert learner.steps_in(1 / 10) == 150
+    learner.iteration, learner.share = 40, 0.1  # a timed run whose steps became slower than its N supposes
+    assert learner.steps_in(1 / 10) == 40
+
+
 def moved(before: dict, model) -> bool:
     """Whether a parameter differs."""
     return any(not torch.equal(value, before[name]) for name, value in model.state_dict().items())

@@ -81,7 +81,7 @@ class SelectLevels(phases.Phase):
 
         gain = math.inf
         try:
-            self._practise(below, max(MIN_PRACTICE, round(PRACTICE * (state.schedule.iterations or 0))))
+            self._practise(below, max(MIN_PRACTICE, state.steps_in(PRACTICE)))
             gain = workers.alike(measure)
         finally:  # a picture that is not finite ends the phase, and the level stays
             if gain >= MIN_GAINS[level]:

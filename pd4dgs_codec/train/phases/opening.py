@@ -42,9 +42,9 @@ class OpenTime(phases.Phase):
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
         """Sets `TrainState.opened` where the motion of the highest level does not predict; the rest is as before."""
-        before, steps = state.snapshot(), round(TRIAL_SHARE * (state.schedule.iterations or 0))
+        before = state.snapshot()
         try:
-            self._practise(state.model.level, max(MIN_TRIAL, steps))
+            self._practise(state.model.level, max(MIN_TRIAL, state.steps_in(TRIAL_SHARE)))
             record["predicted_gain"] = gain = workers.alike(lambda: _predicted(state))
         finally:
             state.return_to(before)
