@@ -23,7 +23,9 @@ from pd4dgs_codec.errors import Pd4Error  # noqa: E402
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--source", default="synthetic:fast?path=jump&frames=200", help="dataset folder or synthetic:NAME (%(default)s)")
+    parser.add_argument(
+        "--source", default="synthetic:fast?path=jump&frames=200", help="dataset folder or synthetic:NAME (%(default)s)"
+    )
     parser.add_argument("--preset", default="tiny", choices=("tiny", "small", "paper"))
     parser.add_argument("--max-seconds", type=float, default=150.0, help="training time (%(default)s)")
     parser.add_argument("--downscale", type=int, default=1)
