@@ -190,7 +190,7 @@ def pictures(rows: Sequence[Row], folder: Path) -> list[str]:
 def time_plot(curves: Sequence[tuple[str, list[Row]]], path: Path) -> None:
     """Held-out PSNR of each level over training wall time."""
     styles = ((":", "o"), ("--", "s"), ("-", "^"))
-    with drawing(path, [name for name, _ in curves], "held-out PSNR, dB", (4.2, 3.4), across=3) as axes:
+    with drawing(path, [name for name, _ in curves], "held-out PSNR, dB", (3.7, 3.0), across=3) as axes:
         for axis, (_, points) in zip(axes, curves, strict=True):
             for level, (line, mark) in enumerate(styles):
                 reached = [(p["seconds"], p["psnr"][level]) for p in points if len(p["psnr"]) > level]

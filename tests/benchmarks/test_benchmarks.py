@@ -224,4 +224,4 @@ def test_pages_show_the_pictures_in_git_which_are_small():
     pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
     pictures = {path for path in (ROOT / "docs").rglob("*") if path.suffix in PICTURES}
     assert set().union(*map(shown, pages)) == pictures
-    assert all(path.stat().st_size <= (LIMIT if path.suffix == ".gif" else 350_000) for path in pictures)
+    assert all(path.stat().st_size <= (LIMIT if path.suffix == ".gif" else 300_000) for path in pictures)

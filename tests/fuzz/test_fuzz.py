@@ -166,7 +166,7 @@ def test_inputs_are_named_by_their_numbers():
 
 def test_random_files_are_legal_and_of_every_sort():
     chunks = []
-    for i in range(60):
+    for i in range(150):
         file = legal.legal(random.Random(i))
         assert hashes(file.data()) == file.hashes()
         parts = mutate.take_apart(file.data())
@@ -177,7 +177,7 @@ def test_random_files_are_legal_and_of_every_sort():
     assert {data[0] for _, _, n, data in sections if n == PLANES} == {0, 1}
     assert any(3 in h for h, _ in chunks) and len({tuple(h[15]) for h, _ in chunks}) > 4
     counts = {len(mutate.stages_of(data, n, h, meta)[1]) for h, meta, n, data in sections}
-    assert {0, 1, 2, 8} < counts
+    assert {0, 1, 2, 3, 8} <= counts
     assert any(c.type > 2 for _, c in chunks) and any(c.flags >> 6 > 4 for _, c in chunks)
 
 
