@@ -35,13 +35,16 @@ def text(benchmarks: Sequence[Benchmark], figures: Row) -> str:
     sections, known = figures["sections"], {b.name: b for b in benchmarks}
     made = [f"commit `{s['commit']}`, {s['date']}, `{s['command']}`, {s['machine']}" for s in sections]
     usual = max(made, key=made.count)
+    common = sections[made.index(usual)]
     parts = ["# Results", wrapped(INTRODUCTION), wrapped(f"Where nothing else is said: {usual}.")]
     for found, by in zip(sections, made, strict=True):
         title = known[found["name"]].title
         shown = [f"![{title}: {name.rsplit('.', 1)[0]}](img/{name})" for name in found["pictures"]]
         parts += [f"## {title}", wrapped(known[found["name"]].text(found["rows"]))]
         parts += ["\n".join(shown)] if shown else []
-        parts += [] if by == usual else [wrapped(f"Made at {by}.")]
+        if by != usual:
+            same = by == usual.replace(f"`{common['command']}`", f"`{found['command']}`")
+            parts.append(wrapped(f"Made by `{found['command']}`." if same else f"Made at {by}."))
     return "\n\n".join(parts) + "\n"
 
 
