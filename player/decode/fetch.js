@@ -74,6 +74,9 @@ export class SceneSource {
     /** Its response. skip: bytes that are here already.
      * @type {{reader: Reader, skip: number, rest: Uint8Array} | null} */
     this._body = null;
+    /** A wait of the connection: when it lapses, what ends it then, and the timer that looks.
+     * @type {{at: number, end: (why: Cut) => void, timer: ReturnType<typeof setTimeout> | undefined}} */
+    this._wait = { at: 0, end: () => {}, timer: undefined };
     /** When the request was sent, and how many bytes were here then. */
     this._requested = { at: 0, received: 0 };
     /** Where the file was fetched anew after damage. */
@@ -87,6 +90,8 @@ export class SceneSource {
   close() {
     this._controller?.abort();
     this._controller = this._body = null;
+    clearTimeout(this._wait.timer);
+    this._wait.timer = undefined;
   }
 
   /**
@@ -131,7 +136,7 @@ export class SceneSource {
         }
         if (!block.length) continue;
         failures = 0;
-        yield* this._feed(block);
+        for (const scene of this._feed(block)) yield scene; // yield* takes longer than a small piece
       }
     } finally {
       this.close();
@@ -191,7 +196,7 @@ export class SceneSource {
     }
     const body = this._body;
     if (!body.rest.length) {
-      const { done, value } = await within(body.reader.read(), patience);
+      const { done, value } = await this._within(body.reader.read(), patience);
       if (done) {
         this.close();
         if (this.total !== null) throw new Cut(`ended at byte ${this.received} of ${this.total}`);
@@ -212,6 +217,29 @@ export class SceneSource {
     return block;
   }
 
+  /**
+   * The value of `promise`, or a Cut if that takes longer. One timer serves all waits of a connection, since one for each
+   * would take longer than a small piece does; those that follow lapse no earlier.
+   *
+   * @template T @param {Promise<T>} promise @param {number} milliseconds @returns {Promise<T>}
+   */
+  _within(promise, milliseconds) {
+    return new Promise((resolve, reject) => {
+      promise.then(resolve, reject);
+      this._wait.at = performance.now() + milliseconds;
+      this._wait.end = reject;
+      if (this._wait.timer === undefined) this._look();
+    });
+  }
+
+  /** Ends the wait if it has lapsed, else looks again when it will have. */
+  _look() {
+    const left = this._wait.at - performance.now();
+    const later = Math.min(Math.ceil(left) + 1, 2 ** 31 - 1); // more would fire at once
+    this._wait.timer = left > 0 ? setTimeout(() => this._look(), later) : undefined;
+    if (left <= 0) this._wait.end(new Cut("no byte arrived for too long"));
+  }
+
   /** Requests the missing bytes. @param {number} patience milliseconds to wait for the response */
   async _request(patience) {
     const start = this.received;
@@ -221,7 +249,7 @@ export class SceneSource {
     this._requested = { at: now(), received: start };
     // a request after a cut or damage bypasses caches
     const cache = start ? "no-store" : "default";
-    const response = await within(this._fetch(this.url, { headers, signal, cache }), patience);
+    const response = await this._within(this._fetch(this.url, { headers, signal, cache }), patience);
     const skip = this._accept(response, "Range" in headers);
     if (skip === null) this.close();
     else {
@@ -284,13 +312,3 @@ const now = () => performance.now() / 1000;
 
 /** @param {number} milliseconds @returns {Promise<void>} */
 const sleep = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
-
-/** The value of `promise`, or a Cut if that takes longer. @template T @param {Promise<T>} promise
- * @param {number} milliseconds @returns {Promise<T>} */
-function within(promise, milliseconds) {
-  return new Promise((resolve, reject) => {
-    const patience = Math.min(Math.ceil(milliseconds) + 1, 2 ** 31 - 1); // more would fire at once
-    const timer = setTimeout(() => reject(new Cut("no byte arrived for too long")), patience);
-    promise.then(resolve, reject).finally(() => clearTimeout(timer));
-  });
-}

@@ -1,27 +1,22 @@
-// What streams of a file cost: seconds of processor time as a multiple of `decode`, and the bytes of the arrays that all
-// scenes have together as a multiple of the last one's. For tests: node streams.mjs FILE prints a line of JSON.
+// What streams of a file cost, as a line of JSON.
+//
+//     node streams.mjs FILE              by the way it is split: processor time as a multiple of `decode`'s, and the bytes
+//                                        of the arrays that all scenes have together as a multiple of the last one's
+//     node streams.mjs FILE WAY SIZE     [seconds of processor time, bytes of the process's peak] of one way of splits.js
 
 import { readFileSync } from "node:fs";
 
-import { SceneSource } from "../decode/fetch.js";
 import { decode, openStream } from "../decode/index.js";
+import { cost, every, fed, fetched, least } from "./splits.js";
 /** @import { Scene } from "../decode/index.js" */
 
-const bytes = new Uint8Array(readFileSync(process.argv[2]));
+const [, , file, way, size] = process.argv;
+const bytes = new Uint8Array(readFileSync(file));
 
-/** The least of three times, for a collection of garbage may fall into one, and the scenes.
- * @param {() => Scene[] | Promise<Scene[]>} work @returns {Promise<[number, Scene[]]>} */
-async function timed(work) {
-  let least = Infinity;
-  /** @type {Scene[]} */
-  let scenes = [];
-  for (let i = 0; i < 3; i++) {
-    const start = process.cpuUsage();
-    scenes = await work();
-    const { user, system } = process.cpuUsage(start);
-    least = Math.min(least, user + system);
-  }
-  return [least, scenes];
+/** Seconds of processor time. */
+function clock() {
+  const { user, system } = process.cpuUsage();
+  return (user + system) / 1e6;
 }
 
 /** @param {Scene[]} scenes */
@@ -30,42 +25,33 @@ function held(scenes) {
   return [...new Set(arrays.map(({ buffer }) => buffer))].reduce((sum, { byteLength }) => sum + byteLength, 0);
 }
 
-/** All scenes of a stream fed these pieces. @param {number[]} cuts */
-function fed(cuts) {
-  const stream = openStream();
-  const scenes = [];
-  let at = 0;
-  for (const end of [...cuts, bytes.length]) scenes.push(...stream.feed(bytes.subarray(at, (at = end))));
-  stream.finish();
-  return scenes;
+async function splits() {
+  const probe = openStream();
+  probe.feed(bytes);
+  const ends = probe.layerEnds.map(({ end }) => end);
+  const ways = {
+    whole: () => fed(bytes, []),
+    slices: () => fed(bytes, ends),
+    "within slices": () => fed(bytes, ends.map((end) => end - 5)),
+    tens: () => fed(bytes, every(bytes, 10)),
+    "a source": () => fetched(bytes, 1 << 16),
+  };
+  for (let i = 0; i < 3; i++) decode(bytes); // compiled by then
+  const seconds = await least(() => decode(bytes), clock, 3);
+  /** @type {Record<string, {time: number, memory: number, scenes: number}>} */
+  const found = {};
+  for (const [name, way] of Object.entries(ways)) {
+    /** @type {Scene[]} */
+    let scenes = [];
+    const own = await least(async () => {
+      scenes = [];
+      for await (const scene of way()) scenes.push(scene);
+    }, clock, 3);
+    found[name] = { time: own / seconds, memory: held(scenes) / held([decode(bytes)]), scenes: scenes.length };
+  }
+  return found;
 }
 
-/** All scenes of a source whose bytes come in blocks. @param {number} size */
-async function fetched(size) {
-  const blocks = Array.from({ length: Math.ceil(bytes.length / size) }, (_, i) => bytes.slice(i * size, (i + 1) * size));
-  const headers = { "Content-Length": String(bytes.length), ETag: '"a"' };
-  const answer = () => new Response(new Blob(blocks).stream(), { headers });
-  const scenes = [];
-  for await (const scene of new SceneSource("http://x/", { fetch: async () => answer() }).scenes()) scenes.push(scene);
-  return scenes;
-}
-
-const probe = openStream();
-probe.feed(bytes);
-const ends = probe.layerEnds.map(({ end }) => end);
-const ways = {
-  whole: () => fed([]),
-  slices: () => fed(ends),
-  "within slices": () => fed(ends.map((end) => end - 5)),
-  tens: () => fed(Array.from({ length: Math.floor(bytes.length / 10) }, (_, i) => 10 * i)),
-  "a source": () => fetched(1 << 16),
-};
-for (let i = 0; i < 3; i++) decode(bytes); // compiled by then
-const [seconds, [last]] = await timed(() => [decode(bytes)]);
-/** @type {Record<string, {time: number, memory: number, scenes: number}>} */
-const found = {};
-for (const [name, way] of Object.entries(ways)) {
-  const [own, scenes] = await timed(way);
-  found[name] = { time: own / seconds, memory: held(scenes) / held([last]), scenes: scenes.length };
-}
+const one = /** @type {"decode" | "stream" | "source" | "pieces"} */ (way);
+const found = way ? [await cost(bytes, one, Number(size), clock), 1024 * process.resourceUsage().maxRSS] : await splits();
 console.log(JSON.stringify(found));
