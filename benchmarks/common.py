@@ -85,7 +85,6 @@ SCENES = {
         Scene("rods", "synthetic:rods", "thin rods move, on white, 100 x 100"),
         Scene("bend", "synthetic:bend", "a column bends, on white, 100 x 100"),
         Scene("mutant-200", MUTANT, "D-NeRF, 200 x 200", 4, "small", 8_000, "3dgs"),
-        Scene("mutant-200-view", MUTANT, "the same, all view-dependent", 4, "small", 8_000, "3dgs", ALL_VIEW),
         Scene("mutant-400", MUTANT, "D-NeRF, 400 x 400", 2, training=ALL_VIEW, **LARGE),
         Scene("mutant", MUTANT, "D-NeRF, 800 x 800", **LARGE),
         Scene("mutant-black", MUTANT, "the same on black", training=("--background", "black"), **LARGE),

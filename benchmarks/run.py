@@ -25,6 +25,7 @@ from typing import Any
 
 import codec
 import delivery
+import judge
 import paper
 import quality
 import refining_gif
@@ -37,6 +38,7 @@ from pd4dgs_codec.errors import DataError, Pd4Error
 ALL = (
     quality.BENCHMARK,
     delivery.SLICES,
+    judge.BENCHMARK,
     paper.PAPER,
     paper.DIAL,
     codec.STABILITY,

@@ -216,7 +216,7 @@ def test_the_results_in_git_are_what_their_figures_make_them():
     if not figures.is_file():
         pytest.skip("there are no figures yet")
     text = (ROOT / "docs" / "results.md").read_text()
-    assert page.text(run.ALL, json.loads(figures.read_text())) == text and len(text.splitlines()) <= 300
+    assert page.text(run.ALL, json.loads(figures.read_text())) == text and len(text.splitlines()) <= 330
     check_page(text)
 
 
