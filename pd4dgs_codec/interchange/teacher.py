@@ -17,6 +17,7 @@ import importlib
 import math
 import os
 import re
+import struct
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.data.dataset import color, load
-from pd4dgs_codec.data.files import last_numbers, read_file, split_options
+from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, last_numbers, read_file, split_options
 from pd4dgs_codec.data.posed import depth_range, held_out, points_box
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError, one_line
@@ -56,6 +57,8 @@ EXAMPLES = {
     "cameras": "cameras=FOLDER", "views": "views=200", "size": "size=400x400", "fps": "fps=30", "up": "up=0,-1,0",
     "background": "background=white or background=0.5,0.5,0.5",
 }  # fmt: skip
+#: Of a stream in a .4dgs file: four bytes, channels, elements, bytes that follow.
+STREAM = struct.Struct("<4xBIQ")
 Triple = tuple[float, float, float]
 
 
@@ -239,14 +242,20 @@ def _folder(folder: Path, fps: float) -> Teacher:
 def _fourdgs(path: Path) -> Teacher:
     """A .4dgs file over its whole time."""
     fourdgs = library("fourdgs", ".4dgs files")
+    data = read_file(path)
+    most = FREE_BYTES + INFLATES * len(data)
+    if _numbers(data, most) > most:
+        raise DataError(f"{path}: holds more than {most:,} numbers in {len(data):,} bytes")
     try:
-        scene = fourdgs.read(read_file(path))
+        with np.errstate(all="ignore"):  # `checked` drops what is not finite
+            scene = fourdgs.read(data)
     except (fourdgs.FourdgsError, ValueError, MemoryError, OSError) as error:
         raise DataError(f"{path}: fourdgs cannot read it: {one_line(str(error), 160)}") from None
     g, seconds, cutoff = scene.gaussians, float(scene.header.duration_sec), float(scene.header.cutoff)
 
     def splats(t: float) -> Splats:
-        state = g.state_at(min(t, 1 - 1e-6) * seconds, cutoff)  # the end itself is no longer shown
+        with np.errstate(all="ignore"):
+            state = g.state_at(min(t, 1 - 1e-6) * seconds, cutoff)  # the end itself is no longer shown
         rows = state["indices"]
         sh = [(g.colors[rows, None, :3] - 0.5) / SH_C0]
         if g.sh is not None and g.sh_degree:
@@ -262,6 +271,30 @@ def _fourdgs(path: Path) -> Teacher:
         )
 
     return Teacher(splats, None, seconds)
+
+
+def _numbers(data: bytes, most: int) -> int:
+    """How many numbers a .4dgs file says it holds, up to where it is damaged; beyond `most` perhaps fewer.
+
+    A few bytes may say that a number is repeated 2^26 times, in each stream, and fourdgs has no limit for all of them.
+    """
+    names = ("opcode", "records", "serialization", "stream_reader", "exceptions")
+    op, records, files, reader, errors = (importlib.import_module(f"fourdgs.{name}") for name in names)
+    total = 0
+    with contextlib.suppress(errors.FourdgsError):
+        for record in files.iter_records(data, len(files.MAGIC)):
+            if record.opcode == op.CHUNK:
+                head, packed = records.parse_chunk(record.content)
+                if head.compression and head.uncompressed_size > most:
+                    return int(head.uncompressed_size)
+                streams = reader.chunk_stream_bytes(head, packed)
+            else:
+                streams = record.content[1:] if record.opcode == op.SH_BAND_STREAM else b""
+            at = 0
+            while at + STREAM.size <= len(streams) and total <= most:
+                channels, count, size = STREAM.unpack_from(streams, at)
+                total, at = total + channels * count, at + STREAM.size + size
+    return total
 
 
 def _function(module: str, name: str) -> Callable[[float], Splats]:

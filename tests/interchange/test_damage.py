@@ -13,9 +13,10 @@ from teachers import Deformable, FourD
 from test_formats import make_splats
 
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.interchange.formats import ply_bytes, read_splats
+from pd4dgs_codec.interchange.formats import fourdgs_bytes, ply_bytes, read_splats
 from pd4dgs_codec.interchange.runs import read_cameras, read_torch
-from pd4dgs_codec.interchange.teacher import read_model
+from pd4dgs_codec.interchange.splats import Splats
+from pd4dgs_codec.interchange.teacher import PARTS, read_model
 
 CASES = 150
 
@@ -50,6 +51,11 @@ def _script(path: Path) -> None:
 
 def _ply(path: Path) -> None:
     path.write_bytes(ply_bytes(make_splats(4, 1)))
+
+
+def _fourdgs(path: Path) -> None:
+    splats = make_splats(4, 1)
+    path.write_bytes(fourdgs_bytes([(t, splats, np.arange(4)) for t in (0.0, 0.5)], 1.0))
 
 
 def _run(kind: type[FourD | Deformable]) -> Callable[[Path], None]:
@@ -89,6 +95,7 @@ def _cameras(path: Path) -> None:
             _moved,
         ),
         ("a.ply", _ply, read_splats),
+        ("a.4dgs", _fourdgs, lambda path: read_model(str(path), 30).splats(0.5)),
         ("cameras.json", _cameras, read_cameras),
     ],
 )
@@ -108,3 +115,14 @@ def test_damaged_files(tmp_path, name: str, make: Callable[[Path], None], read: 
             assert str(path.name) in str(error) and "\n" not in str(error)
             refused += 1
     assert refused > CASES / 4
+
+
+def test_a_few_bytes_that_stand_for_many_numbers_are_refused(tmp_path):
+    """fourdgs took 350 bytes for each of any number of equal Gaussians."""
+    splats = make_splats(1, 0)
+    many = Splats(**{name: np.repeat(getattr(splats, name), 200_000, axis=0) for name in PARTS})
+    path = tmp_path / "a.4dgs"
+    path.write_bytes(fourdgs_bytes([(0.0, many, np.arange(len(many.means)))], 1.0))
+    assert path.stat().st_size < 2000
+    with pytest.raises(DataError, match="a.4dgs: holds more than 1,0.* numbers in "):
+        read_model(str(path), 30)
