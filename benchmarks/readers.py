@@ -23,6 +23,7 @@ from pathlib import Path
 import numpy as np
 
 MEGABYTE = 1 << 20
+VECTORS = Path(__file__).resolve().parents[1] / "spec" / "vectors"
 
 
 def archive(pickled: bytes, method: int = zipfile.ZIP_STORED, storage: bytes = b"", members: int = 1) -> bytes:
@@ -89,6 +90,91 @@ def blank_film(side: int, frames: int) -> bytes:
 def spz(size: int) -> bytes:
     """An SPZ file that says it has ten million Gaussians, all zero."""
     return gzip.compress(b"NGSP" + (2).to_bytes(4, "little") + (10_000_000).to_bytes(4, "little") + bytes(size))
+
+
+def compressed_ply(points: int) -> bytes:
+    """A compressed PLY of so many Gaussians, all zero."""
+    chunks = -(-points // 256)
+    kinds = ("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b")
+    bounds = [f"property float {end}_{name}" for names in kinds for end in ("min", "max") for name in names]
+    packed = [f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color")]
+    head = ["ply", "format binary_little_endian 1.0", f"element chunk {chunks}", *bounds]
+    lines = [*head, f"element vertex {points}", *packed, "end_header", ""]
+    return "\n".join(lines).encode() + bytes(72 * chunks + 16 * points)
+
+
+def equal_gaussians(count: int) -> bytes:
+    """A .4dgs file of Gaussians that are all one."""
+    from pd4dgs_codec.interchange.formats import fourdgs_bytes
+    from pd4dgs_codec.interchange.splats import Splats
+
+    ones = [np.ones((count, *shape), np.float32) for shape in ((3,), (4,), (3,), (), (1, 3))]
+    return fourdgs_bytes([(0.0, Splats(*ones), np.arange(count))], 1.0)
+
+
+def npy(head: str) -> bytes:
+    """A .npy file that says what it holds, and 8 bytes."""
+    head = f"{head:<117}\n"
+    return b"\x93NUMPY\1\0" + len(head).to_bytes(2, "little") + head.encode() + bytes(8)
+
+
+def endless(size: int) -> bytes:
+    """A file whose layer 0 has so many bytes, all of them zero, and a wrong checksum."""
+    from pd4dgs_codec.format import canonical
+    from pd4dgs_codec.format.container import read_preamble, write_chunk, write_preamble
+    from pd4dgs_codec.format.header import scene_id_of
+
+    known = canonical.unpack(read_preamble((VECTORS / "valid" / "layers-0-1.pd4").read_bytes()).header)
+    header = canonical.pack({**known, 1: [[0, size]]})
+    return write_preamble(header) + write_chunk(0, 0, scene_id_of(header), bytes(size))[:-4] + bytes(4)
+
+
+def read_scene(path: Path) -> None:
+    """A .pd4 file."""
+    from pd4dgs_codec import decode
+
+    decode(path.read_bytes())
+
+
+def read_url(path: Path) -> None:
+    """The same from a server, which is measured as well."""
+    import threading
+
+    from pd4dgs_codec.web.client import SceneClient
+    from pd4dgs_codec.web.server import Server
+
+    with Server(path.parent, port=0) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        with SceneClient(f"{server.url}{path.name}") as client:
+            list(client.scenes())
+
+
+def read_teacher(path: Path) -> None:
+    """Gaussians over time, at one time."""
+    from pd4dgs_codec.interchange.teacher import read_model
+
+    read_model(str(path), 30).splats(0.5)
+
+
+def read_cameras(path: Path) -> None:
+    """The cameras of a run of another trainer."""
+    from pd4dgs_codec.interchange import runs
+
+    runs.read_cameras(path)
+
+
+def read_options(path: Path) -> None:
+    """The options of a run of another trainer."""
+    from pd4dgs_codec.interchange.runs import Config
+
+    Config.of(path.parent).flag("no_dx", "False")
+
+
+def read_array(path: Path) -> None:
+    """Poses, and cached frames."""
+    from pd4dgs_codec.data.files import read_npy
+
+    read_npy(path.read_bytes(), str(path))
 
 
 def read_checkpoint(path: Path) -> None:
@@ -165,6 +251,13 @@ def read_manifest(path: Path) -> None:
 
 #: Name of the row -> (name of the file, its content, its reader).
 CASES: dict[str, tuple[str, Callable[[], bytes], Callable[[Path], None]]] = {
+    ".pd4: symbols, the file that takes most memory": (
+        "x.pd4", (VECTORS / "dear" / "memory-0.pd4").read_bytes, read_scene
+    ),
+    ".pd4: symbols, the file that takes longest": (
+        "x.pd4", (VECTORS / "dear" / "seconds-0.pd4").read_bytes, read_scene
+    ),
+    ".pd4 from a server: zeros": ("x.pd4", lambda: endless(64 * MEGABYTE), read_url),
     "checkpoint: empty dicts": ("m.pt", lambda: checkpoint_with(b"](" + b"}" * MEGABYTE + b"e"), read_checkpoint),
     "checkpoint: one tuple again and again": (
         "m.pt", lambda: checkpoint_with(b"((K\1K\1K\1tq\0](" + b"h\0" * (MEGABYTE // 2) + b"et"), read_checkpoint
@@ -190,6 +283,16 @@ CASES: dict[str, tuple[str, Callable[[], bytes], Callable[[Path], None]]] = {
         read_splats,
     ),
     "Gaussians (.spz): zeros": ("x.spz", lambda: spz(256 * MEGABYTE), read_splats),
+    "Gaussians (.compressed.ply): zeros": ("x.compressed.ply", lambda: compressed_ply(MEGABYTE // 16), read_splats),
+    "Gaussians (.4dgs): equal ones": ("x.4dgs", lambda: equal_gaussians(45_000), read_teacher),
+    "Gaussians (.4dgs): too many equal ones": ("x.4dgs", lambda: equal_gaussians(300_000), read_teacher),
+    "run of another trainer: cameras.json": (
+        "cameras.json", lambda: b"[" + b"{}," * (MEGABYTE // 3) + b"{}]", read_cameras
+    ),
+    "run of another trainer: cfg_args": ("cfg_args", lambda: b"no_dx=a" * (MEGABYTE // 7), read_options),
+    "array (.npy): 2^40 numbers": (
+        "x.npy", lambda: npy("{'descr': '<f8', 'fortran_order': False, 'shape': (1099511627776,), }"), read_array
+    ),
     "transforms.json: empty lists": (
         "transforms.json", lambda: b'{"frames": [' + b"[]," * (MEGABYTE // 3) + b"0]}", read_frames
     ),
@@ -207,6 +310,11 @@ CASES: dict[str, tuple[str, Callable[[], bytes], Callable[[Path], None]]] = {
 }  # fmt: skip
 
 
+def peak() -> int:
+    """Peak bytes of this process; getrusage also counts what it was forked from. Linux alone says."""
+    return 1024 * int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
+
+
 def measure(name: str, path: Path) -> None:
     """Prints seconds, bytes of memory and the answer of one reader, as JSON."""
     import torch  # noqa: F401 - and all else that a reader imports, before the measurement
@@ -217,14 +325,13 @@ def measure(name: str, path: Path) -> None:
     from pd4dgs_codec.interchange import formats  # noqa: F401
     from pd4dgs_codec.model import checkpoint  # noqa: F401
 
-    before, begin, answer = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time(), "read"
+    before, begin, answer = peak(), time.process_time(), "read"
     try:
         CASES[name][2](path)
     except Pd4Error as error:
         answer = str(error).replace(str(path.parent), "")
     seconds = time.process_time() - begin + resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
-    memory = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
-    print(json.dumps([seconds, memory, answer]))
+    print(json.dumps([seconds, peak() - before, answer]))
 
 
 def main() -> None:

@@ -11,6 +11,7 @@ import hashlib
 import json
 import os
 import posixpath
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from importlib.util import find_spec
@@ -27,6 +28,8 @@ PROBE = ".pd4dgs-batch"
 STAMPS = ("ETag", "etag", "md5Hash", "generation", "LastModified", "Last-Modified", "mtime")
 #: What the file systems of stores call a file's media type when they write one.
 TYPED = {"s3": "ContentType", "gs": "content_type"}
+#: Not empty, and no URI of a local file whose path is relative: fsspec would read its host as a folder.
+_ABSOLUTE = re.compile(r"(?!(?:file|local):(?://)?(?!/)).", re.DOTALL)
 #: Errors that another try would meet again.
 FINAL = (FileNotFoundError, FileExistsError, PermissionError, IsADirectoryError, NotADirectoryError)
 
@@ -59,6 +62,8 @@ def _system(place: str) -> tuple[Any, str, bool]:
     from fsspec.implementations.local import LocalFileSystem
 
     try:
+        if not _ABSOLUTE.match(place):
+            raise ValueError("expected a path, or a URI like file:///FOLDER or s3://BUCKET/FOLDER")
         system, path = url_to_fs(place)
     except Exception as error:  # each store has its own
         raise DataError(f"{place}: {one_line(str(error))}") from None
@@ -136,7 +141,7 @@ class Root:
 
     def __init__(self, place: str):
         self.place = place.rstrip("/")
-        self.system, self.path, self.local = _system(self.place)
+        self.system, self.path, self.local = _system(place)
         schemes = self.system.protocol
         self.schemes = (schemes,) if isinstance(schemes, str) else schemes
 

@@ -143,6 +143,17 @@ def test_a_place_that_no_store_has_holds_no_manifest(place):
         Manifest(place, OPS["encode"], lambda options: None)
 
 
+@pytest.mark.parametrize("place", ["dir:///", "reference://", "github://", "", "file:", "file://", "file://host/x"])
+def test_a_place_that_no_store_has_takes_no_output(place, tmp_path, monkeypatch):
+    """Without its last slashes a URI became the name of a folder, and / the folder where the command runs."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(DataError) as caught:
+        store.Root(place).check()
+    assert str(caught.value).isprintable() and not list(tmp_path.iterdir())
+    root, memory, folder = map(store.Root, ("/", "memory://", f"file://{tmp_path}/"))
+    assert (root.path, memory.local, folder.local) == ("/", False, True)
+
+
 def test_what_no_check_foresaw_is_a_failure_of_its_line_alone(library):
     def check(options):
         if options:
