@@ -67,6 +67,20 @@ def test_the_repository_names_no_address_of_its_own():
     assert "project.urls" not in text("pyproject.toml") and "repository" not in json.loads(text("player/package.json"))
 
 
+@pytest.mark.parametrize("page", ["SECURITY.md", "docs/robustness.md"])
+def test_every_promise_names_tests_that_exist(page):
+    """Each after its file, perhaps by the beginning of its name."""
+    folder, found = ROOT / "tests", 0
+    for name in re.findall(r"`((?:[\w/]+\.py)|(?:test_\w+…?))`", text(page)):
+        if name.endswith(".py"):
+            path = folder / name.removeprefix("tests/")
+        else:
+            begins = "^def " + (name[:-1] if name.endswith("…") else rf"{name}\(")
+            assert re.search(begins, path.read_text(), re.MULTILINE), f"{page}: {path.name} has no {name}"
+            found += 1
+    assert found > 20
+
+
 def test_the_npm_package_has_all_that_it_exports(tmp_path):
     subprocess.run([sys.executable, ROOT / "tools" / "npm_package.py", tmp_path / "package"], check=True)
     package = tmp_path / "package"
