@@ -163,8 +163,9 @@ class Root:
             content = json.loads(raw)
         except ValueError:
             content = None
-        if isinstance(content, dict) and isinstance(content.get("files"), dict):
-            return content
+        files = content.get("files") if isinstance(content, dict) else None
+        if isinstance(files, dict) and all(isinstance(f, dict) and type(f.get("bytes")) is int for f in files.values()):
+            return dict(content)
         if overwrite:
             return None
         raise DataError(f"{self.place}/{output}{RECORD}: is not a record of a batch; --overwrite replaces it")

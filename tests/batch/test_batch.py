@@ -273,10 +273,12 @@ def test_read_only_store_is_named_before_any_work(tmp_path):
     assert not list((tmp_path / "folder").iterdir())
 
 
-def test_a_damaged_record_is_named_and_can_be_overwritten(library):
+@pytest.mark.parametrize("files", [None, 5, {"": 5}, {"": {}}, {"": {"bytes": "x"}}, {"": None}])
+def test_a_damaged_record_is_named_and_can_be_overwritten(library, files):
     library.add("a.pt", "text")
     library.run()
-    (library.out / "a.pd4.done.json").write_text("garbage")
+    path = library.out / "a.pd4.done.json"
+    path.write_text("garbage" if files is None else json.dumps(json.loads(path.read_text()) | {"files": files}))
     assert library.run()["done"] == 0
     outcome, tries = library.outcomes["a.pd4"]
     assert tries == 1 and "a.pd4.done.json" in outcome.message and "--overwrite" in outcome.message
