@@ -221,6 +221,14 @@ def present(names: Sequence[str]) -> Iterator[Scene]:
             say(f"{name}: {SCENES[name].source} does not exist, left out")
 
 
+def save_jpeg(image: Any, path: Path, limit: int) -> None:
+    """Saves an image of Pillow as JPEG: the best of some qualities that has at most `limit` bytes, else the least."""
+    for quality in (95, 85, 75, 60):
+        image.convert("RGB").save(path, quality=quality, subsampling=0)
+        if path.stat().st_size <= limit:
+            break
+
+
 def say(line: str) -> None:
     """Prints a stage as it begins."""
     print(line, file=sys.stderr, flush=True)

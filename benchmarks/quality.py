@@ -8,7 +8,22 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from common import ONE, QUICK, SCENES, Benchmark, Row, Run, Scene, Training, command, levels, number, seconds_at, table
+from common import (
+    ONE,
+    QUICK,
+    SCENES,
+    Benchmark,
+    Row,
+    Run,
+    Scene,
+    Training,
+    command,
+    levels,
+    number,
+    save_jpeg,
+    seconds_at,
+    table,
+)
 
 from pd4dgs_codec.bench.report import drawing
 
@@ -100,10 +115,7 @@ def draw_levels(scene: Scene, file: Path, picture: Path) -> None:
     still = file.with_name("levels.png")
     command("render", file, "-o", still, "-f", *scene.data, "--frames", 1, "--side-by-side")
     picture.parent.mkdir(parents=True, exist_ok=True)
-    for quality in (95, 85, 75):
-        Image.open(still).convert("RGB").save(picture, quality=quality, subsampling=0)
-        if picture.stat().st_size <= LARGEST_PICTURE:
-            break
+    save_jpeg(Image.open(still), picture, LARGEST_PICTURE)
 
 
 def text(rows: Sequence[Row]) -> str:

@@ -18,12 +18,11 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
-from browser import PATIENCE_MS, launched
+from browser import PATIENCE_MS, PLAYER, launched
 
 from pd4dgs_codec import decode, open_stream
 from pd4dgs_codec.errors import DataError
 
-PLAYER = Path(__file__).resolve().parents[1] / "player"
 SIZES = [1, 7, 1 << 10, 1 << 16, 1 << 30]
 MEGABYTE = 1 << 20
 

@@ -15,11 +15,13 @@ _ADDRESSED = re.compile(r"-[0-9a-f]{16}\.\w+$")
 IMMUTABLE, CHANGES = "public, max-age=31536000, immutable", "no-cache"
 #: Of files by their suffix. That of scenes is described in packaging/.
 MEDIA_TYPES = {
+    ".css": "text/css; charset=utf-8",
     ".html": "text/html; charset=utf-8",
     ".jpg": "image/jpeg",
     ".js": "text/javascript; charset=utf-8",
     ".json": "application/json",
     ".m3u8": "application/vnd.apple.mpegurl",
+    ".mjs": "text/javascript; charset=utf-8",
     ".mp4": "video/mp4",
     ".mpd": "application/dash+xml",
     ".pd4": "model/vnd.pd4dgs",

@@ -1,5 +1,5 @@
-// A headset as WebXR describes one, for tests: it stands still at `headset.pose`, and each eye sees `headset.size`
-// pixels. `headset.read()` is what it shows, the eyes beside each other, as base64 of RGBA bytes.
+// A headset as WebXR describes one, for tests: it stands still at `headset.pose`, and `headset.eyes` see `headset.size`
+// pixels each. `headset.read()` is what it shows, the eyes beside each other, as base64 of RGBA bytes.
 
 /** @typedef {{inverse: {matrix: Float32Array}}} Transform */
 
@@ -8,7 +8,7 @@
   /** Of the head: radians to the left, and metres right, up and backwards. Of each eye: metres to the right, tangents of
    * the left, right, lower and upper side. */
   const pose = { turn: 0.2, place: [0.1, 0.05, -0.3] };
-  const eyes = /** @type {const} */ ({ left: [-0.03, -0.7, 0.5, -0.4, 0.5], right: [0.03, -0.5, 0.7, -0.4, 0.5] });
+  const eyes = { left: [-0.03, -0.7, 0.5, -0.4, 0.5], right: [0.03, -0.5, 0.7, -0.4, 0.5] };
 
   /** World to head, moved to the right. @param {number} right metres @returns {Transform} */
   function transform(right) {
@@ -68,6 +68,7 @@
   }
 
   const headset = {
+    ...{ size, pose, eyes },
     frames: 0,
     /** @type {Session | null} */
     session: null,

@@ -18,25 +18,32 @@ Object.assign(window, { harness: { open, show, close } });
  * A scene in the viewer, in place of a still one. Time stands still.
  *
  * @param {string} url @param {number} width @param {number} height
- * @param {{still: string, fov: number, background: number[], position: number[]}} options fov: degrees, of the longer
- * side
+ * @param {{still: string, fov: number, background: number[], position: number[], target: number[], angles: number[],
+ * ui: boolean}} options fov: degrees, of the longer side. angles: degrees, from the scene to the viewer's y-up world. ui:
+ * whether the viewer's controls are there
  */
-async function open(url, width, height, { still, fov, background, position }) {
+async function open(url, width, height, { still, fov, background, position, target, angles, ui }) {
   const container = document.createElement("div");
   Object.assign(container.style, { width: `${width}px`, height: `${height}px` });
   document.body.append(container);
+  const style = Object.assign(document.createElement("link"), {
+    ...{ rel: "stylesheet", href: import.meta.resolve("@playcanvas/supersplat-viewer/viewer.css") },
+  });
+  document.head.append(style);
+  await new Promise((resolve) => (style.onload = resolve));
+  localStorage.setItem("controlsPanelOpen", "false"); // which hides the scene
   const settings = defaultSettings("object");
   Object.assign(settings, { tonemapping: "none", background: { color: background } });
-  settings.cameras = [{ initial: { position, target: [0, 0, 0], fov } }];
+  settings.cameras = [{ initial: { position, target, fov } }];
   const viewer = await createViewer({
-    ...{ container, settings, contentUrl: still, renderer: "webgl", ui: false, noanim: true, nofx: true },
+    ...{ container, settings, contentUrl: still, renderer: "webgl", ui, noanim: true, nofx: true },
   });
   const { app, events, state } = viewer;
   if (!state.loaded) await new Promise((resolve) => events.once("loaded:changed", resolve));
   state.cameraMode = "orbit"; // else it flies around
   viewer.resetCamera();
   const entity = new Entity("moving", app);
-  entity.setLocalEulerAngles(0, 0, 180); // as the viewer's own
+  entity.setLocalEulerAngles(angles[0], angles[1], angles[2]);
   app.root.addChild(entity);
   entity.addComponent("script");
   const properties = { src: url, autoplay: false, exact: true };

@@ -45,15 +45,15 @@ export async function least(work, clock, runs) {
  * @param {() => number} clock */
 export function cost(bytes, way, size, clock) {
   const cuts = way === "stream" ? every(bytes, size) : [];
-  /** @type {Scene} the newest one is held, as by a caller who draws it */
-  let scene;
+  /** The newest one is held, as by a caller who draws it. @type {{scene?: Scene}} */
+  const kept = {};
   const ways = {
-    decode: () => void (scene = decode(bytes)),
+    decode: () => void (kept.scene = decode(bytes)),
     stream: () => {
-      for (scene of fed(bytes, cuts));
+      for (kept.scene of fed(bytes, cuts));
     },
     source: async () => {
-      for await (scene of fetched(bytes, size));
+      for await (kept.scene of fetched(bytes, size));
     },
     pieces: async () => {
       const reader = /** @type {ReadableStream} */ (answer(bytes, size).body).getReader();

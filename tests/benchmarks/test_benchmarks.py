@@ -6,6 +6,7 @@ import json
 import re
 from pathlib import Path
 
+import browser
 import codec
 import common
 import demo
@@ -14,6 +15,7 @@ import page
 import pytest
 import quality
 import run
+import viewers
 from common import QUICK, ROOT, Run, Training
 from PIL import Image
 from refining_gif import LIMIT
@@ -200,6 +202,17 @@ def test_the_demo_writes_all_that_it_names(tmp_path, capsys):
     assert len(names) == 6 and all(Path(name).stat().st_size > 0 for name in names)
     assert demo.main(["--source", str(tmp_path / "nowhere"), "-o", str(tmp_path)]) == 1
     assert "demo: error:" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("there, told", [(False, "spark: three is not installed (npm install"), (True, "absent.pd4")])
+def test_pictures_of_viewers_say_what_is_missing(monkeypatch, tmp_path, capsys, there, told):
+    monkeypatch.setattr(browser, "PLAYER", tmp_path)
+    file = tmp_path / ("absent.pd4" if there else "scene.pd4")
+    (tmp_path / "scene.pd4").write_bytes(b"")
+    assert viewers.main([str(file), "-o", str(tmp_path / "img")]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("viewers: error: ") and told in said and said.count("\n") == 1
+    assert not (tmp_path / "img").exists()
 
 
 @pytest.mark.slow

@@ -2,32 +2,19 @@
 
 from __future__ import annotations
 
-import base64
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from browser import call, pixels
 
 from pd4dgs_codec import decode
 from pd4dgs_codec.draw.gaussians import Gaussians
 from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.scene import Camera, Scene
-
-PLAYER = Path(__file__).parents[2] / "player"
-
-
-def call(page: Any, script: str, *args: Any) -> Any:
-    """The result of a function, given as JavaScript, in a page."""
-    return page.evaluate(f"(args) => ({script})(...args)", list(args))
-
-
-def pixels(text: str, width: int, height: int) -> np.ndarray:
-    """A picture of the harness as float [H, W, 3] in 0..1."""
-    return np.frombuffer(base64.b64decode(text), np.uint8).reshape(height, width, 4)[..., :3] / 255
 
 
 def decibels(a: np.ndarray, b: np.ndarray) -> float:
@@ -99,4 +86,4 @@ def shoot(page: Any, camera: Camera, level: int, seconds: float) -> np.ndarray:
     """The player's settled picture, float [H, W, 3]."""
     state: dict[str, Any] = dict(level=level, seconds=seconds, width=camera.width, height=camera.height)
     state |= dict(viewmat=camera.viewmat.ravel().tolist(), K=camera.K.ravel().tolist())
-    return pixels(call(page, "harness.shoot", state), camera.width, camera.height)
+    return pixels(call(page, "harness.shoot", state), camera.width, camera.height) / 255

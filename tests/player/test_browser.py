@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import gzip
 import http.server
-import io
 import math
 import os
 import shutil
@@ -17,7 +16,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,9 +24,19 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
-from browser import PATIENCE_MS, launched
-from pictures import PLAYER, Rasterised, call, cameras, decibels, pixels, resized, shots
-from PIL import Image
+from browser import (
+    ELEMENT,
+    PATIENCE_MS,
+    PLAYER,
+    call,
+    check_packages,
+    eyes_of_headset,
+    launched,
+    pixels,
+    screenshot,
+    wait_for_level,
+)
+from pictures import Rasterised, cameras, decibels, resized, shots
 from strategies import make_scene
 from tiny import random_network
 
@@ -224,15 +233,7 @@ def opened(page: Any, url: str, **options: Any) -> list[tuple[str, Any]]:
 
 def shoot(page: Any, **state: Any) -> np.ndarray:
     """The harness's settled picture, float [H, W, 3]."""
-    return pixels(call(page, "harness.shoot", state), WIDTH, HEIGHT)
-
-
-#: The element, and whether it shows a level.
-ELEMENT = "document.querySelector('pd4-player')"
-
-
-def wait_for_level(page: Any, level: int) -> None:
-    page.wait_for_function(f"{ELEMENT}?.player?.status.level === {level}")
+    return pixels(call(page, "harness.shoot", state), WIDTH, HEIGHT) / 255
 
 
 # -- evaluation and pictures -------------------------------------------------------------------------------------------
@@ -299,32 +300,20 @@ def test_pictures_are_those_of_the_rasteriser(harness, server, folder, kind, eva
     assert decibels(seen[1], seen[2]) < 60 and decibels(seen[2], seen[5]) < 60  # levels and times differ
 
 
-#: What the pages of other viewers ask for, of the packages in player/node_modules.
-SPARK_FILES = (
-    "three/build/three.module.js",
-    "three/build/three.core.js",
-    "three/examples/jsm/postprocessing/Pass.js",
-    "@sparkjsdev/spark/dist/spark.module.js",
-)
-PLAYCANVAS_FILES = ("playcanvas/build/playcanvas.mjs",)
-SUPERSPLAT_FILES = (
-    *PLAYCANVAS_FILES,
-    "playcanvas/scripts/esm/xr/xr-controllers.mjs",
-    "playcanvas/scripts/esm/xr/xr-navigation.mjs",
-    "@playcanvas/supersplat-viewer/dist/viewer.js",
-    "@playcanvas/supersplat-viewer/dist/settings.js",
-)
+@pytest.fixture(scope="module")
+def repository() -> Iterator[Server]:
+    """Serves the player with the packages of other viewers, if they are installed."""
+    with Server(ROOT) as served, served.running():
+        yield served
 
 
-def viewer(page: Any, server: Server, folder: Path, name: str, files: Sequence[str]) -> None:
-    """Loads the harness of another viewer, whose `files` it imports, all as .js."""
-    for file in files:
-        if not (PLAYER / "node_modules" / file).is_file():
-            pytest.skip(f"no {file}: npm install --no-package-lock in player/")
-        target = folder / "packages" / file
-        target.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(PLAYER / "node_modules" / file, target.with_suffix(".js"))
-    page.goto(f"{server.url_of('player/test-browser/viewer.html')}#{name}")
+def viewer(page: Any, repository: Server, name: str) -> None:
+    """Loads the harness of another viewer."""
+    try:
+        check_packages(name)
+    except DataError as error:
+        pytest.skip(str(error))
+    page.goto(f"{repository.url_of('player/test-browser/viewer.html')}?{name}")
     page.wait_for_function("!!window.harness")
 
 
@@ -334,16 +323,13 @@ def centred(camera: Camera) -> Camera:
     return replace(camera, K=K, width=WIDTH, height=HEIGHT)
 
 
-@pytest.mark.parametrize(
-    "name, files, seen_by",
-    [("spark", SPARK_FILES, lambda c: resized(c, WIDTH, HEIGHT)), ("playcanvas", PLAYCANVAS_FILES, centred)],
-)
-def test_pictures_through_other_viewers_are_those_of_the_rasteriser(page, server, folder, lively, name, files, seen_by):
+@pytest.mark.parametrize("name, seen_by", [("spark", lambda c: resized(c, WIDTH, HEIGHT)), ("playcanvas", centred)])
+def test_pictures_through_other_viewers_are_those_of_the_rasteriser(page, repository, server, lively, name, seen_by):
     pytest.importorskip("numba")
-    viewer(page, server, folder, name, files)
+    viewer(page, repository, name)
     opened(page, server.url_of("scene.pd4"))
     scene = decode(lively)
-    views = [resized(c, WIDTH, HEIGHT) if name == "spark" else centred(c) for c in cameras(scene, [(0.3, 0.1)])]
+    views = [seen_by(camera) for camera in cameras(scene, [(0.3, 0.1)])]
     seen = []
     # level 2 has Gaussians larger than the picture or outside of it, which these engines draw otherwise or leave out
     for shot in (*shots(page, lively, views[:1], (0.0, 1.0), [0, 1]), *shots(page, lively, views[1:], (0.5,), [1])):
@@ -354,22 +340,22 @@ def test_pictures_through_other_viewers_are_those_of_the_rasteriser(page, server
     call(page, "harness.close")
 
 
-def test_supersplat_shows_the_script_in_place_of_a_still(page, server, folder, lively):
+def test_supersplat_shows_the_script_in_place_of_a_still(page, repository, server, folder, lively):
     pytest.importorskip("numba")
-    viewer(page, server, folder, "supersplat", SUPERSPLAT_FILES)
+    viewer(page, repository, "supersplat")
     scene = decode(lively)
     corners = scene.info.box.astype(np.float32)
     white = np.ones((2, 1, 3), np.float32)
     still = Splats(corners, np.eye(4, dtype=np.float32)[[0, 0]], 0 * corners + 0.3, np.float32([1, 1]), white)
     (folder / "still.ply").write_bytes(ply_bytes(still))
     fov = math.degrees(2 * math.atan(WIDTH / 2 / 80))
-    look = dict(still=server.url_of("still.ply"), fov=fov, background=scene.info.background, position=[0.3, 0.2, -4])
+    look = dict(position=[0.3, 0.2, -4], target=[0, 0, 0], angles=[0, 0, 180], fov=fov, ui=False)
+    look |= dict(still=server.url_of("still.ply"), background=scene.info.background)
     opened(page, server.url_of("scene.pd4"), **look)
     seen = []
     for level, t in ((0, 0.0), (1, 0.5)):
         state = call(page, "harness.show", dict(level=level, seconds=1 + 2 * t))
-        picture = np.asarray(Image.open(io.BytesIO(page.screenshot(clip=dict(x=0, y=0, width=WIDTH, height=HEIGHT)))))
-        seen.append(picture[..., :3] / 255)
+        seen.append(screenshot(page)[:HEIGHT, :WIDTH] / 255)
         viewmat = np.diag([1.0, -1, -1, 1]) @ np.linalg.inv(np.reshape(state["pose"], (4, 4)).T)
         K = np.array([[state["focal"], 0, WIDTH / 2], [0, state["focal"], HEIGHT / 2], [0, 0, 1]], np.float32)
         camera = Camera(viewmat.astype(np.float32), K, WIDTH, HEIGHT)
@@ -378,8 +364,8 @@ def test_supersplat_shows_the_script_in_place_of_a_still(page, server, folder, l
     call(page, "harness.close")
 
 
-def test_the_playcanvas_script_plays_and_tells_what_fails(page, server, folder):
-    viewer(page, server, folder, "playcanvas", PLAYCANVAS_FILES)
+def test_the_playcanvas_script_plays_and_tells_what_fails(page, repository, server):
+    viewer(page, repository, "playcanvas")
     opened(page, server.url_of("scene.pd4"))
     page.evaluate("harness.script.speed = 10; harness.script.loop = false; harness.script.playback.play()")
     page.wait_for_function("harness.script.playback.paused")
@@ -719,12 +705,7 @@ def test_a_headset_shows_each_eye_its_picture(page, server, folder):
     player = element(page, server, f'controls time="2" src="{server.url_of("vr.pd4")}"')
     wait_for_level(page, 2)
     before = page.evaluate(f"[...{ELEMENT}.camera.viewmat]")
-    player.get_by_role("button", name="Show in the headset").click()
-    page.wait_for_function(f"headset.frames && {ELEMENT}.player._isEvaluated() && {ELEMENT}.player._isSorted()")
-    drawn = page.evaluate("headset.frames")
-    page.wait_for_function("(drawn) => headset.frames > drawn + 1", arg=drawn)
-    got = pixels(page.evaluate("headset.read()"), 2 * WIDTH, HEIGHT)
-    eyes = np.split(got, 2, axis=1)
+    eyes = np.split(eyes_of_headset(page, 2 * WIDTH, HEIGHT) / 255, 2, axis=1)
     for eye, picture in zip(EYES, eyes, strict=True):
         expected = Rasterised(decode(data)).picture(eye_camera(scene, eye), 0.5)
         assert decibels(picture, expected) > LEAST_DB

@@ -28,6 +28,12 @@ def test_the_whole_file_with_its_validators(server):
     assert ask(server, "/scene.pd4").headers["Content-Type"] == "model/vnd.pd4dgs"
 
 
+@pytest.mark.parametrize("name, kind", [("viewer.css", "text/css"), ("playcanvas.mjs", "text/javascript")])
+def test_browsers_take_modules_and_styles_of_pages_beside_scenes(server, folder, name, kind):
+    (folder / name).write_bytes(b"")
+    assert ask(server, f"/{name}").headers["Content-Type"] == f"{kind}; charset=utf-8"
+
+
 @pytest.mark.parametrize(
     ("header", "part"),
     [
