@@ -29,7 +29,7 @@ import numpy as np
 
 from pd4dgs_codec.data.dataset import color, load
 from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, last_numbers, read_file, split_options
-from pd4dgs_codec.data.posed import depth_range, held_out, points_box
+from pd4dgs_codec.data.posed import depth_range, held_out, normalised_times, points_box, seconds_range
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError, one_line
 from pd4dgs_codec.interchange.formats import SH_SPAN, checked, library, read_gsplat, read_splats
@@ -110,7 +110,7 @@ def _around(source: str, place: Path, teacher: Teacher, options: Options, downsc
     return Dataset(
         name=source, train=tuple(train), test=tuple(test),
         box=box, near=near, far=far, background=background,
-        time_range=(0.0, teacher.seconds), up=up, unit=0.0, masked=False,
+        time_range=seconds_range(*normalised_times((0.0, teacher.seconds), source)[1:]), up=up, unit=0.0, masked=False,
         **_points(teacher, solid),
     )  # fmt: skip
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import struct
 from collections.abc import Callable
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.formats import fourdgs_bytes, ply_bytes, read_splats
 from pd4dgs_codec.interchange.runs import read_cameras, read_torch
 from pd4dgs_codec.interchange.splats import Splats
-from pd4dgs_codec.interchange.teacher import PARTS, read_model
+from pd4dgs_codec.interchange.teacher import PARTS, load_source, read_model
 
 CASES = 150
 
@@ -126,3 +127,17 @@ def test_a_few_bytes_that_stand_for_many_numbers_are_refused(tmp_path):
     assert path.stat().st_size < 2000
     with pytest.raises(DataError, match="a.4dgs: holds more than 1,0.* numbers in "):
         read_model(str(path), 30)
+
+
+@pytest.mark.parametrize("seconds, expected", [(1e300, None), (0.0, (0.0, 1.0)), (1e-320, (0.0, 1.0))])
+def test_a_duration_that_no_file_holds_is_found_before_training(tmp_path, seconds, expected):
+    """The time range of a .pd4 file is binary32, which training met at its end."""
+    path, one = tmp_path / "a.4dgs", struct.pack("<d", 1.0)
+    _fourdgs(path)
+    path.write_bytes(path.read_bytes().replace(one, struct.pack("<d", seconds)))
+    source = f"teacher:{path}?views=2&size=24x20"
+    if expected:
+        assert load_source(source).time_range == expected
+    else:
+        with pytest.raises(DataError, match=r"times from 0 to 1e\+300"):
+            load_source(source)
