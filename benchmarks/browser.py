@@ -58,11 +58,12 @@ def launched() -> Iterator[Any]:
         browser.close()
 
 
-def check_packages(viewer: str) -> None:
-    """Raises DataError if a package is not installed that one of VIEWERS needs."""
-    for name in VIEWERS[viewer]:
-        if not (PLAYER / "node_modules" / name).is_dir():
-            raise DataError(f"{viewer}: {name} is not installed (npm install --no-package-lock in player/)")
+def check_packages(*viewers: str) -> None:
+    """Raises DataError if a package is not installed that these of VIEWERS need."""
+    for viewer in viewers:
+        for name in VIEWERS[viewer]:
+            if not (PLAYER / "node_modules" / name).is_dir():
+                raise DataError(f"{viewer}: {name} is not installed (npm install --no-package-lock in player/)")
 
 
 def call(page: Any, script: str, *args: Any) -> Any:

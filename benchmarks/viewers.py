@@ -1,9 +1,8 @@
-"""Pictures of a scene in each viewer that plays it, at one time and through the scene's own camera.
+"""Pictures of a scene in each viewer that plays it, at one time and through the scene's own camera, at most 60 kB each:
+player.jpg, spark.jpg, playcanvas.jpg, supersplat.jpg, headset.jpg.
 
     (cd player && npm install --no-package-lock)    # once: three.js, Spark, PlayCanvas, SuperSplat's viewer
     python benchmarks/viewers.py scene.pd4 -o docs/img
-
-Writes player.jpg, spark.jpg, playcanvas.jpg, supersplat.jpg and headset.jpg, each of at most 60 kB.
 """
 
 from __future__ import annotations
@@ -37,13 +36,12 @@ HEADSET = """Object.assign(headset.size, { width: 312, height: 264 });
   Object.assign(headset.eyes, { left: [-0.03, -0.7, 0.6, -0.7, 0.4], right: [0.03, -0.6, 0.7, -0.7, 0.4] });"""
 
 
-def draw(data: bytes, folder: Path, seconds: float | None = None) -> list[Path]:
-    """Writes the pictures of the file `data`, by default at the middle of its time; returns their paths. Raises
-    DataError without a browser or a package, and Pd4Error for a file that is not valid or has no camera."""
+def draw(data: bytes, folder: Path, seconds: float | None = None) -> None:
+    """Writes the pictures of the file `data`, by default at the middle of its time. Raises DataError without a browser
+    or a package, and Pd4Error for a file that is not valid or has no camera."""
     from PIL import Image
 
-    for viewer in browser.VIEWERS:
-        browser.check_packages(viewer)
+    browser.check_packages(*browser.VIEWERS)
     scene = decode(data)
     camera = widened(own_frames(scene.info, 1)[0].camera, WIDTH)
     at = sum(scene.info.time_range) / 2 if seconds is None else seconds
@@ -54,16 +52,12 @@ def draw(data: bytes, folder: Path, seconds: float | None = None) -> list[Path]:
             page = opened.new_page(viewport={"width": camera.width, "height": camera.height})
             page.set_default_timeout(browser.PATIENCE_MS)
             pictures = dict(taken(page, f"{code.url}player/", files.url, scene, camera, at))
-    paths = [folder / f"{name}.jpg" for name in pictures]
-    with whole_files([str(path) for path in paths], overwrite=True) as temporaries:
-        for picture, path in zip(pictures.values(), temporaries, strict=True):
+    with whole_files([f"{folder / name}.jpg" for name in pictures], overwrite=True) as paths:
+        for picture, path in zip(pictures.values(), paths, strict=True):
             save_jpeg(Image.fromarray(picture), path, LIMIT)
-    return paths
 
 
-def taken(
-    page: Any, at: str, files: str, scene: Scene, camera: Camera, time: float
-) -> Iterator[tuple[str, np.ndarray]]:
+def taken(page: Any, at: str, files: str, scene: Scene, camera: Camera, time: float) -> Iterator[Any]:
     """(name, uint8 [H, W, 3]) of each viewer. at: address of player/. files: that of scene.pd4 and still.ply."""
     source, size = f"{files}scene.pd4", (camera.width, camera.height)
     element = f"{at}index.html?{urlencode({'src': source, 'time': time, 'autoplay': 0})}"
@@ -74,22 +68,17 @@ def taken(
     yield "player", browser.screenshot(page)
     state = {"level": scene.level, "seconds": time, "width": camera.width, "height": camera.height}
     state |= {"viewmat": camera.viewmat.ravel().tolist(), "K": camera.K.ravel().tolist()}
+    look = supersplat(scene, camera) | {"still": f"{files}still.ply"}
     for name in browser.VIEWERS:
         page.goto(f"{at}test-browser/viewer.html?{name}")
         page.wait_for_function("!!window.harness")
+        browser.call(page, "harness.open", source, *size, look)
+        browser.call(page, "harness.show" if name == "supersplat" else "harness.shoot", state)
         if name == "supersplat":
-            browser.call(
-                page, "harness.open", source, *size, supersplat(scene, camera) | {"still": f"{files}still.ply"}
-            )
-            browser.call(page, "harness.show", state)
             page.mouse.move(9, 9)  # the controls appear, and stay while the pointer is over them
             page.locator(".sse-controlsWrap").hover()
-            yield name, browser.screenshot(page)
-        else:
-            browser.call(page, "harness.open", source, *size)
-            yield name, browser.pixels(browser.call(page, "harness.shoot", state), *size)
-    page.add_init_script(path=browser.PLAYER / "test-browser" / "headset.js")
-    page.add_init_script(HEADSET)
+        yield name, browser.screenshot(page)
+    page.add_init_script((browser.PLAYER / "test-browser" / "headset.js").read_text() + HEADSET)
     page.goto(element)
     browser.wait_for_level(page, scene.level)
     yield "headset", browser.eyes_of_headset(page, 2 * 312, 264)
@@ -99,11 +88,10 @@ def supersplat(scene: Scene, camera: Camera) -> dict[str, Any]:
     """The options of its viewer, where y points up, for a scene where z points up or y down."""
     z_up = abs(scene.info.up[2]) > abs(scene.info.up[1])
     turn = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]) if z_up else np.diag([-1, -1, 1])
-    eye = -camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]
-    look = {"position": (turn @ eye).tolist(), "target": (turn @ look_at_point(scene.info)).tolist()}
+    places = {"position": -camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3], "target": look_at_point(scene.info)}
+    look = {name: (turn @ place).tolist() for name, place in places.items()} | {"background": scene.info.background}
     fov = math.degrees(2 * math.atan(camera.width / 2 / camera.K[0, 0]))
-    angles = (-90, 0, 0) if z_up else (0, 0, 180)
-    return look | {"fov": fov, "angles": angles, "background": scene.info.background, "ui": True}
+    return look | {"angles": (-90, 0, 0) if z_up else (0, 0, 180), "fov": fov, "ui": True}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -114,11 +102,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--time", type=float, metavar="SECONDS", help="of the scene (the middle)")
     args = parser.parse_args(argv)
     try:
-        paths = draw(args.file.read_bytes(), args.output, args.time)
+        draw(args.file.read_bytes(), args.output, args.time)
     except (Pd4Error, OSError) as error:
         print(f"viewers: error: {error}", file=sys.stderr)
         return 1
-    print("\n".join(f"{path}: {path.stat().st_size:,} bytes" for path in paths))
     return 0
 
 
