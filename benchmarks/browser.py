@@ -82,10 +82,10 @@ def pixels(text: str, width: int, height: int) -> np.ndarray:
 
 
 def screenshot(page: Any) -> np.ndarray:
-    """uint8 [H, W, 3] of what a page shows."""
+    """uint8 [H, W, 3] of what a page shows once nothing of it fades in or out."""
     from PIL import Image
 
-    return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))
+    return np.asarray(Image.open(io.BytesIO(page.screenshot(animations="disabled"))).convert("RGB"))
 
 
 def eyes_of_headset(page: Any, width: int, height: int) -> np.ndarray:

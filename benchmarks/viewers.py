@@ -85,13 +85,14 @@ def taken(page: Any, at: str, files: str, scene: Scene, camera: Camera, time: fl
 
 
 def supersplat(scene: Scene, camera: Camera) -> dict[str, Any]:
-    """The options of its viewer, where y points up, for a scene where z points up or y down."""
-    z_up = abs(scene.info.up[2]) > abs(scene.info.up[1])
-    turn = np.array([[1, 0, 0], [0, 0, 1], [0, -1, 0]]) if z_up else np.diag([-1, -1, 1])
+    """The options of its viewer, where y points up: the scene is turned about x."""
+    angle = -math.atan2(scene.info.up[2], scene.info.up[1])
+    cosine, sine = math.cos(angle), math.sin(angle)
+    turn = np.array([[1, 0, 0], [0, cosine, -sine], [0, sine, cosine]])
     places = {"position": -camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3], "target": look_at_point(scene.info)}
     look = {name: (turn @ place).tolist() for name, place in places.items()} | {"background": scene.info.background}
     fov = math.degrees(2 * math.atan(camera.width / 2 / camera.K[0, 0]))
-    return look | {"angles": (-90, 0, 0) if z_up else (0, 0, 180), "fov": fov, "ui": True}
+    return look | {"angles": (math.degrees(angle), 0, 0), "fov": fov, "ui": True}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import browser
@@ -19,10 +20,12 @@ import viewers
 from common import QUICK, ROOT, Run, Training
 from PIL import Image
 from refining_gif import LIMIT
+from strategies import make_scene
 from tiny import TINY
 
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.model.config import PRESETS
+from pd4dgs_codec.scene import Camera
 
 #: They start processes or browsers and wait for them.
 SLOW = ("latency", "batch", "player")
@@ -213,6 +216,17 @@ def test_pictures_of_viewers_say_what_is_missing(monkeypatch, tmp_path, capsys, 
     said = capsys.readouterr().err
     assert said.startswith("viewers: error: ") and told in said and said.count("\n") == 1
     assert not (tmp_path / "img").exists()
+
+
+@pytest.mark.parametrize("up, places", [((0, 1, 0), [1, 2, 3]), ((0, -1, 0), [1, -2, -3]), ((0, 0, 1), [1, 3, -2])])
+def test_a_scene_is_upright_in_the_viewer_of_supersplat(up, places):
+    scene = make_scene(1, anchors=4)
+    viewmat = np.eye(4, dtype=np.float32)
+    viewmat[:3, 3] = -1, -2, -3
+    camera = Camera(viewmat, np.diag([40, 40, 1]).astype(np.float32), 80, 60)
+    look = viewers.supersplat(replace(scene, info=replace(scene.info, up=up, camera=camera)), camera)
+    np.testing.assert_allclose(look["position"], places, atol=1e-6)
+    assert abs(look["angles"][0]) == pytest.approx({1: 0, -1: 180, 0: 90}[up[1]]) and look["fov"] == 90
 
 
 @pytest.mark.slow
