@@ -169,7 +169,8 @@ class Run:
 class Benchmark:
     """scenes: names in SCENES; none where no scene is measured. measure: the rows of one scene (of None without
     scenes). text: the rows of all scenes as Markdown, without a heading. pictures: draws them into a folder and returns
-    the file names. trainings: what it needs of a scene, so that they can run side by side before it measures."""
+    the file names. trainings: what it needs of a scene, so that they can run side by side before it measures. measured:
+    the folders of code on which its rows depend."""
 
     name: str
     title: str
@@ -178,6 +179,7 @@ class Benchmark:
     text: Callable[[Sequence[Row]], str]
     pictures: Callable[[Sequence[Row], Path], list[str]] = lambda rows, folder: []
     trainings: Callable[[Run, Any], list[Training]] = lambda run, scene: [Training(scene)]
+    measured: tuple[str, ...] = ("pd4dgs_codec",)
 
 
 def command(name: str, *arguments: object) -> Row:

@@ -189,4 +189,6 @@ def player_text(rows: Sequence[Row]) -> str:
 
 LATENCY = Benchmark("latency", "First picture", ONE, measure_latency, latency_text)
 SLICES = Benchmark("slices", "Slices", TWO, measure_slices, slices_text, slices_pictures)
-PLAYER = Benchmark("player", "The player in a browser", ONE, measure_player, player_text)
+PLAYER = Benchmark(
+    "player", "The player in a browser", ONE, measure_player, player_text, measured=("pd4dgs_codec", "player")
+)

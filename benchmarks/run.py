@@ -78,11 +78,11 @@ def section(benchmark: Benchmark, run: Run, names: Sequence[str], made: Row) -> 
 
 
 def aged(sections: Sequence[Row]) -> list[str]:
-    """A line for every section that was made before the last change of the package or of the player."""
-    lines = []
+    """A line for every section that was made before the last change of what it measures."""
+    lines, measured = [], {benchmark.name: benchmark.measured for benchmark in ALL}
     for found in sections:
         made = found["commit"].partition(",")[0]
-        newer = git("log", "-1", "--format=%h, %s", f"{made}..HEAD", "--", "pd4dgs_codec", "player")
+        newer = git("log", "-1", "--format=%h, %s", f"{made}..HEAD", "--", *measured[found["name"]])
         if newer or not git("cat-file", "-t", made):
             lines.append(f"{found['name']}: made at {found['commit']}, before {newer or 'the history that is here'}")
     return lines

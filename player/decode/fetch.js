@@ -205,10 +205,12 @@ export class SceneSource {
       }
       const skipped = Math.min(body.skip, value.length);
       body.skip -= skipped;
-      body.rest = value.subarray(skipped);
+      body.rest = skipped ? value.subarray(skipped) : value;
     }
-    const block = body.rest.subarray(0, end - this.received);
-    body.rest = body.rest.subarray(block.length);
+    const { rest } = body;
+    const all = rest.length <= end - this.received; // views take longer than a small piece
+    const block = all ? rest : rest.subarray(0, end - this.received);
+    body.rest = all ? NOTHING : rest.subarray(block.length);
     if (block.length) {
       if (this.received < PREAMBLE_SIZE) this._head.set(block, this.received);
       this.received += block.length;

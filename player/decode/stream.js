@@ -108,9 +108,9 @@ export class Stream {
 
   /** @param {Uint8Array} bytes */
   _append(bytes) {
-    const held = this._buffer.subarray(this._start, this._filled);
-    const size = held.length + bytes.length;
     if (this._filled + bytes.length > this._buffer.length) {
+      const held = this._buffer.subarray(this._start, this._filled);
+      const size = held.length + bytes.length;
       const doubled = Math.min(2 * this._buffer.length, size + (1 << 26));
       // where half of the buffer is free already, what it holds moves to its front
       const fits = size <= this._buffer.length / 2;

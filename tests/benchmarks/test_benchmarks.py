@@ -149,13 +149,19 @@ def test_trainings_side_by_side_are_those_that_are_measured(tmp_path, monkeypatc
     assert here.trained(QUICK)[1]["finished"] and len(ran) == 2
 
 
-def test_sections_older_than_the_package_are_named(monkeypatch):
-    newer = {"a1": "", "b2": "c3, Package: change", "gone": ""}
-    monkeypatch.setattr(
-        run, "git", lambda verb, *words: newer[words[2][:-6]] if verb == "log" else "commit" * (words[1] != "gone")
-    )
-    lines = run.aged([{"name": name, "commit": name} for name in newer] + [{"name": "own", "commit": "a1, changed"}])
-    assert [line.partition(":")[0] for line in lines] == ["b2", "gone"] and "c3, Package: change" in lines[0]
+def test_sections_older_than_what_they_measure_are_named(monkeypatch):
+    """Of the player the one that opens it."""
+
+    def git(verb, *words):
+        if verb == "cat-file":
+            return "commit" * (words[1] != "gone")
+        return {"b2": "c3, Package: change", "d4": "e5, Player: change" * ("player" in words)}.get(words[2][:-6], "")
+
+    monkeypatch.setattr(run, "git", git)
+    made = {"quality": "a1", "slices": "b2", "paper": "gone", "dial": "a1, changed", "speed": "d4", "player": "d4"}
+    lines = run.aged([{"name": name, "commit": commit} for name, commit in made.items()])
+    assert [line.partition(":")[0] for line in lines] == ["slices", "paper", "player"]
+    assert "c3, Package: change" in lines[0] and "e5, Player: change" in lines[2]
 
 
 def test_several_seeds_are_shown_with_their_spread():
