@@ -158,9 +158,9 @@ def test_a_file_that_once_broke_a_promise_is_refused_by_every_entry_point(limit)
 
 
 def test_inputs_are_named_by_their_numbers():
-    cases = [mutate.make_case(seeds(), 3, index) for index in range(200)]
-    assert cases == [mutate.make_case(seeds(), 3, index) for index in range(200)]
-    assert len({case.data for case in cases}) > 180
+    cases = [mutate.make_case(seeds(), 3, index) for index in range(60)]
+    assert cases == [mutate.make_case(seeds(), 3, index) for index in range(60)]
+    assert len({case.data for case in cases}) > 54
     assert cases[0] != mutate.make_case(seeds(), 4, 0)
 
 
