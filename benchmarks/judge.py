@@ -46,8 +46,9 @@ def text(rows: Sequence[Row]) -> str:
     head = ("scene", "seed", "top level", "gain of 1", "gain of 2", "mPSNR dB", "moving dB", "bytes so far")
     return (
         f"`pd4dgs-train 'synthetic:SCENE?seed=SEED' --preset tiny --iterations {STEPS}`: the camera sweeps. "
-        "*gain*: dB by which a level stays (1 needs 1, 2 needs 2) or goes, in the pixels that it changes of views held "
-        "back from training, over the level below after practice. Level 1 is judged where level 2 goes.\n\n"
+        "*gain*: dB by which a level stays (2 needs 2; 1 needs 1.5, to which the gain of 2 counts) or goes, in pixels "
+        "that it changes of views held back from training, over the level below after practice. Level 1 is judged "
+        "where level 2 goes.\n\n"
         f"{table(head, cells)}"
     )
 

@@ -313,10 +313,23 @@ def test_levels_without_gain_go_from_the_top_and_leave_their_anchors(dataset, mo
     assert learner.model.masks(0).mean() > torch.sigmoid(before[3][:, 0]).mean() + 0.2
 
 
+@pytest.mark.parametrize(
+    "gains, kept", [((1.9, 0.5), 1), ((0.8, 0.6), 0), ((-3.0, 1.6), 1), ((-3.0, 1.4), 0), ((2.0, 0.0), 2)]
+)
+def test_what_level_2_gained_counts_for_level_1(dataset, monkeypatch, gains, kept):
+    """Both tell that something moves: quick motion shows in level 2, and hardly in the few instants of level 1."""
+    monkeypatch.setattr(levels.SelectLevels, "_gain", lambda self, state, level, views, needed: gains[2 - level])
+    learner, record = trainer_of(replace(dataset, train=dataset.train * 12)).learner, {}
+    learner.levels.apply(learner, record)
+    assert learner.model.level == kept and record["level_gains"] == list(gains[: 3 - max(kept, 1)])
+
+
 @pytest.mark.usefixtures("short_runs_have_phases")
 def test_a_removed_level_stays_away(dataset, tmp_path, monkeypatch):
     """From the model, its optimiser, the log, the file and a resumed run."""
-    monkeypatch.setattr(levels.SelectLevels, "_gain", lambda self, state, level, views: 0.0 if level == 2 else 9.0)
+    monkeypatch.setattr(
+        levels.SelectLevels, "_gain", lambda self, state, level, views, needed: 0.0 if level == 2 else 9.0
+    )
     views = replace(dataset, train=dataset.train * 12)
     config = TrainConfig(preset="tiny", iterations=30)
     trainer = Trainer(config, views)

@@ -27,8 +27,8 @@ from pd4dgs_codec.train.state import TrainingView, TrainState
 EVERY = 16
 MIN_VIEWS = 4
 #: A level stays if it is better by so many dB: level 2 by more, since level 1 has seen a tenth of the steps and has not
-#: caught up in its practice ...
-MIN_GAINS = {1: 1.0, 2: 2.0}
+#: caught up in its practice; level 1 together with what level 2 gained, for both tell that something moves, ...
+MIN_GAINS = {1: 1.5, 2: 2.0}
 #: ... in the pixels in which it changes some colour by so much, if there are so many of them, ...
 MIN_CONTRAST, MIN_PIXELS = 0.02, 32
 #: ... than the level below after so many further steps: a share of the run, and so many at least.
@@ -53,19 +53,22 @@ class SelectLevels(phases.Phase):
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
         """From the highest level down, until one stays."""
         record["level_gains"] = gains = []
+        above = 0.0
         while state.model.level:
             level, views = state.model.level, [state.views[index] for index in sorted(held_back_views(state))]
-            gain = self._gain(state, level, views)
+            needed = MIN_GAINS[level] - above
+            gain = self._gain(state, level, views, needed)
             gains.append(gain)
-            if gain >= MIN_GAINS[level]:
+            if gain >= needed:
                 break
+            above = max(gain, 0.0)
             drop_level(state.model, state.optimiser, level)
             self.left_out.append({"level": level, "gain": gain, "views": len(views)})
         record["left_out"] = self.left_out
 
-    def _gain(self, state: TrainState, level: int, views: list[TrainingView]) -> float:
+    def _gain(self, state: TrainState, level: int, views: list[TrainingView], needed: float) -> float:
         """By how many dB `level` is better in the pixels that it changes than the level below after practice. The state
-        is as before if that is enough for the level to stay."""
+        is as before if that is what is `needed` for the level to stay."""
         below = max(layer for layer in (0, *state.model.deformations) if layer < level)
         pictures = [images(state, view, (below, level)) for view in views]
         acts = [changes(*pair) for pair in pictures]
@@ -84,7 +87,7 @@ class SelectLevels(phases.Phase):
             self._practise(below, max(MIN_PRACTICE, state.steps_in(PRACTICE)))
             gain = workers.alike(measure)
         finally:  # a picture that is not finite ends the phase, and the level stays
-            if gain >= MIN_GAINS[level]:
+            if gain >= needed:
                 state.return_to(before)
         return gain
 
