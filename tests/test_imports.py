@@ -148,12 +148,3 @@ def test_decoding_needs_no_torch():
     done = subprocess.run([sys.executable, "-c", SCRIPT], input=data, capture_output=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr.decode()
     assert done.stdout.decode().split() == ["(0,", "1,", "2)", str(len(pd4dgs_codec.decode(data).anchor_q)), "3.0"]
-
-
-def test_security_names_tests_that_there_are():
-    tests = {path.name: path.read_text() for path in (ROOT / "tests").rglob("test_*.py")}
-    text = (ROOT / "SECURITY.md").read_text()
-    files = re.findall(r"`(tests/[\w/.]+)`", text)
-    names = re.findall(r"`(test_\w+)…`", text)
-    assert len(files) > 20 and [file for file in files if not (ROOT / file).exists()] == []
-    assert len(names) > 9 and [n for n in names if not any(f"def {n}" in code for code in tests.values())] == []

@@ -126,7 +126,7 @@ def test_what_is_raised_aside_reaches_the_caller(count):
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
 def test_a_forked_child_shares_with_helpers_of_its_own():
     code = "import os, threading; from pd4dgs_codec import threads; threads.set_kernel_threads(2); "
-    code += "threads._share(8, 2, 1, print); pid = os.fork(); threads._share(8, 2, 1, lambda own: None); "
+    code += "threads._share(8, 2, 1, lambda own: None); pid = os.fork(); threads._share(8, 2, 1, lambda own: None); "
     code += "print(threading.active_count() == 2) if pid == 0 else os.waitpid(pid, 0)"
     assert _run(code)[-1] == "True"
 
