@@ -9,14 +9,14 @@ import io
 import os
 import shutil
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+from common import ROOT
 
 from pd4dgs_codec.errors import DataError
 
-PLAYER = Path(__file__).resolve().parents[1] / "player"
+PLAYER = ROOT / "player"
 
 #: The first draws the same pictures with a fifth less work: it is Chromium without windows.
 BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "chrome")

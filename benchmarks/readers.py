@@ -21,9 +21,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from common import ROOT
 
 MEGABYTE = 1 << 20
-VECTORS = Path(__file__).resolve().parents[1] / "spec" / "vectors"
+VECTORS = ROOT / "spec" / "vectors"
 
 
 def archive(pickled: bytes, method: int = zipfile.ZIP_STORED, storage: bytes = b"", members: int = 1) -> bytes:
@@ -138,15 +139,11 @@ def read_scene(path: Path) -> None:
 
 def read_url(path: Path) -> None:
     """The same from a server, which is measured as well."""
-    import threading
-
     from pd4dgs_codec.web.client import SceneClient
     from pd4dgs_codec.web.server import Server
 
-    with Server(path.parent, port=0) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        with SceneClient(f"{server.url}{path.name}") as client:
-            list(client.scenes())
+    with Server(path.parent) as server, server.running(), SceneClient(f"{server.url}{path.name}") as client:
+        list(client.scenes())
 
 
 def read_teacher(path: Path) -> None:

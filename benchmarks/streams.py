@@ -15,6 +15,7 @@ import sys
 import time
 import tracemalloc
 from collections import deque
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -40,8 +41,13 @@ def python(path: Path, way: str, size: int) -> tuple[float, int]:
             kept.extend(stream.feed(data[at : at + size]))
         stream.finish()
 
+    return cost(work, 7)
+
+
+def cost(work: Callable[[], Any], runs: int) -> tuple[float, int]:
+    """(least seconds of processor time of so many runs, peak bytes of arrays and objects)."""
     seconds = []
-    for _ in range(7):
+    for _ in range(runs):
         start = time.process_time()
         work()
         seconds.append(time.process_time() - start)
