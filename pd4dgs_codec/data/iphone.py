@@ -33,14 +33,7 @@ from pd4dgs_codec.data.files import (
     read_npy,
     whole_number,
 )
-from pd4dgs_codec.data.posed import (
-    LARGEST_TIME,
-    cameras_box,
-    held_out,
-    points_box,
-    posed_dataset,
-    seconds_range,
-)
+from pd4dgs_codec.data.posed import LARGEST_TIME, cameras_box, held_out, points_box, posed_dataset, seconds_range
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError
 

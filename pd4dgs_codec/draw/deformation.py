@@ -13,16 +13,7 @@ from pd4dgs_codec.draw import hexplane
 from pd4dgs_codec.draw.hexplane import PlaneLayout
 from pd4dgs_codec.draw.layers import Layers
 from pd4dgs_codec.draw.simd import LANES
-from pd4dgs_codec.scene import (
-    LENGTH_HEADS,
-    PLANES,
-    TRUNK,
-    Deformation,
-    Network,
-    deformation_unit,
-    instant,
-    plane_sides,
-)
+from pd4dgs_codec.scene import LENGTH_HEADS, PLANES, TRUNK, Deformation, Network, deformation_unit, instant, plane_sides
 
 
 class Field:

@@ -26,16 +26,7 @@ from pd4dgs_codec.draw.gaussians import (
     seen,
 )
 from pd4dgs_codec.draw.rasteriser import draw
-from pd4dgs_codec.scene import (
-    MASK_STEP,
-    MASK_THRESHOLD,
-    SCAFFOLD_NETWORKS,
-    Camera,
-    Scene,
-    SceneInfo,
-    Steps,
-    Widths,
-)
+from pd4dgs_codec.scene import MASK_STEP, MASK_THRESHOLD, SCAFFOLD_NETWORKS, Camera, Scene, SceneInfo, Steps, Widths
 
 
 class Player:

@@ -73,11 +73,7 @@ def check_channels(channels: Sequence[np.ndarray]) -> list[np.ndarray]:
 
 
 def encode_channels(
-    channels: Sequence[np.ndarray],
-    *,
-    priors: str = "best",
-    effort: int = 5,
-    known: Sequence[Fitted] = (),
+    channels: Sequence[np.ndarray], *, priors: str = "best", effort: int = 5, known: Sequence[Fitted] = ()
 ) -> CodedChannels:
     """Encode int32 channels (1-D, any lengths, |k| <= 2**24 - 1) into one payload.
 

@@ -449,11 +449,7 @@ def heights(dense: np.ndarray) -> tuple[int, int, int, int, int, int, int, np.nd
 
 @_compiled
 def cost_matrix(
-    values: np.ndarray,
-    counts: np.ndarray,
-    ends: np.ndarray,
-    windows: np.ndarray,
-    costs: np.ndarray,
+    values: np.ndarray, counts: np.ndarray, ends: np.ndarray, windows: np.ndarray, costs: np.ndarray
 ) -> np.ndarray:
     """Cost of each channel under each prior without its description, int64 [channels, priors].
 

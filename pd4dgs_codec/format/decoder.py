@@ -11,14 +11,7 @@ from pd4dgs_codec.format.container import CHUNK_OVERHEAD, PREAMBLE_SIZE, Chunk, 
 from pd4dgs_codec.format.header import Header, scene_id_of, unpack_header
 from pd4dgs_codec.format.payload import Declared, read_layer
 from pd4dgs_codec.format.registry import BY_CHUNK_TYPE, LayerKind
-from pd4dgs_codec.format.symbols import (
-    GrowingScene,
-    LayerSymbols,
-    SceneSymbols,
-    TakenVoxels,
-    check_slice,
-    merged,
-)
+from pd4dgs_codec.format.symbols import GrowingScene, LayerSymbols, SceneSymbols, TakenVoxels, check_slice, merged
 from pd4dgs_codec.scene import Scene
 
 

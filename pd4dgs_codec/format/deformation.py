@@ -32,17 +32,7 @@ from pd4dgs_codec.format.planes import (
 )
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, dequantise, expect, expect_array, is_step, magnitude, quantise
 from pd4dgs_codec.format.registry import LAYER_KINDS, LayerKind, Section
-from pd4dgs_codec.scene import (
-    INSTANTS,
-    PLANES,
-    TRUNK,
-    Deformation,
-    Planes,
-    Steps,
-    Widths,
-    instant,
-    plane_sides,
-)
+from pd4dgs_codec.scene import INSTANTS, PLANES, TRUNK, Deformation, Planes, Steps, Widths, instant, plane_sides
 
 # Keys of the layer parameters.
 STEPS, SCALES, NETWORKS, KEY = 3, 4, 5, 6

@@ -222,10 +222,7 @@ def read_class_count(reader: ByteReader, stage: int) -> int:
 
 
 def read_stages(
-    reader: ByteReader,
-    number: int,
-    groups: Iterator[list[Group]],
-    known: Sequence[list[Prior]] | None = None,
+    reader: ByteReader, number: int, groups: Iterator[list[Group]], known: Sequence[list[Prior]] | None = None
 ) -> None:
     """Decode `number` stages. groups: yields the targets of each stage once those before are decoded. known: by stage
     the priors of the slices before, to which its own are appended."""

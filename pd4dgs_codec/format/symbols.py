@@ -8,13 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pd4dgs_codec.errors import Malformed
-from pd4dgs_codec.format.deformation import (
-    NOTHING,
-    arrays_of,
-    dequantise_tensors,
-    layer_steps,
-    quantise_tensors,
-)
+from pd4dgs_codec.format.deformation import NOTHING, arrays_of, dequantise_tensors, layer_steps, quantise_tensors
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, Grid, all_finite, classes_of, row_blocks
 from pd4dgs_codec.format.registry import LAYER_KINDS, LayerKind
 from pd4dgs_codec.morton import MAX_VOXEL, morton_order

@@ -23,16 +23,7 @@ from pd4dgs_codec.data.posed import points_box
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.runs import PLY, Config, State, iteration, network_of, read_cameras, read_torch, run_of
 from pd4dgs_codec.morton import MAX_VOXEL
-from pd4dgs_codec.scene import (
-    MAX_FEATURE,
-    MAX_SLOTS,
-    SCALING_DIM,
-    Network,
-    Scene,
-    SceneInfo,
-    Steps,
-    Widths,
-)
+from pd4dgs_codec.scene import MAX_FEATURE, MAX_SLOTS, SCALING_DIM, Network, Scene, SceneInfo, Steps, Widths
 
 #: The decoders' names here and in Scaffold-GS.
 DECODERS = {"opacity": "opacity_mlp", "covariance": "cov_mlp", "color": "color_mlp"}

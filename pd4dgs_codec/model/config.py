@@ -57,10 +57,7 @@ PRESETS: dict[str, ModelConfig] = {
         initial_anchors=5_000,
         max_anchors=12_000,
     ),
-    "small": ModelConfig(
-        DeformationConfig(((32, 24),), 16, 64),
-        DeformationConfig(((64, 24), (64, 72)), 16, 64),
-    ),
+    "small": ModelConfig(DeformationConfig(((32, 24),), 16, 64), DeformationConfig(((64, 24), (64, 72)), 16, 64)),
     # the grids of the paper: 291,840 and 1,904,640 values; its networks are 128 wide, these 64
     "paper": ModelConfig(
         DeformationConfig(((32, 10), (64, 10)), 16, 64),

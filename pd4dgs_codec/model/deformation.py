@@ -40,11 +40,7 @@ class DeformationField(nn.Module):
 
     @staticmethod
     def fresh(
-        config: DeformationConfig,
-        box: np.ndarray,
-        head_widths: dict[str, int],
-        key: int | None = None,
-        below: int = 0,
+        config: DeformationConfig, box: np.ndarray, head_widths: dict[str, int], key: int | None = None, below: int = 0
     ) -> DeformationField:
         """A new field with the heads that `config` names. head_widths: the output width of each; below: features of the
         planes of the layer below, which the trunk reads too."""

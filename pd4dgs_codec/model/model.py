@@ -23,14 +23,7 @@ from pd4dgs_codec.draw.gaussians import OFFSET_REACH, SIGMA_REACH, in_view
 from pd4dgs_codec.model import fused, reference
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.networks import EXACT, MLP, Quantisation, Rounding, level_mask
-from pd4dgs_codec.scene import (
-    MASK_THRESHOLD,
-    SCAFFOLD_NETWORKS,
-    Camera,
-    SceneInfo,
-    Steps,
-    Widths,
-)
+from pd4dgs_codec.scene import MASK_THRESHOLD, SCAFFOLD_NETWORKS, Camera, SceneInfo, Steps, Widths
 
 #: Opacities of an anchor's Gaussians start spread between these, so that some but not all are seen everywhere: they
 #: start at one place.

@@ -67,11 +67,7 @@ class RenderedLoss:
 
 
 def true_psnr(
-    scene: Scene,
-    views: Sequence[View],
-    step: Callable[[], None] = lambda: None,
-    *,
-    levels: Sequence[int] | None = None,
+    scene: Scene, views: Sequence[View], step: Callable[[], None] = lambda: None, *, levels: Sequence[int] | None = None
 ) -> dict[int, float]:
     """The mean mPSNR over views, dB, by level of a decoded scene; `levels` defaults to all."""
     model = from_scene(scene)
