@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from itertools import pairwise
 from pathlib import Path
 from statistics import median
@@ -11,19 +14,19 @@ from typing import Any
 
 from browser import PATIENCE_MS, launched
 from common import ONE, TWO, Benchmark, Row, Run, Scene, command, levels, number, seconds_at, table
-from latency import first_start, served, times
 
 from pd4dgs_codec.bench.report import drawing
+from pd4dgs_codec.errors import DataError
 
 # -- latency -----------------------------------------------------------------------------------------------------------
 
 
 def measure_latency(run: Run, scene: Scene) -> list[Row]:
-    """A row per rate and level."""
-    rates, runs = ((5e7,), 1) if run.quick else ((2e6, 1e7), 3)
-    file = run.packed(scene)
-    first = {"scene": scene.name, "first_start": first_start(file, max(rates))}
-    return [first | row for rate in rates for row in times(file, rate, runs)]
+    """What `pd4dgs-bench latency` measures: a row per rate and level."""
+    options = ("--rates", "50M", "--runs", "1") if run.quick else ("--rates", "2M,10M", "--runs", "3")
+    (found,) = command("bench", "latency", run.packed(scene), *options)["files"]
+    first = {"scene": scene.name, "first_start": found["first_start"]}
+    return [first | row for row in found["times"]]
 
 
 def latency_text(rows: Sequence[Row]) -> str:
@@ -36,8 +39,9 @@ def latency_text(rows: Sequence[Row]) -> str:
     head = ("scene", "Mbps", "level", "bytes S", "8S/B", "last byte", "picture", "after the last byte", "cold process")
     return (
         "Seconds since the request, medians, over `pd4dgs-serve --rate`: until the last byte of the level has arrived, "
-        "until its picture is drawn on the CPU, and until then in a process that starts with the request. With empty "
-        f"kernel caches the first picture takes {rows[0]['first_start']:.1f} s.\n\n{table(head, cells)}"
+        "until its picture is drawn on the CPU, and until then in a process that starts with the request "
+        f"(`pd4dgs-bench latency`). With empty kernel caches the first picture takes {rows[0]['first_start']:.1f} s."
+        f"\n\n{table(head, cells)}"
     )
 
 
@@ -100,6 +104,23 @@ NOTE = """window.noted = [];
       noted.push({ level: event.detail.level, shown: performance.now() / 1000 });
     }, true);
   }"""
+
+
+@contextmanager
+def served(folder: Path, *options: str) -> Iterator[str]:
+    """The URL of a folder served by `pd4dgs-serve`. Raises DataError if it does not start."""
+    words = [sys.executable, "-m", "pd4dgs_codec", "serve", str(folder), "--port", "0", *options]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        with process.stdout as lines:
+            url = lines.readline().strip()
+            if not url:
+                raise DataError("pd4dgs-serve did not start")
+            yield url
+    finally:
+        process.terminate()
+        process.wait()
 
 
 def measure_player(run: Run, scene: Scene) -> list[Row]:

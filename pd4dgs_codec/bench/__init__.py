@@ -1,1 +1,1 @@
-"""What `pd4dgs-bench` measures: codec, renderer, trainer, stability."""
+"""What `pd4dgs-bench` measures: codec, renderer, trainer, latency, stability."""

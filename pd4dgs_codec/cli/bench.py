@@ -1,4 +1,4 @@
-"""`pd4dgs-bench`: error against run time of codec, renderer and trainer; numerical stability."""
+"""`pd4dgs-bench`: error against run time of codec, renderer and trainer; numerical stability; latency."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from pd4dgs_codec.cli import common, options
 from pd4dgs_codec.cli.common import FAILED, OK, STDIO, Console, UsageError, check_output, is_pd4, read_bytes
 from pd4dgs_codec.cli.progress import TrainingProgress, progress_bar
-from pd4dgs_codec.errors import TrainError
+from pd4dgs_codec.errors import DataError, DecodeError, TrainError
 
 if TYPE_CHECKING:
     from pd4dgs_codec.bench.report import Panel
@@ -220,6 +220,56 @@ def _trained(args: argparse.Namespace, console: Console) -> list[Point]:
     return runs
 
 
+# -- latency -----------------------------------------------------------------------------------------------------------
+
+LATENCY = """\
+Reports for each rate and level the bytes S of the prefix, 8S/B, the median time to their last byte over the paced link
+of pd4dgs-serve, and the time to the rendered image on the CPU in a warm and in a cold process, with the file's camera.
+A file takes about (8S/B + 2 s) x 3 x runs at each rate. Use a machine without other load.
+
+examples:
+  pd4dgs-bench latency scene.pd4 > latency.md
+  pd4dgs-bench latency scene.pd4 --rates 500k,10M --json latency.json"""
+
+
+def _latency_options(p: options.Parser) -> None:
+    add = p.add_argument
+    add("inputs", nargs="+", metavar="FILE", help=".pd4 files with a camera")
+    what = "rates of the link (default: 2M,10M,50M)"
+    add("--rates", type=options.rates, default="2M,10M,50M", metavar="R", help=what)
+    add("--runs", type=options.positive_int, default=9, metavar="N", help="runs per median (default: 9)")
+
+
+def _latency(args: argparse.Namespace, console: Console) -> Outcome:
+    contents = [_with_camera(name) for name in args.inputs]
+    from pd4dgs_codec.bench import latency, report
+
+    machine, speeds, files, parts = report.machine(), args.rates.values(), [], []
+    with progress_bar(3 * args.runs * len(speeds) * len(contents), "runs", "latency") as step:
+        for name, data in zip(args.inputs, contents, strict=True):
+            rows = [row for rate in speeds for row in latency.times(data, rate, args.runs, step)]
+            start = latency.first_start(data, max(speeds))
+            files.append({"name": name, "bytes": len(data), "times": rows, "first_start": start})
+            cold = f"With empty kernel caches the first image takes {start:.1f} s."
+            parts += [f"## {name}", latency.table(rows), cold]
+    parts.append(f"Seconds since the request (cold: since the start of the process), medians of {args.runs}.")
+    result = {"runs": args.runs, "rates": args.rates, "machine": machine, "files": files}
+    return Outcome(result, "\n\n".join([*parts, report.machine_line(machine)]))
+
+
+def _with_camera(name: str) -> bytes:
+    """The bytes of a valid file with a camera."""
+    from pd4dgs_codec.format.decoder import decode
+
+    data = read_bytes(name)
+    try:
+        if decode(data).info.camera is None:
+            raise DataError("holds no camera, expected one to render with")
+    except (DecodeError, DataError) as error:
+        raise DataError(f"{name}: {error}") from None
+    return data
+
+
 # -- stability ---------------------------------------------------------------------------------------------------------
 
 STABILITY = """\
@@ -278,6 +328,7 @@ REPORTS = {
     "codec": Report("FILE", "Measure the codec's error against bytes and seconds.", CODEC, _codec_options, _codec),
     "render": Report("FILE", "Measure the rasterisers' error against time.", RENDER, _render_options, _render),
     "train": Report("[SOURCE]", "Measure held-out error against training time.", TRAIN, _train_options, _train),
+    "latency": Report("FILE...", "Measure seconds to each level's image.", LATENCY, _latency_options, _latency, False),
     "stability": Report("", "Test stiff and extreme cases.", STABILITY, _stability_options, _stability, False),
 }
 
@@ -296,7 +347,7 @@ def parser(name: str | None = None) -> options.Parser:
     lines = [f"  {name:<11} {report.summary}" for name, report in REPORTS.items()]
     examples = [f"  pd4dgs-bench {name} --help" for name in REPORTS]
     details = "\n".join(["REPORT is one of", *lines, "", "examples:", *examples])
-    summary = "Measure error against run time and numerical stability."
+    summary = "Measure error against run time, numerical stability and latency."
     p = options.Parser("bench", "REPORT", summary, details)
     p.add_argument("report", metavar="REPORT", choices=tuple(REPORTS), help="report to make, see below")
     p.add_common()

@@ -1,10 +1,11 @@
-"""The reports codec, render and train: figures by hand, and a tiny model end to end."""
+"""The reports codec, render, train and latency: figures by hand, and a tiny model end to end."""
 
 from __future__ import annotations
 
 import json
 import math
 import platform
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,10 +13,14 @@ import torch
 from PIL import Image
 from tiny import TINY, write_views
 
-from pd4dgs_codec.bench import report, runtime
+from pd4dgs_codec import encode
+from pd4dgs_codec.bench import latency, report, runtime
 from pd4dgs_codec.cli import bench
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.format.info import info
 from pd4dgs_codec.model.config import PRESETS
 from pd4dgs_codec.scene import Camera
+from pd4dgs_codec.web.server import Server
 
 
 @pytest.fixture
@@ -142,6 +147,30 @@ def test_presets_are_trained_and_compared(tmp_path, capsys, monkeypatch):
     assert (tmp_path / "t.png").exists()
 
 
+# -- latency -----------------------------------------------------------------------------------------------------------
+
+
+def test_latency_of_a_file(scene_pd4, data, capsys, monkeypatch):
+    monkeypatch.setattr(latency, "first_start", lambda data, rate: 12.3)  # takes seconds to compile the kernels
+    assert bench.main(["latency", str(scene_pd4), "--rates", "50M", "--runs", "1", "--json"]) == 0
+    (found,) = json.loads(capsys.readouterr().out)["files"]
+    assert [(row["level"], row["bytes"]) for row in found["times"]] == [
+        (r["layer"], r["end"]) for r in info(data)["layers"]
+    ]
+    assert found["first_start"] == 12.3
+    for row in found["times"]:
+        assert row["expected"] == 8 * row["bytes"] / 50e6
+        assert 0 < row["after_last_byte"] <= row["picture"] and 0 < row["network"] and 0 < row["cold"]
+
+
+def test_a_file_without_a_camera_cannot_be_rendered(scene, tmp_path):
+    blind = encode(replace(scene, info=replace(scene.info, camera=None)), layers=0, effort=1)
+    (tmp_path / "scene.pd4").write_bytes(blind)
+    with Server(tmp_path) as server, server.running(), pytest.raises(DataError, match="camera"):
+        list(latency.pictures(f"{server.url}scene.pd4"))
+    assert bench.main(["latency", str(tmp_path / "scene.pd4")]) == 1
+
+
 # -- the command -------------------------------------------------------------------------------------------------------
 
 
@@ -165,6 +194,7 @@ def test_help_has_examples(report, capsys):
         ("train", 2, "--from"),
         ("train synthetic:static --from a.pt", 2, "no SOURCE"),
         ("train synthetic:static --seconds 3 --iterations 3", 2, "one of them"),
+        ("latency none.pd4 --rates fast", 2, "expected a rate"),
         ("stability --only nowhere", 2, "nowhere"),
         ("--json stability", 2, "the report first"),
         ("stabilty", 2, "stabilty"),

@@ -11,7 +11,6 @@ import browser
 import codec
 import common
 import demo
-import latency
 import numpy as np
 import page
 import pytest
@@ -25,7 +24,6 @@ from strategies import make_scene
 from tiny import TINY
 
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.format.info import info
 from pd4dgs_codec.model.config import PRESETS
 from pd4dgs_codec.scene import Camera
 
@@ -235,16 +233,6 @@ def test_a_scene_is_upright_in_the_viewer_of_supersplat(up, places):
     look = viewers.supersplat(replace(scene, info=replace(scene.info, up=up, camera=camera)), camera)
     np.testing.assert_allclose(look["position"], places, atol=1e-6)
     assert abs(look["angles"][0]) == pytest.approx({1: 0, -1: 180, 0: 90}[up[1]]) and look["fov"] == 90
-
-
-def test_latency_of_a_file(made):
-    file = made / QUICK.name / "scene.pd4"
-    rows = latency.times(file, 5e7, 1)
-    ends = [(row["layer"], row["end"]) for row in info(file.read_bytes())["layers"]]
-    assert [(row["level"], row["bytes"]) for row in rows] == ends
-    for row in rows:
-        assert row["expected"] == 8 * row["bytes"] / 5e7
-        assert 0 < row["after_last_byte"] <= row["picture"] and 0 < row["network"] and 0 < row["cold"]
 
 
 @pytest.mark.slow

@@ -1,0 +1,166 @@
+"""Seconds from a request to the bytes and the rendered image of each level, over the paced link of `pd4dgs-serve`.
+
+    python -m pd4dgs_codec.bench.latency URL
+
+is the cold viewer: a process that renders each level as it arrives and prints a line per image.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from statistics import median
+from typing import IO, Any
+
+from pd4dgs_codec import threads
+from pd4dgs_codec.errors import DataError, DeliveryError
+from pd4dgs_codec.format.info import info
+from pd4dgs_codec.web.client import SceneClient
+from pd4dgs_codec.web.transfer import Transfer
+
+
+@contextlib.contextmanager
+def served(data: bytes, rate: float) -> Iterator[str]:
+    """The URL of a file behind a link of `rate` bits per second, from `pd4dgs-serve` in another process."""
+    with tempfile.TemporaryDirectory(prefix="pd4dgs-") as folder:
+        (Path(folder) / "scene.pd4").write_bytes(data)
+        with _python("-m", "pd4dgs_codec", "serve", folder, "--port", "0", "--rate", repr(rate)) as lines:
+            line = lines.readline().strip()
+            if not line:
+                raise DeliveryError("pd4dgs-serve did not start")
+            yield f"{line}scene.pd4"
+
+
+@contextlib.contextmanager
+def _python(*arguments: str, **environment: str) -> Iterator[IO[str]]:
+    """The stdout of a Python process that ends with the block."""
+    command, variables = [sys.executable, *arguments], os.environ | environment
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=variables)
+    assert process.stdout is not None
+    try:
+        with process.stdout as lines:
+            yield lines
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def arrivals(url: str, ends: Sequence[int]) -> list[float]:
+    """Seconds from the request to each of these bytes, read as a stream without decoding."""
+    with contextlib.closing(Transfer(url)) as transfer:
+        start, seconds = time.perf_counter(), []
+        for end in ends:
+            while transfer.read(end):
+                pass
+            seconds.append(time.perf_counter() - start)
+    return seconds
+
+
+def pictures(url: str, ready: Callable[[], object] = lambda: None) -> Iterator[tuple[float, float]]:
+    """Renders each level at time 0 with the file's own camera as soon as it is decoded: seconds since the request, and
+    since the last byte of its layer. ready: called before each.
+
+    Raises what SceneClient.scenes raises, and DataError for a file without a camera.
+    """
+    start = time.monotonic()
+    with SceneClient(url) as client:
+        for scene in client.scenes():
+            last_byte = client.arrived_at
+            if scene.info.camera is None:
+                raise DataError("the file holds no camera, expected one to render with")
+            ready()
+            from pd4dgs_codec.quality.levels import level_of
+
+            level_of(scene).picture(scene.info.camera, 0.0)
+            now = time.monotonic()
+            yield now - start, now - last_byte
+
+
+def cold_start(url: str, **environment: str) -> list[float]:
+    """Seconds from the start of a viewer's process to each of its images. Raises DeliveryError if it fails."""
+    start = time.perf_counter()
+    with _python("-m", "pd4dgs_codec.bench.latency", url, **environment) as lines:
+        seconds = [time.perf_counter() - start for _ in lines]
+    if not seconds:
+        raise DeliveryError(f"{url}: the viewer's process rendered nothing")
+    return seconds
+
+
+def times(data: bytes, rate: float, runs: int, step: Callable[[], None] = lambda: None) -> list[dict[str, Any]]:
+    """A row per level of a file at a rate, medians of `runs` in seconds: rate; level; bytes, S, of the prefix;
+    expected, 8S/rate; since the request, network, to the last byte, and picture, to the image in a warm process, of
+    which after_last_byte follow that byte; cold, from the start of a process with nothing loaded to the image.
+
+    `step` is called 3 times per run.
+    """
+    _warm_up()
+    layers = [(row["layer"], row["end"]) for row in info(data)["layers"]]
+    network, warm, cold = [], [], []
+    with served(data, rate) as url:
+        for _ in range(runs):
+            network.append(arrivals(url, [end for _, end in layers]))
+            step()
+            warm.append(list(pictures(url)))
+            step()
+            cold.append(cold_start(url))
+            step()
+    return [
+        {
+            "rate": rate,
+            "level": layer,
+            "bytes": end,
+            "expected": 8 * end / rate,
+            "network": median(run[i] for run in network),
+            "picture": median(run[i][0] for run in warm),
+            "after_last_byte": median(run[i][1] for run in warm),
+            "cold": median(run[i] for run in cold),
+        }
+        for i, (layer, end) in enumerate(layers)
+    ]
+
+
+def first_start(data: bytes, rate: float) -> float:
+    """Seconds to the first image of a process without compiled kernels, as after installation."""
+    with tempfile.TemporaryDirectory(prefix="pd4dgs-") as cache, served(data, rate) as url:
+        return cold_start(url, NUMBA_CACHE_DIR=cache)[0]
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """A row per rate and level."""
+    from pd4dgs_codec.bench.report import markdown
+
+    head = ("rate", "level", "S, bytes", "8S/B", "network", "picture, warm", "after last byte", "picture, cold")
+    keys = ("expected", "network", "picture", "after_last_byte", "cold")
+    cells = [
+        (f"{row['rate'] / 1e6:g} Mbps", str(row["level"]), f"{row['bytes']:,}", *(f"{row[key]:.3f}" for key in keys))
+        for row in rows
+    ]
+    return markdown(head, cells)
+
+
+def _warm_up() -> None:
+    """Imports the player and loads its kernels."""
+    from pd4dgs_codec.draw.player import warm_up
+
+    warm_up()
+
+
+def main(url: str) -> None:
+    """The cold viewer: imports and kernels load in a thread while the bytes arrive."""
+    threads.configure()
+    threads.load_numba()
+    warming = threading.Thread(target=_warm_up)
+    warming.start()
+    for seconds, _ in pictures(url, ready=warming.join):
+        print(f"image after {seconds:.3f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main(*sys.argv[1:])
