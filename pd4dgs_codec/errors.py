@@ -88,7 +88,9 @@ class Truncated(DecodeError):
     needs: so many bytes of the file the step takes that found too few, 0 if unknown.
     """
 
-    needs: int = 0
+    def __init__(self, message: str, *, offset: int | None = None, chunk: int | None = None, needs: int = 0):
+        super().__init__(message, offset=offset, chunk=chunk)
+        self.needs = needs
 
 
 class BadSignature(DecodeError):

@@ -1,5 +1,7 @@
 """A stream costs what decoding costs, however the bytes are split."""
 
+import gc
+import weakref
 from collections import deque
 from functools import cache
 from itertools import chain
@@ -79,6 +81,19 @@ def test_scenes_stay_as_they_were():
         np.testing.assert_array_equal(scene.mask[0][order], expected.mask[0][other])
         with pytest.raises(ValueError, match="read-only"):
             scene.feature[:] = 0
+
+
+def test_a_scene_is_freed_as_soon_as_nobody_holds_it():
+    """An error for each piece held its frames and their scenes until the next collection of garbage."""
+    data, stream = many_slices(), open_stream()
+    gc.disable()
+    try:
+        (scene,) = stream.feed(data[: ends()[3] + 9])
+        held = weakref.ref(scene)
+        del scene, stream
+        assert held() is None
+    finally:
+        gc.enable()
 
 
 def test_a_stream_goes_on_after_a_damaged_slice_is_fed_again():
