@@ -1,7 +1,5 @@
 """`python -m pd4dgs_codec VERB ...`: the same commands as the `pd4dgs-VERB` programs."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from importlib import import_module

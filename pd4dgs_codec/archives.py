@@ -7,8 +7,6 @@ place each, and keys are short texts or small numbers. `torch.load(weights_only=
 bounds, and refuses TorchScript.
 """
 
-from __future__ import annotations
-
 import io
 import math
 import pickletools

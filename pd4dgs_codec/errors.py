@@ -3,8 +3,6 @@
 Every message says what was found, what was expected, and where.
 """
 
-from __future__ import annotations
-
 LONGEST = 400  #: characters of a message; beyond, its middle is left out
 
 

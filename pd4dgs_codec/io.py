@@ -5,8 +5,6 @@ mode of the file that it replaces, and is renamed to the target in one step. The
 signal; a process that is killed by SIGKILL may leave it behind.
 """
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import math

@@ -1,7 +1,5 @@
 """Morton (Z-order) codes of voxel cells: bit 3i is bit i of x, 3i + 1 of y, 3i + 2 of z, relative to the minimum."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pd4dgs_codec.errors import EncodeError

@@ -4,8 +4,6 @@ Before `interruptible` and after it a program has nothing to clear up, and signa
 raise KeyboardInterrupt in the main thread, as Ctrl-C does in any Python program.
 """
 
-from __future__ import annotations
-
 import signal
 import sys
 import threading

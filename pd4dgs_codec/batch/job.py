@@ -4,8 +4,6 @@ A manifest has a JSON object per line, `{"source": ..., "output": ..., "options"
 of the package that runs on each source. A broken line is reported and the others go on.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import posixpath

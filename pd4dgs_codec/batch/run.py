@@ -4,8 +4,6 @@ An engine runs jobs as tasks: a pool of processes on this machine, Ray, or Slurm
 retries and the time limit are the same for all.
 """
 
-from __future__ import annotations
-
 import contextlib
 import multiprocessing
 import os

@@ -4,8 +4,6 @@ An output is its files and a record, `OUTPUT.done.json`, which is written last a
 Each file appears whole or not at all: on a disk by a rename, in object stores by their own design.
 """
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """Seconds of repeated work and the machine that they hold for; Markdown tables, and plots of error over a cost."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import platform

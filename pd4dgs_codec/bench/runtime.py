@@ -1,8 +1,6 @@
 """Error against run time of the codec, the rasterisers and the trainer. Errors are RMSE of images, 0..1, not rounded to
 8 bits. A point or run is a dict, as in the report's JSON."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Iterable, Sequence

@@ -1,7 +1,5 @@
 """The stability table: promises, their inputs, outcomes as rows, and a scene that some inputs share."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Stability of numbers and their codes: the rate R(a), priors, quantisers and masks."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """`pd4dgs-eval`: quality and bytes per level."""
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`pd4dgs-import`: another trainer's checkpoint -> a checkpoint of ours."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

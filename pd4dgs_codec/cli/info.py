@@ -1,7 +1,5 @@
 """`pd4dgs-info`: what a `.pd4` file holds."""
 
-from __future__ import annotations
-
 import argparse
 from contextlib import closing
 from typing import Any

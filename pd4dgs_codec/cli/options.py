@@ -3,8 +3,6 @@
 A type returns the value or raises one line that says what was found and what was expected.
 """
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 import math

@@ -1,7 +1,5 @@
 """`pd4dgs-prepare`: a video, or its frames -> a folder that `pd4dgs-train` reads."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`pd4dgs-serve`: a folder over HTTP, at the rate of a slow link if asked for."""
 
-from __future__ import annotations
-
 import argparse
 import signal
 import threading

@@ -1,7 +1,5 @@
 """`pd4dgs-view`: a scene in the browser, from a local server that runs as long as the command."""
 
-from __future__ import annotations
-
 import argparse
 import contextlib
 from urllib.parse import quote

@@ -5,8 +5,6 @@ coordinates m, placed by an affine map that depends on time: x = A(t) m + c(t). 
 point stay constant in any motion, including stretching.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

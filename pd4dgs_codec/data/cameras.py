@@ -1,7 +1,5 @@
 """Lenses and poses as files describe them, removal of lens distortion, and a frame read as a View."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache

@@ -6,8 +6,6 @@ videos, named as the pictures of the model (`cam00.png` and `cam00.mp4`), in `vi
 order.
 """
 
-from __future__ import annotations
-
 import struct
 from collections import Counter
 from collections.abc import Iterator

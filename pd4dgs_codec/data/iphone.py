@@ -4,8 +4,6 @@ The first has camera/*.json, rgb/{factor}x, splits/, scene.json, metadata.json a
 covisible/. Record3D has `metadata` or `metadata.json` beside `rgbd/` or `rgb/` with pictures 0.jpg, 1.jpg, ... .
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any

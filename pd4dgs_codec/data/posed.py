@@ -1,7 +1,5 @@
 """From frames with poses to a dataset: split, times, scene box, depth range and background, for all readers."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, TypeVar

@@ -1,7 +1,5 @@
 """Rigs of many calibrated cameras: Neu3D (DyNeRF) with a video per camera, and Panoptic Studio with pictures."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 from pathlib import Path

@@ -6,8 +6,6 @@ points); two cameras that stand still see all instants. Another size keeps the v
 repeat the same motion more densely. The content depends on the source string alone.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace

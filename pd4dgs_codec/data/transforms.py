@@ -1,7 +1,5 @@
 """Blender, D-NeRF and nerfstudio folders: transforms*.json with OpenGL camera-to-world matrices."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path

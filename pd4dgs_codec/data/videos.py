@@ -5,8 +5,6 @@ compressed by zstd. It lies in the folder that PD4DGS_CACHE names, else in ~/.ca
 PD4DGS_CACHE_GIB (default 20); the videos that were used least recently leave first.
 """
 
-from __future__ import annotations
-
 import errno
 import hashlib
 import json

@@ -1,7 +1,5 @@
 """A dataset as training and evaluation use it: posed images, their split, and the geometry of the scene."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -7,8 +7,6 @@ set of blocks is one 64-bit word, and a small Gaussian costs few lanes. Where ve
 rows, named by the first; the picture has the same bits.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -3,8 +3,6 @@
 Another kind of deformation is another body of `Field`, behind the same two methods.
 """
 
-from __future__ import annotations
-
 from itertools import accumulate
 
 import numpy as np

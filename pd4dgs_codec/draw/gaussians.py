@@ -11,8 +11,6 @@ backward passes split the Gaussians over threads at anchors, and each part owns 
 Gaussians are kept per part and added in order, so that results are bitwise reproducible for a fixed number of parts.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

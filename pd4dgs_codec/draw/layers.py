@@ -8,8 +8,6 @@ last side by side, each padded with zeros to whole vectors.
 Each part of a backward pass owns its sums, which are added in order: bits repeat for a fixed number of parts.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

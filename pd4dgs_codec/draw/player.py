@@ -3,8 +3,6 @@
 The two agree to rounding: activations differ in the last bit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -7,8 +7,6 @@ Compositing takes a Gaussian as log2(alpha) = q - t^2 - r^2 with t = sa (dx - k 
 loses no digits in float32 for a long thin Gaussian, and |t|, |r| stay below 3 where it is drawn.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -5,8 +5,6 @@ into tiles here: depth order by a radix sort, then a stable counting sort, paral
 order, whose result does not depend on the number of chunks or threads.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

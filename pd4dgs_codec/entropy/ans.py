@@ -11,8 +11,6 @@ constriction panics with a BaseException on a bad table, leaves half a channel e
 process on a count that it cannot allocate. So everything is checked first.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import TypeAlias
 

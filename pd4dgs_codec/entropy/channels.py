@@ -8,8 +8,6 @@ After the last channel the ANS words: the heights of each histogram prior in ord
 symbols.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate

@@ -9,8 +9,6 @@ The first fit of an installation waits for the compilation, so slow constructs a
 slice takes five seconds to compile, `np.interp` two, and a function is compiled anew for each constant argument.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any

@@ -5,8 +5,6 @@ varint of (zigzag(base) << 2 | log2(width)); then one raw LZMA2 stream of the ch
 signed integers k - base of the narrowest width.
 """
 
-from __future__ import annotations
-
 import itertools
 import lzma
 from collections.abc import Sequence

@@ -16,8 +16,6 @@ Channels
 Every table is static, so a level is one vectorised step.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from pd4dgs_codec.entropy.ans import MAX_COUNT

@@ -4,8 +4,6 @@ A table is ``cum`` int64 [n + 1], strictly increasing from 0 to 2**24; symbol q 
 Every rule below uses integers below 2**53 only, so Python, C and JavaScript build the same table on every machine.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

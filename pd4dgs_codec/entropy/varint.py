@@ -1,7 +1,5 @@
 """Variable-length integers: LEB128, least significant seven bits first, always in the shortest form."""
 
-from __future__ import annotations
-
 from pd4dgs_codec.errors import LimitExceeded, Malformed
 
 _MAX_BYTES = 5

@@ -4,8 +4,6 @@ Values are bool, int, float (a finite binary32), str, bytes, list, and dict with
 every form is the shortest, and nesting is at most MAX_DEPTH.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from collections.abc import Mapping

@@ -6,8 +6,6 @@ one bound per kind of tensors (clause 5.4), the kinds being the fields of Steps.
 times the steps and the bounds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from itertools import pairwise

@@ -6,8 +6,6 @@
 The preamble's CRC covers its first 16 bytes and the header; a chunk's CRC covers all of the chunk before it.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Bytes of a `.pd4` file -> Scene, at once or as they arrive. Needs numpy, constriction, msgpack and nothing else."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 
 from pd4dgs_codec.entropy.priors import Prior

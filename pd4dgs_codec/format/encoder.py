@@ -1,7 +1,5 @@
 """Scene -> bytes of a `.pd4` file, with a report of where the bits went."""
 
-from __future__ import annotations
-
 import hashlib
 import time
 from collections.abc import Callable, Sequence

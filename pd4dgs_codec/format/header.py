@@ -1,7 +1,5 @@
 """The file header <-> canonical msgpack (clause 5): chunk list, coding mode, attribute steps, SceneInfo."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Facts about a file, from the header alone where possible, and digests of its contents for conformance."""
 
-from __future__ import annotations
-
 import hashlib
 from typing import Any
 

@@ -4,8 +4,6 @@ The content is a canonical msgpack map in one zstd frame that declares its size.
 unpack it import zstandard.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Scene -> a flat dict of arrays under stable names, for numpy.savez and readers without this package."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from pd4dgs_codec.format.deformation import arrays_of

@@ -5,8 +5,6 @@ Section. Mode ans codes each group of channels as a section; mode lzma codes all
 is one scalar of the anchors' attributes, one channel of a plane (its residuals, row by row), or one weight or bias.
 """
 
-from __future__ import annotations
-
 import struct
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ a layer is left out because it has no deformation, its anchors and masks pass to
 picture of the highest level stays the same.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

@@ -5,8 +5,6 @@ N = k[i-1, j] and NW = k[i-1, j-1], and the residual k - prediction is coded. In
 column 0 W and NW are taken equal to N, and at (0, 0) all three are 0 (clause 11.3). All arithmetic is on integers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import accumulate

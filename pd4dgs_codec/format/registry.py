@@ -1,7 +1,5 @@
 """Registries of the bitstream, a row per layer and the sections, and its limits."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntEnum
 

@@ -3,8 +3,6 @@
 SPZ, compressed PLY and 4dgs go through gaussforge and fourdgs, which are in the extra `interchange`.
 """
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import io

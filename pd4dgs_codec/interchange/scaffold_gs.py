@@ -7,8 +7,6 @@ the colour decoder linearly, so for one picture it is part of the bias. Two fold
 give the voxel size, the background and the cameras; they are parsed as text.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass

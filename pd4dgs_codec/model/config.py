@@ -1,7 +1,5 @@
 """Sizes of a model, and the three presets."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from pd4dgs_codec.scene import HEADS, Steps

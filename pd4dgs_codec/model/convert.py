@@ -1,7 +1,5 @@
 """Model <-> Scene: torch tensors to the numpy arrays that the codec packs, and back."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
 

@@ -1,7 +1,5 @@
 """Choice of frames from a recording: spread over its time, sharp, and each different from the one before."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Quality and bytes of the levels of a file, on a dataset's held-out views."""
 
-from __future__ import annotations
-
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

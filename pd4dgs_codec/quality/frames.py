@@ -1,7 +1,5 @@
 """The pictures to take of a file: a dataset's views, or the file's own camera over time."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

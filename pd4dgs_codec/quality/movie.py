@@ -1,7 +1,5 @@
 """Pictures of levels side by side under captions, and sequences of pictures as PNG files, animated GIF or MP4."""
 
-from __future__ import annotations
-
 import contextlib
 import itertools
 import subprocess

@@ -3,8 +3,6 @@
 Nothing is downloaded. docs/evaluation.md gives the definitions and says where each package comes from.
 """
 
-from __future__ import annotations
-
 import functools
 import sys
 import warnings

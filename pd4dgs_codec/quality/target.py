@@ -10,8 +10,6 @@ scenes.
 The caller gives the loss and the error of omitted anchors as functions, so that nothing here needs a renderer.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

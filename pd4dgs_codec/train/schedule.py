@@ -1,7 +1,5 @@
 """The schedule of a training run: its phases, learning rates and probabilities of levels, after the PD-4DGS method."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

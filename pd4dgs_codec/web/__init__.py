@@ -1,7 +1,5 @@
 """Scenes over the web: a range server, a resuming client, the one-file page, packages with DASH and HLS manifests."""
 
-from __future__ import annotations
-
 #: The page of a folder.
 PAGE = "index.html"
 

@@ -1,7 +1,5 @@
 """HTTP headers of partial and cached content (RFC 9110, RFC 9111)."""
 
-from __future__ import annotations
-
 import posixpath
 import re
 

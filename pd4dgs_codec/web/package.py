@@ -4,8 +4,6 @@
 packages gets an index of its own, the library.
 """
 
-from __future__ import annotations
-
 import hashlib
 import html
 import json

@@ -5,8 +5,6 @@ is opened as a file cannot import modules, so each entry point becomes one scrip
 returns its exports, in the order in which a browser would run the modules.
 """
 
-from __future__ import annotations
-
 import base64
 import html
 import json

@@ -4,8 +4,6 @@ HTTP comes from the standard library. Connections are direct (no proxies), stay 
 redirects.
 """
 
-from __future__ import annotations
-
 import contextlib
 import http.client
 import math

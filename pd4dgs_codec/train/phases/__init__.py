@@ -1,7 +1,5 @@
 """The phases of a training run, one module each: what a run does to its model once or a few times, between steps."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 
