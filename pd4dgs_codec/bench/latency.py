@@ -22,8 +22,7 @@ from typing import IO, Any
 from pd4dgs_codec import threads
 from pd4dgs_codec.errors import DataError, DeliveryError
 from pd4dgs_codec.format.info import info
-from pd4dgs_codec.web.client import SceneClient
-from pd4dgs_codec.web.transfer import Transfer
+from pd4dgs_codec.web.client import SceneClient, Transfer
 
 
 @contextlib.contextmanager

@@ -79,7 +79,7 @@ def _input(args: argparse.Namespace, console: Console) -> bytes:
 
     if not is_url(args.input):
         return common.read_bytes(args.input)
-    from pd4dgs_codec.web.transfer import Transfer, fetch
+    from pd4dgs_codec.web.client import Transfer, fetch
 
     with closing(Transfer(args.input)) as transfer:
         try:

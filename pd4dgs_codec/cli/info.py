@@ -69,7 +69,7 @@ def _input(args: argparse.Namespace, console: Console) -> tuple[bytes, int]:
     if not is_url(args.input):
         data = read_bytes(args.input)
         return data, len(data)
-    from pd4dgs_codec.web.transfer import Transfer, fetch
+    from pd4dgs_codec.web.client import Transfer, fetch
 
     with closing(Transfer(args.input)) as transfer:
         data = fetch(transfer, max_bytes=None if args.check or args.bytes or args.hashes else 0)

@@ -1,23 +1,365 @@
-"""The viewer's side of a `.pd4` file on a web server: slices as they arrive, upgrades later, interruptions survived."""
+"""The viewer's side of a `.pd4` file on a web server: its first bytes, and scenes as its slices arrive.
+
+Bytes that have arrived are never requested again unless the file changes. HTTP comes from the standard library.
+Connections are direct (no proxies), stay open between requests, and follow redirects.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import http.client
+import math
+import socket
+import ssl
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent import futures
+from functools import partial
+from http import HTTPStatus
+from typing import TypeVar
+from urllib.parse import SplitResult, quote, urljoin, urlsplit
 
-from pd4dgs_codec.errors import BadSignature, DecodeError, UnsupportedVersion
-from pd4dgs_codec.format.decoder import open_stream
-from pd4dgs_codec.scene import Scene
-from pd4dgs_codec.web.transfer import (
-    HEADER_GUESS,
-    LONGEST_HEADER,
-    MOST_BYTES,
-    Changed,
-    Transfer,
-    check_end,
-    prefix_end,
-    slice_ends,
+from pd4dgs_codec.errors import (
+    BadSignature,
+    DecodeError,
+    DeliveryError,
+    LimitExceeded,
+    Truncated,
+    UnsupportedVersion,
+    one_line,
 )
+from pd4dgs_codec.format.container import PREAMBLE_SIZE, read_preamble
+from pd4dgs_codec.format.decoder import open_stream
+from pd4dgs_codec.format.info import info
+from pd4dgs_codec.format.registry import MAX_HEADER
+from pd4dgs_codec.scene import Scene
+from pd4dgs_codec.web import is_url
+from pd4dgs_codec.web.headers import content_range, strong_etag
+
+BLOCK = 1 << 16
+MAX_REDIRECTS = 5
+#: After so many changes during one transfer the file counts as never stable.
+MAX_CHANGES = 4
+BACKOFF_SECONDS = 0.2
+#: Temporary errors; all others are final.
+TEMPORARY = {408, 425, 429, 500, 502, 503, 504}
+REDIRECTS = {301, 302, 303, 307, 308}
+#: Characters of a server's text that an error message quotes.
+SHOWN = 80
+#: Most headers have some 300 bytes; a longer one costs a second request.
+HEADER_GUESS = 512
+LONGEST_HEADER = PREAMBLE_SIZE + MAX_HEADER
+#: Bytes of a file that are fetched where no budget is given: a header of a few bytes may promise terabytes.
+MOST_BYTES = 1 << 28
+
+T = TypeVar("T")
+
+
+class Changed(Exception):
+    """The file has changed: its earlier bytes are discarded, and the transfer stands at byte 0."""
+
+
+class _Cut(Exception):
+    """The connection ended early, or the response is invalid: a new request may help."""
+
+
+class Transfer:
+    """Fetches one URL front to back, as far as asked, and resumes after interruptions.
+
+    data: bytes that have arrived, from byte 0. total: length of the file, None until known. stall: seconds until a
+    connection without a complete response header, or without a further byte of the body, counts as interrupted.
+    attempts: consecutive failures, without a byte between them, before giving up. requests, cuts, changes: counts.
+    """
+
+    def __init__(self, url: str, *, stall: float = 10.0, attempts: int = 5):
+        self.url, self.stall, self.attempts = url, stall, attempts
+        self.data = bytearray()
+        self.total: int | None = None
+        self.requests = self.cuts = self.changes = 0
+        self._home = self._place = _parsed(url)
+        self._validator: str | None = None
+        self._connection: http.client.HTTPConnection | None = None
+        self._socket: socket.socket | None = None  # http.client forgets it before the last response is read
+        self._response: http.client.HTTPResponse | None = None
+        self._at = 0  # offset in the file of the next byte of the response; bytes that are here are skipped
+        self._response_end: int | None = None  # offset in the file where the response ends, if known
+
+    def read(self, end: int | None = None, *, reach: int | None = None) -> bytes:
+        """The next bytes to arrive, none beyond `end` (None: the end of the file); empty if all are here.
+
+        reach: offset up to which one request may ask, so that later reads need no further request; None: the end.
+        Raises Changed, or DeliveryError if the file is not available.
+        """
+        failures = 0
+        while not self._is_here(end):
+            try:
+                if self._response is None:
+                    self._request(reach)
+                    continue  # the response may say that there is nothing to read
+                block = self._receive(end)
+            except (OSError, http.client.HTTPException, _Cut) as error:
+                self.close()
+                self.cuts += 1
+                failures += 1
+                if failures >= self.attempts or isinstance(error, ssl.SSLCertVerificationError):
+                    message = f"{self.url}: {_reason(error)} ({len(self.data):,} bytes are here)"
+                    raise DeliveryError(message) from None
+                if failures > 1:
+                    time.sleep(BACKOFF_SECONDS * 2 ** (failures - 2))
+                continue
+            except DeliveryError as error:
+                self.close()
+                raise DeliveryError(f"{self.url}: {error}") from None
+            if block:
+                return block
+        return b""
+
+    def rewind(self, size: int) -> None:
+        """Discards all but the first `size` bytes."""
+        del self.data[size:]
+        self.close()
+
+    def close(self) -> None:
+        """Closes the connection. Bytes that have arrived stay; a later read connects again."""
+        if self._socket is not None:
+            with contextlib.suppress(OSError, ValueError):
+                self._socket.shutdown(socket.SHUT_RDWR)  # wakes a thread that still reads from it
+        if self._response is not None:
+            self._response.close()
+        if self._connection is not None:
+            self._connection.close()
+        self._connection = self._socket = self._response = None
+        self._place = self._home
+
+    def _is_here(self, end: int | None) -> bool:
+        size = len(self.data)
+        return (end is not None and size >= end) or (self.total is not None and size >= self.total)
+
+    def _receive(self, end: int | None) -> bytes:
+        """One block of the response; b"" at its regular end and while bytes are skipped."""
+        response, skipped = self._response, len(self.data) - self._at
+        assert response is not None and self._socket is not None
+        limits = [BLOCK]
+        if skipped:
+            limits.append(skipped)
+        elif end is not None:
+            limits.append(end - self._at)
+        if self._response_end is not None:
+            limits.append(self._response_end - self._at)
+        self._socket.settimeout(self.stall)
+        # a chunk's length takes several reads, each with a time limit of its own
+        read = partial(response.read1, min(limits))
+        block = _within(self.stall, read) if response.chunked else read()
+        self._at += len(block)
+        if not skipped:
+            self.data += block
+        if self._at == self._response_end:
+            response.close()  # it is read completely, so the connection can be used again
+            self._response = None
+        elif not block:
+            if skipped or self._response_end is not None:
+                raise _Cut(f"the connection ended early, at byte {self._at:,}")
+            self._response, self.total = None, self._at  # of unknown length: it ends with the connection
+        return b"" if skipped else block
+
+    # -- requests ------------------------------------------------------------------------------------------------------
+
+    def _request(self, reach: int | None) -> None:
+        start = len(self.data)
+        headers = {"Accept-Encoding": "identity", "User-Agent": "pd4dgs"}
+        if start and self._validator is None:  # the rest may belong to another file: fetch all of it again
+            headers["Cache-Control"] = "no-cache"
+        elif start:
+            headers["Range"] = f"bytes={start}-" + ("" if reach is None else str(reach - 1))
+            headers["If-Range"] = str(self._validator)
+        elif reach is not None:
+            headers["Range"] = f"bytes=0-{reach - 1}"
+        for _ in range(MAX_REDIRECTS + 1):
+            response = self._send(headers)
+            if response.status not in REDIRECTS:
+                self._accept(response, start, "Range" in headers)
+                return
+            here, target = self._place.geturl(), response.headers.get("Location")
+            self.close()
+            if target is None:
+                raise DeliveryError("a redirect without a Location")
+            self._place = _parsed(target, here)
+        raise DeliveryError(f"more than {MAX_REDIRECTS} redirects")
+
+    def _send(self, headers: dict[str, str]) -> http.client.HTTPResponse:
+        """The response with its headers. The time limit covers name resolution, connection, TLS and all headers."""
+        if self._connection is None:
+            secure = self._place.scheme == "https"
+            kind = http.client.HTTPSConnection if secure else http.client.HTTPConnection
+            port = self._place.port or kind.default_port  # without one it is looked for in an IPv6 address
+            self._connection = kind(str(self._place.hostname), port, timeout=self.stall)
+        connection, target = self._connection, _target(self._place)
+        self.requests += 1
+
+        def exchange() -> http.client.HTTPResponse:
+            if connection.sock is None:  # new, or closed by the server after its last response
+                try:
+                    connection.connect()
+                except UnicodeError:  # a label too long for a host name
+                    raise OSError(f"{connection.host} is not a host name") from None
+            if connection is not self._connection:
+                connection.close()
+                raise TimeoutError  # the caller has given up
+            self._socket = connection.sock
+            self._socket.settimeout(self.stall)
+            connection.request("GET", target, headers=headers)
+            return connection.getresponse()
+
+        return _within(self.stall, exchange)
+
+    def _accept(self, response: http.client.HTTPResponse, start: int, asked_range: bool) -> None:
+        """Checks a response for bytes from `start` on. Raises Changed if it is about another file than before."""
+        status, part = response.status, content_range(response.headers.get("Content-Range"))
+        if status == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE and asked_range:
+            if start:
+                self._restart()  # the file has become shorter than the bytes that are here
+            self.close()
+            self.total = 0
+            return
+        if status not in (HTTPStatus.OK, HTTPStatus.PARTIAL_CONTENT):
+            said = f"the server answers {status} {one_line(response.reason, SHOWN)}".rstrip()
+            raise (_Cut if status in TEMPORARY else DeliveryError)(said)
+        coding = response.headers.get("Content-Encoding", "identity")
+        if coding.lower() != "identity":
+            raise DeliveryError(f"found Content-Encoding {one_line(coding, SHOWN)}, expected identity")
+        tag = strong_etag(response.headers.get("ETag"))
+        validator = tag or response.headers.get("Last-Modified")
+        self._response, self._at = response, start
+        if status == HTTPStatus.PARTIAL_CONTENT:
+            if not asked_range or part is None or part[0] != start:
+                found = one_line(response.headers.get("Content-Range") or "none", SHOWN)
+                raise _Cut(f"found Content-Range {found}, expected bytes from {start}")
+            other = validator is not None and validator != self._validator
+            if start and (other or part[2] != self.total):
+                self._restart()
+            _, self._response_end, self.total = part
+        else:
+            self._response_end = self.total = response.length
+            self._at = 0
+            if start and (tag is None or tag != self._validator):  # else a server without ranges sends the same file
+                self._restart(keep_response=True, validator=validator)
+        self._validator = validator or self._validator
+
+    def _restart(self, keep_response: bool = False, validator: str | None = None) -> None:
+        """Back to byte 0. keep_response: the current response, with this validator, begins there."""
+        self.data.clear()
+        self.changes += 1
+        self._validator = validator
+        if not keep_response:
+            self.close()
+            self.total = None
+        if self.changes > MAX_CHANGES:
+            raise DeliveryError(f"changed {self.changes} times during the transfer")
+        raise Changed
+
+
+def _within(seconds: float, work: Callable[[], T]) -> T:
+    """The result of `work` in a thread; TimeoutError after `seconds`. Sockets have a time limit for each operation
+    alone, the system's resolver has none."""
+    result: futures.Future[T] = futures.Future()
+
+    def run() -> None:
+        try:
+            result.set_result(work())
+        except BaseException as error:
+            result.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
+    try:
+        return result.result(timeout=seconds)
+    except futures.TimeoutError:
+        raise TimeoutError from None
+
+
+def _parsed(url: str, base: str = "") -> SplitResult:
+    """The parts of an address that can be fetched, if relative from `base` on. Raises DeliveryError for any other."""
+    with contextlib.suppress(ValueError):
+        parts = urlsplit(urljoin(base, url))
+        if is_url(parts.geturl()) and parts.hostname and "@" not in parts.netloc and parts.port != 0:
+            return parts
+    raise DeliveryError(f"found {url!r}, expected http://HOST/PATH or https://HOST/PATH")
+
+
+def _target(place: SplitResult) -> str:
+    query = f"?{quote(place.query, safe='/%:=&?~+!$,;@()*')}" if place.query else ""
+    return quote(place.path or "/", safe="/%:=&~+!$,;'@()*") + query
+
+
+def _reason(error: BaseException) -> str:
+    if isinstance(error, TimeoutError):
+        return "no byte arrived for too long"
+    if isinstance(error, OSError):
+        return error.strerror or one_line(str(error), SHOWN)
+    if isinstance(error, _Cut):
+        return str(error)
+    return f"not an HTTP answer: {one_line(str(error), SHOWN)}".rstrip(": ")
+
+
+# -- prefixes of a .pd4 file -------------------------------------------------------------------------------------------
+
+
+def slice_ends(data: bytes | bytearray) -> list[tuple[int, int]]:
+    """(layer, end offset) of each slice in file order, from a file's first bytes; empty if they end within the
+    header."""
+    size = _header_size(data)
+    layers = [] if size is None else info(bytes(data[:size]))["layers"]
+    return [(row["layer"], part["end"]) for row in layers for part in row["slices"]]
+
+
+def prefix_end(slices: list[tuple[int, int]], max_layer: int | None = None, max_bytes: int | None = None) -> int:
+    """End of the last slice of a layer up to max_layer that ends within max_bytes; 0 if there is none."""
+    layer_limit, limit = (math.inf if most is None else most for most in (max_layer, max_bytes))
+    return max((end for layer, end in slices if layer <= layer_limit and end <= limit), default=0)
+
+
+def check_end(end: int) -> None:
+    """Raise LimitExceeded if a file, or the prefix of it that is asked for, ends too far behind."""
+    if end > MOST_BYTES + 1:
+        raise LimitExceeded(f"ends at byte {end:,}, limit {MOST_BYTES:,} without a budget of bytes")
+
+
+def fetch(transfer: Transfer, max_layer: int | None = None, max_bytes: int | None = None) -> bytes:
+    """The file, or its prefix of layers up to max_layer, or of slices within max_bytes, the header in any case; fewer
+    bytes if the remote file ends early.
+
+    A prefix takes two requests for exactly its bytes, the whole file one. One byte after the last chunk is fetched, so
+    that the decoder sees trailing data. Raises as Transfer.read does, and DecodeError for an invalid header, and for a
+    prefix that ends behind byte MOST_BYTES without max_bytes.
+    """
+    whole = max_layer is None and max_bytes is None
+
+    def fill(end: int) -> bytes:
+        while transfer.read(end, reach=None if whole else end):
+            pass
+        return bytes(transfer.data[:end])
+
+    while True:
+        with contextlib.suppress(Changed):
+            size = _header_size(fill(HEADER_GUESS)) or _header_size(fill(LONGEST_HEADER))
+            if size is None:
+                return bytes(transfer.data)
+            header = bytes(transfer.data[:size])
+            end = info(header)["bytes"] + 1 if whole else prefix_end(slice_ends(header), max_layer, max_bytes)
+            if max_bytes is None:
+                check_end(end)
+            return fill(max(end, size))
+
+
+def _header_size(data: bytes | bytearray) -> int | None:
+    """Bytes of preamble and header; None if `data`, the first bytes of a file, ends within them."""
+    try:
+        return read_preamble(data).size
+    except Truncated:
+        return None
+
+
+# -- scenes as slices arrive -------------------------------------------------------------------------------------------
 
 
 class SceneClient:

@@ -6,7 +6,7 @@ import pytest
 from faulty import Fault, FaultyServer
 
 from pd4dgs_codec.format.container import read_preamble
-from pd4dgs_codec.web.transfer import HEADER_GUESS, slice_ends
+from pd4dgs_codec.web.client import HEADER_GUESS, slice_ends
 
 
 def test_info_reads_the_header_alone(cli, folder, scene_bytes):
@@ -67,7 +67,7 @@ def test_a_server_without_ranges_serves_prefixes_too(cli, scene_bytes):
 
 
 def test_partial_files_and_failing_links(cli, scene_bytes, monkeypatch):
-    monkeypatch.setattr("pd4dgs_codec.web.transfer.BACKOFF_SECONDS", 0.0)
+    monkeypatch.setattr("pd4dgs_codec.web.client.BACKOFF_SECONDS", 0.0)
     cut = slice_ends(scene_bytes)[1][1] + 5
     with FaultyServer(scene_bytes[:cut]) as server:
         assert cli("decode", server.url).code == 1

@@ -33,9 +33,8 @@ from pd4dgs_codec.format import canonical
 from pd4dgs_codec.format.container import read_preamble, write_preamble
 from pd4dgs_codec.format.header import scene_id_of
 from pd4dgs_codec.scene import Scene
-from pd4dgs_codec.web.client import SceneClient
+from pd4dgs_codec.web.client import MAX_CHANGES, SceneClient, Transfer, fetch, slice_ends
 from pd4dgs_codec.web.server import Link, Server
-from pd4dgs_codec.web.transfer import MAX_CHANGES, Transfer, fetch, slice_ends
 
 SAME = {"ETag": '"same"'}
 

@@ -12,8 +12,7 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from pd4dgs_codec.errors import DeliveryError, Pd4Error
-from pd4dgs_codec.web import transfer
-from pd4dgs_codec.web.client import SceneClient
+from pd4dgs_codec.web.client import SceneClient, Transfer
 
 FILE = bytes(range(256)) * 4
 WHOLE = b'HTTP/1.1 200 OK\r\nContent-Length: %d\r\nETag: "a"\r\n\r\n' % len(FILE) + FILE
@@ -115,7 +114,7 @@ def reply_at_random(rng: random.Random) -> bytes:
 def test_replies_at_random_end_with_the_file_or_an_error_of_one_line(seed, count, monkeypatch):
     rng = random.Random(seed)
     replies: list[bytes] = []
-    monkeypatch.setattr(transfer, "BACKOFF_SECONDS", 0.0)
+    monkeypatch.setattr("pd4dgs_codec.web.client.BACKOFF_SECONDS", 0.0)
     with answering(lambda c: c.sendall(replies.pop()) if replies else None) as url:
         for i in range(count):
             replies[:] = given = [reply_at_random(rng) for _ in range(3)]
@@ -130,4 +129,4 @@ def test_replies_at_random_end_with_the_file_or_an_error_of_one_line(seed, count
 
 def test_the_plain_answer_is_taken():
     with answering(lambda c: c.sendall(WHOLE)) as url:
-        assert transfer.Transfer(url).read(len(FILE)) == FILE
+        assert Transfer(url).read(len(FILE)) == FILE
