@@ -22,9 +22,9 @@ def assert_same_weights(path, other) -> None:
 
 def assert_resumes_bit_for_bit(config, dataset, folder, cuts) -> None:
     """Runs cut before each of the steps `cuts` and resumed end as the one in folder/whole.pt."""
-    for cut in cuts:
-        part = Trainer(config, dataset)
-        for _ in range(cut):
+    part = Trainer(config, dataset)
+    for cut in sorted(cuts):
+        while part.iteration < cut:
             part.learner.step()
         part.save(folder / "part.pt")
         resumed = Trainer(config, dataset)

@@ -17,7 +17,7 @@ def test_bytes_rise_with_the_dial(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(phases, "MIN_ITERATIONS", 10)
     files, sizes, psnr = [], [], []
     for quality in (0, 100):
-        trainer = Trainer(TrainConfig(preset="tiny", iterations=90, **at_quality(quality)), dataset)
+        trainer = Trainer(TrainConfig(preset="tiny", iterations=60, **at_quality(quality)), dataset)
         trainer.run(tmp_path / "m.pt")
         model = trainer.model
         levels = level_psnr(

@@ -27,6 +27,7 @@ from pd4dgs_codec.entropy.priors import (
     Normal,
     Prior,
     Window,
+    normal_tables,
 )
 from pd4dgs_codec.entropy.varint import put_varint, put_zigzag
 from pd4dgs_codec.format import canonical
@@ -131,7 +132,7 @@ def coded(
     some channels, by their number. known: definitions of the slices before, to which those of this section are added.
     """
     block, defined = b"", [] if known is None else known
-    tables, parts = list[tuple[np.ndarray, np.ndarray]](), list[tuple[np.ndarray, np.ndarray]]()
+    tables, parts = list[tuple[np.ndarray, np.ndarray]](), list[tuple[np.ndarray, Prior]]()
     for number, channel in enumerate(channels):
         k = np.asarray(channel, np.int64)
         if not k.size:
@@ -151,8 +152,18 @@ def coded(
                 tables.append((prior.height_symbols, prior.height_cum))
         if not inside.all():
             block += _exceptions(k, inside, window)
-        parts.append((k[inside] - window.kmin, prior.cum))
-    return block + ans_encode([symbols for symbols, _ in tables + parts], [cum for _, cum in tables + parts])
+        parts.append((k[inside] - window.kmin, prior))
+    tables += zip([symbols for symbols, _ in parts], _tables([prior for _, prior in parts]), strict=True)
+    return block + ans_encode([symbols for symbols, _ in tables], [cum for _, cum in tables])
+
+
+def _tables(priors: Sequence[Prior]) -> list[np.ndarray]:
+    """`cum` of each, of Gaussians in one pass: one by one they take a fifth of the time of making the vectors."""
+    if not priors:
+        return []
+    cums, sizes = normal_tables(priors)
+    of_each = np.split(cums, np.cumsum(sizes + 1))
+    return [prior.cum if isinstance(prior, Hist) else own for prior, own in zip(priors, of_each, strict=False)]
 
 
 def _exceptions(k: np.ndarray, inside: np.ndarray, window: Window) -> bytes:
