@@ -3,6 +3,9 @@
 Every message says what was found, what was expected, and where.
 """
 
+from importlib import import_module
+from typing import Any
+
 LONGEST = 400  #: characters of a message; beyond, its middle is left out
 
 
@@ -113,3 +116,13 @@ class Malformed(DecodeError):
 
 class LimitExceeded(DecodeError):
     """A declared count or size is over the format's limits; nothing was allocated for it."""
+
+
+def required(name: str, extra: str, what: str) -> Any:
+    """The module `name` of one of the package's extras, which `what` (a plural) need. Raises DataError if it cannot be
+    imported."""
+    try:
+        return import_module(name)
+    except ImportError:
+        how = f"pip install 'pd4dgs-codec[{extra}]'"
+        raise DataError(f"{what} need the package {name}, which is not installed: {how}") from None

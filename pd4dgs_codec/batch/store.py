@@ -12,11 +12,10 @@ import posixpath
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from importlib.util import find_spec
 from pathlib import Path
 from typing import IO, Any
 
-from pd4dgs_codec.errors import DataError, one_line
+from pd4dgs_codec.errors import DataError, one_line, required
 from pd4dgs_codec.io import check_source, is_device, write_bytes
 from pd4dgs_codec.web.headers import media_type
 
@@ -35,7 +34,7 @@ FINAL = (FileNotFoundError, FileExistsError, PermissionError, IsADirectoryError,
 def absolute(place: str) -> str:
     """An absolute path, for workers in other folders; URIs stay, and nothing is asked of their store. Raises DataError
     for an unknown scheme."""
-    _need_fsspec()
+    required("fsspec", "cluster", "batches")
     from fsspec import available_protocols
     from fsspec.core import split_protocol
 
@@ -48,14 +47,9 @@ def absolute(place: str) -> str:
     return place
 
 
-def _need_fsspec() -> None:
-    if find_spec("fsspec") is None:
-        raise DataError("batches need the package fsspec: pip install 'pd4dgs-codec[cluster]'")
-
-
 def _system(place: str) -> tuple[Any, str, bool]:
     """(file system, path in it, whether it is this machine's)."""
-    _need_fsspec()
+    required("fsspec", "cluster", "batches")
     from fsspec.core import url_to_fs
     from fsspec.implementations.local import LocalFileSystem
 

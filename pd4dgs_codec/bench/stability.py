@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.bench.report import markdown, optional
-from pd4dgs_codec.errors import DataError, Pd4Error
+from pd4dgs_codec.errors import Pd4Error, required
 from pd4dgs_codec.scene import Camera, Deformation, Network, Scene, SceneInfo, Steps, Widths
 
 PASS, REFUSED, FAIL = "pass", "refused", "fail"
@@ -105,11 +105,7 @@ def text(rows: Sequence[Row]) -> str:
 
 def mpmath() -> Any:
     """The library of the high-precision references. Raises DataError if it is not installed."""
-    try:
-        return import_module("mpmath")
-    except ModuleNotFoundError:
-        message = "the references of the stability table need mpmath, which is not installed"
-        raise DataError(f"{message}: pip install 'pd4dgs-codec[test]'") from None
+    return required("mpmath", "test", "the references of the stability table")
 
 
 def largest(errors: Iterable[float]) -> float:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from pd4dgs_codec.cli import common, options
 from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError
 from pd4dgs_codec.cli.progress import progress_bar
-from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.errors import DataError, required
 from pd4dgs_codec.io import whole_files
 
 if TYPE_CHECKING:
@@ -46,6 +46,7 @@ examples:
 
 SEQUENCES = ("ply-seq", "4dgs")
 KINDS = ("ply", "ply-seq", "spz", "glb", "4dgs")
+LIBRARIES = {"spz": "gaussforge", "4dgs": "fourdgs"}
 FPS, STEPS, MAX_FRAMES = 30.0, 300, 100_000
 
 
@@ -81,12 +82,10 @@ def _export(args: argparse.Namespace, console: Console) -> int:
     else:
         common.check_output(args.output, args.overwrite)
     from pd4dgs_codec.interchange.export import Export
-    from pd4dgs_codec.interchange.formats import library
+    from pd4dgs_codec.interchange.formats import EXTRA
 
-    if args.to == "spz":
-        library("gaussforge", "SPZ files")
-    if args.to == "4dgs":
-        library("fourdgs", ".4dgs files")
+    if args.to in LIBRARIES:
+        required(LIBRARIES[args.to], EXTRA, f"{args.to} files")
     player = _player(args)
     if args.refine is None:
         args.refine = 0 if player.shapes_are_blind else STEPS

@@ -19,7 +19,7 @@ import numpy as np
 
 from pd4dgs_codec.cli.progress import TrainingProgress
 from pd4dgs_codec.data.cameras import rotation_matrix, world_to_camera
-from pd4dgs_codec.errors import RenderError, TrainError
+from pd4dgs_codec.errors import RenderError, TrainError, required
 from pd4dgs_codec.scene import Camera
 
 if TYPE_CHECKING:
@@ -63,14 +63,9 @@ class WatchedProgress(TrainingProgress):
     """The terminal's progress, and a page that shows the scene from the cameras of its viewers."""
 
     def __init__(self, trainer: Trainer, port: int) -> None:
-        """Raises TrainError if viser is not installed or the port cannot be used."""
+        """Raises DataError if viser is not installed, TrainError if the port cannot be used."""
         super().__init__()
-        try:
-            import viser
-        except ImportError:
-            raise TrainError(
-                "--view needs the package viser, which is not installed: pip install 'pd4dgs-codec[watch]'"
-            ) from None
+        viser = required("viser", "watch", "pages of a training")
         try:
             with contextlib.redirect_stdout(io.StringIO()), _own_pages_alone():  # a banner; stdout is for results
                 self.server = viser.ViserServer(host=HOST, port=port, label="pd4dgs-train", verbose=False)

@@ -13,7 +13,6 @@ import struct
 import sys
 import zlib
 from collections.abc import Iterator, Sequence
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +20,10 @@ import numpy as np
 
 from pd4dgs_codec.archives import read_tensors
 from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, LARGEST, read_file, read_vertices
-from pd4dgs_codec.errors import DataError, one_line
+from pd4dgs_codec.errors import DataError, one_line, required
 from pd4dgs_codec.interchange.splats import MAX_DEGREE, SH_C0, Splats, unit
 
+EXTRA = "interchange"  #: of gaussforge and fourdgs
 #: Coefficients of the harmonics without the constant, by degree.
 REST = {(degree + 1) ** 2 - 1: degree for degree in range(MAX_DEGREE + 1)}
 #: PLY files store opacities as logits and scales as logarithms, of values within these bounds.
@@ -69,15 +69,6 @@ def finite_rows(parts: dict[str, np.ndarray]) -> np.ndarray:
     """bool [n]: the rows of arrays [n, ...] that hold numbers up to LARGEST alone."""
     found = [(np.abs(array) <= LARGEST).all(axis=tuple(range(1, array.ndim))) for array in parts.values()]  # not NaN
     return np.asarray(np.logical_and.reduce(found))
-
-
-def library(name: str, what: str) -> Any:
-    """A module of the extra `interchange`. Raises DataError if it is not installed."""
-    try:
-        return import_module(name)
-    except ImportError:
-        how = "pip install 'pd4dgs-codec[interchange]'"
-        raise DataError(f"{what} need the package {name}, which is not installed: {how}") from None
 
 
 @contextlib.contextmanager
@@ -145,7 +136,7 @@ def activated(parameters: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def _unpacked(path: Path, kind: str) -> bytes:
     """An SPZ file or a compressed PLY converted to PLY by gaussforge."""
-    forge = library("gaussforge", "SPZ files and compressed PLYs").GaussForge()
+    forge = required("gaussforge", EXTRA, "SPZ files and compressed PLYs").GaussForge()
     data = read_file(path)
     if kind == "spz":
         _check_spz(path, data)
@@ -286,7 +277,8 @@ def spz_bytes(splats: Splats) -> bytes:
         found = f"a Gaussian lies {reach:.4g} units from 0"
         raise DataError(f"{found}, SPZ holds {SPZ_REACH:g} at most: --scale less than 1")
     with quiet():
-        result = library("gaussforge", "SPZ files").GaussForge().convert(ply_bytes(splats), "ply", "spz", spz_version=3)
+        forge = required("gaussforge", EXTRA, "SPZ files").GaussForge()
+        result = forge.convert(ply_bytes(splats), "ply", "spz", spz_version=3)
     if "error" in result:
         raise DataError(f"gaussforge cannot write this SPZ file: {result['error']}")
     return bytes(result["data"])
@@ -297,7 +289,7 @@ def fourdgs_bytes(frames: Sequence[tuple[float, Splats, np.ndarray]], seconds: f
 
     frames: (start in seconds, Gaussians, their slots int64 [N]), ascending from 0.
     """
-    fourdgs = library("fourdgs", ".4dgs files")
+    fourdgs = required("fourdgs", EXTRA, ".4dgs files")
     starts = [start for start, _, _ in frames]
     ends = [*starts[1:], seconds]
     parts: dict[str, list[np.ndarray]] = {}

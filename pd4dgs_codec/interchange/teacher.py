@@ -31,8 +31,8 @@ from pd4dgs_codec.data.dataset import color, load
 from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, last_numbers, read_file, split_options
 from pd4dgs_codec.data.posed import depth_range, held_out, normalised_times, points_box, seconds_range
 from pd4dgs_codec.data.view import Dataset, View
-from pd4dgs_codec.errors import DataError, one_line
-from pd4dgs_codec.interchange.formats import SH_SPAN, checked, library, read_gsplat, read_splats
+from pd4dgs_codec.errors import DataError, one_line, required
+from pd4dgs_codec.interchange.formats import EXTRA, SH_SPAN, checked, read_gsplat, read_splats
 from pd4dgs_codec.interchange.runs import read_cameras, read_deformed
 from pd4dgs_codec.interchange.splats import SH_C0, Splats, looking, picture, sphere, spread
 from pd4dgs_codec.quality.frames import shrunk
@@ -241,7 +241,7 @@ def _folder(folder: Path, fps: float) -> Teacher:
 
 def _fourdgs(path: Path) -> Teacher:
     """A .4dgs file over its whole time."""
-    fourdgs = library("fourdgs", ".4dgs files")
+    fourdgs = required("fourdgs", EXTRA, ".4dgs files")
     data = read_file(path)
     most = FREE_BYTES + INFLATES * len(data)
     if _numbers(data, most) > most:

@@ -10,14 +10,13 @@ from __future__ import annotations
 import signal
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import import_module
 from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.errors import DataError, one_line
+from pd4dgs_codec.errors import DataError, one_line, required
 from pd4dgs_codec.prepare.frames import Advance
 from pd4dgs_codec.signals import ENDING
 
@@ -46,11 +45,7 @@ REACH = 0.03
 
 def colmap() -> Any:
     """pycolmap, without its log and with a fixed seed. Raises DataError if it is not installed."""
-    try:
-        module = import_module("pycolmap")
-    except ImportError:
-        how = "pip install 'pd4dgs-codec[prepare]'"
-        raise DataError(f"camera poses need the package pycolmap, which is not installed: {how}") from None
+    module = required("pycolmap", "prepare", "camera poses")
     for number in ENDING:  # its C++ prints a stack where SIGTERM comes
         if (handler := signal.getsignal(number)) is not None:
             signal.signal(number, handler)

@@ -12,7 +12,7 @@ from tiny import TINY, disc
 from pd4dgs_codec.cli import watch
 from pd4dgs_codec.cli.train import main
 from pd4dgs_codec.cli.watch import RESTING_PIXELS, WatchedProgress, camera_of
-from pd4dgs_codec.errors import TrainError
+from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.loop import Trainer
@@ -155,7 +155,7 @@ def test_being_watched_changes_no_bit(dataset, trainer, watched):
 
 def test_without_viser_it_is_one_line(trainer, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "viser", None)
-    with pytest.raises(TrainError, match=r"needs the package viser.*\[watch\]"):
+    with pytest.raises(DataError, match=r"need the package viser.*\[watch\]"):
         WatchedProgress(trainer, 0)
 
 
