@@ -25,10 +25,10 @@ from typing import Any
 
 import codec
 import delivery
-import judge
 import paper
 import quality
 import refining_gif
+import selection
 from common import QUICK, ROOT, SCENES, Benchmark, Row, Run, commit, git, present, say
 from page import write
 
@@ -38,7 +38,7 @@ from pd4dgs_codec.errors import DataError, Pd4Error
 ALL = (
     quality.BENCHMARK,
     delivery.SLICES,
-    judge.BENCHMARK,
+    selection.BENCHMARK,
     paper.PAPER,
     paper.DIAL,
     codec.STABILITY,

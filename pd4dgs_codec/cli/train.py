@@ -33,8 +33,7 @@ the more the layers differ; uniform samples all levels alike; fixed samples them
 trains only the highest level; all trains every level in every step, at about three times the cost. The first tenth of a
 run trains level 0 in any case.
 --without: rate, the bit-rate terms; planes, the bit-rate term of the planes; binary and smooth, the two mask terms;
-tmc, both of them; noise, the simulated quantisation; whitening, the transform of the feature channels; judge, the
-removal of levels that gain too little on held-back training views.
+tmc, both of them; noise, the simulated quantisation; whitening, the transform of the feature channels.
 
 torchrun starts several workers that train one scene: they share the V views of a step and average their gradients, and
 the first worker writes the files. Their number must divide V. A run may be resumed with another number of workers.
@@ -78,13 +77,17 @@ def _add_fields(p: options.Parser) -> None:
         about = OPTIONS.get(field.name)
         if about is None or not about.help:
             continue
+        name = f"--{field.name.replace('_', '-')}"
+        if field.type == "bool":
+            p.add_argument(name, action="store_const", const=True, help=about.help)
+            continue
         kind = {"int": int, "float": float}.get(str(field.type).split(" ")[0], str)
         at = " at quality 50" if about.dial else ""
         what = about.help if field.default is None else f"{about.help} (default: {field.default}{at})"
         settings: dict[str, Any] = {"type": kind, "choices": about.choices}
         if not about.choices:
             settings = {"type": options.checked(kind, about.contains, about.range), "metavar": about.metavar}
-        p.add_argument(f"--{field.name.replace('_', '-')}", help=what, **settings)
+        p.add_argument(name, help=what, **settings)
 
 
 def _train(args: argparse.Namespace, console: Console) -> int:

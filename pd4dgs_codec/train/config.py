@@ -34,7 +34,6 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "tmc": {"tmc_binary": False, "tmc_smooth": False},
     "noise": {"noise": False},
     "whitening": {"whitening": False},
-    "judge": {"judge": False},
 }
 
 #: The steps that `step_scale` multiplies. Offsets and weights cost more quality per byte than any of these.
@@ -187,8 +186,9 @@ class TrainConfig:
     )
     #: 0 is a static scaffold, 1 a scaffold with its global deformation
     max_layer: int = option(2, help="train without the layers above this one", choices=(0, 1, 2))
-    #: leave out levels that gain too little on held-back training views, see `phases.levels`
-    judge: bool = True
+    keep_layers: bool = option(
+        False, help="keep all layers, those too that gain little on training views held back for it"
+    )
     prune: float = option(
         0.14,
         help="prune anchors half way through the run, as long as together they add at most this share to the squared "

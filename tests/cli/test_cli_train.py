@@ -59,7 +59,7 @@ def test_train_reports_and_logs(train, tmp_path, shared_dataset):
 def test_options_reach_the_configuration(train, tmp_path):
     options = ("--seed", 7, "--downscale", 2, "--holdout", 3, "--rate-scale", 0.5, "--rollout", "fixed")
     options += ("--without", "noise", "--without", "tmc", "--max-layer", 1, "--prune", 0.1)
-    options += ("--feature-width", 5, "--slots", 3)
+    options += ("--feature-width", 5, "--slots", 3, "--keep-layers")
     assert train(tmp_path / "m.pt", *options, iterations=1).code == 0
     config = json.loads(checkpoint.load(tmp_path / "m.pt")[1]["config"])
     found = [
@@ -68,7 +68,7 @@ def test_options_reach_the_configuration(train, tmp_path):
     scene = to_scene(checkpoint.load(tmp_path / "m.pt")[0])
     assert scene.widths == decode(encode(scene)).widths == Widths(5, 3, viewing=("color",))
     assert found == [7, 2, 3, 0.5, "fixed", "tiny", 1, 0.1]
-    assert not (config["noise"] or config["tmc_binary"] or config["tmc_smooth"])
+    assert not (config["noise"] or config["tmc_binary"] or config["tmc_smooth"]) and config["keep_layers"]
 
 
 def test_the_quality_sets_the_dial_and_single_options_replace_parts_of_it(train, tmp_path):
@@ -115,6 +115,7 @@ def test_resume_refuses_what_contradicts_the_checkpoint(cli, train, tmp_path, sh
         "--preset": ("--preset", "small"),
         "--without noise": ("--without", "noise"),
         "--max-layer": ("--max-layer", 1),
+        "--keep-layers": ("--keep-layers",),
         "--background": ("--background", "white"),
         "--feature-width": ("--feature-width", 16),
     }

@@ -96,7 +96,7 @@ def test_short_runs_and_few_views_have_no_measured_phases(dataset, tmp_path, mon
     monkeypatch.setattr(opening, "MIN_TRIAL", 3)
     monkeypatch.setattr(levels, "MIN_PRACTICE", 3)
     assert held_back_views(trainer.learner) == {8, 24, 40, 56}
-    for off in ({"judge": False}, {"max_layer": 0}, {"rollout": "top"}):
+    for off in ({"keep_layers": True}, {"max_layer": 0}, {"rollout": "top"}):
         assert not held_back_views(trainer_of(views, **off).learner)
     assert not held_back_views(trainer_of(replace(dataset, train=dataset.train * 8)).learner)
 

@@ -126,7 +126,7 @@ def held_back_views(state: TrainState) -> set[int]:
     """Indices of the training views by which levels are selected, unseen until then; none if nothing is selected or
     the length of the run is not known yet."""
     config = state.config
-    selects = config.judge and config.max_layer > 0 and config.rollout != "top" and phases.long_enough(state)
+    selects = not config.keep_layers and config.max_layer > 0 and config.rollout != "top" and phases.long_enough(state)
     views = set(range(EVERY // 2, len(state.views), EVERY)) if selects else set()
     return views if len(views) >= MIN_VIEWS else set()
 
