@@ -164,7 +164,6 @@ class Local(Engine):
         return future
 
     def kill(self, future: Future[Outcome]) -> None:
-        """Ends the process."""
         self._end([future])
 
     def _end(self, futures: list[Future[Outcome]]) -> None:
@@ -234,17 +233,14 @@ class Ray(Engine):
         self.quiet.enter_context(contextlib.redirect_stdout(sys.stderr))  # Ray prints of dead workers; stdout is JSON's
 
     def start(self, jobs: list[Job]) -> list[Future[Outcome]]:
-        """As tasks."""
         started = {(reference := self.task.remote(self.work, job)).future(): reference for job in jobs}
         self.references |= started
         return list(started)
 
     def kill(self, future: Future[Outcome]) -> None:
-        """Kills the worker."""
         self.ray.cancel(self.references[future], force=True)
 
     def close(self) -> None:
-        """Leaves the cluster."""
         self.ray.shutdown()
         self.quiet.close()
 
@@ -294,7 +290,6 @@ class Slurm(Engine):
         threading.Thread(target=self._watch, daemon=True).start()
 
     def start(self, jobs: list[Job]) -> list[Future[Outcome]]:
-        """As one array."""
         if not jobs:
             return []
         try:
@@ -320,7 +315,6 @@ class Slurm(Engine):
             time.sleep(POLL_SECONDS)
 
     def close(self) -> None:
-        """Cancels all jobs."""
         for task in list(self.tasks.values()):
             task.cancel()
 

@@ -54,7 +54,6 @@ examples:
 
 
 def parser() -> options.Parser:
-    """The options of `pd4dgs-batch`."""
     p = options.Parser("batch", "MANIFEST --op OP -o URI", "Run a command on every scene of a library.", DETAILS)
     add = p.add_argument
     add("input", metavar="MANIFEST", help="file of JSON lines, see below")
@@ -80,7 +79,6 @@ def parser() -> options.Parser:
 
 
 def scan_parser() -> options.Parser:
-    """The options of `pd4dgs-batch scan`."""
     p = options.Parser("batch scan", "FOLDER", "Write a manifest of the sources in a folder.", SCAN_DETAILS)
     p.add_argument("input", metavar="FOLDER", help="folder or URI")
     p.add_argument("--op", choices=VERBS, help="the command of the manifest (default: by the kind of sources found)")
@@ -97,7 +95,6 @@ def _parameter(text: str) -> tuple[str, str]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments[:1] == ["scan"]:
         return run(scan_parser(), _scan, arguments[1:])

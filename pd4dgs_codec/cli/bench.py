@@ -355,7 +355,6 @@ def parser(name: str | None = None) -> options.Parser:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments or arguments[0] not in REPORTS:
         return common.run(parser(), _misplaced, arguments)

@@ -33,7 +33,6 @@ exit code 3: cut input, decoded as far as possible (--allow-partial)"""
 
 
 def parser() -> options.Parser:
-    """The options of `pd4dgs-decode`."""
     p = options.Parser("decode", "[scene.pd4] [-o FILE]", "Unpack a .pd4 file, or its first layers.", DETAILS)
     add = p.add_argument
     add("input", nargs="?", default=STDIO, metavar="scene.pd4", help="file or URL; - or nothing reads stdin")

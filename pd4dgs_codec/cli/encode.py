@@ -50,7 +50,6 @@ HELP = {
 
 
 def parser() -> options.Parser:
-    """The options of `pd4dgs-encode`."""
     p = options.Parser("encode", "model.pt -o FILE.pd4", "Encode a trained scene as a layered .pd4 file.", DETAILS)
     add = p.add_argument
     add("input", metavar="model.pt", help="checkpoint of pd4dgs-train, or a .pd4 file to encode again; - reads stdin")

@@ -26,7 +26,6 @@ examples:
 
 
 def parser() -> options.Parser:
-    """The options of `pd4dgs-eval`."""
     p = options.Parser("eval", "FILE SOURCE", "Measure quality, bytes and time of each level on a dataset.", DETAILS)
     p.add_argument("input", metavar="FILE", help=".pd4 file or .pt checkpoint; - reads a .pd4 from stdin")
     p.add_argument("source", metavar="SOURCE", help="dataset to compare with, see below")

@@ -51,7 +51,6 @@ FPS, STEPS, MAX_FRAMES = 30.0, 300, 100_000
 
 
 def parser() -> options.Parser:
-    """The options of `pd4dgs-export`."""
     p = options.Parser("export", "FILE -o OUT --to KIND", "Write a scene as Gaussians for other viewers.", DETAILS)
     p.add_argument("input", metavar="FILE", help=".pd4 file; - reads it from stdin")
     p.add_argument("-o", "--output", required=True, metavar="OUT", help="file to write; with ply-seq a folder")

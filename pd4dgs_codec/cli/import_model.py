@@ -21,7 +21,6 @@ examples:
 
 
 def parser() -> options.Parser:
-    """The options of `pd4dgs-import`."""
     p = options.Parser("import", "FOLDER -o model.pt", "Import a Scaffold-GS model.", DETAILS)
     p.add_argument("input", metavar="FOLDER", help="the checkpoint")
     p.add_argument("-o", "--output", required=True, metavar="model.pt", help="checkpoint to write")

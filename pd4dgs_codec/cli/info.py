@@ -25,7 +25,6 @@ DETAIL_KEYS = ("steps", "planes", "networks")
 
 
 def parser() -> options.Parser:
-    """The options of `pd4dgs-info`."""
     p = options.Parser("info", "FILE", "Show the header and layers of a .pd4 file.", DETAILS)
     p.add_argument("input", metavar="FILE", help=".pd4 file or its URL; - reads stdin")
     p.add_argument("--check", action="store_true", help="decode the whole file: check every checksum and rule")

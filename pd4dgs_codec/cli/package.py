@@ -45,7 +45,6 @@ FRAGMENT_SECONDS = 2
 
 
 def parser() -> options.Parser:
-    """The options of `pd4dgs-package`."""
     summary = "Make a folder for web servers: a page that plays the scene, DASH, HLS."
     p = options.Parser("package", "scene.pd4 -o DIR", summary, DETAILS)
     p.add_argument("input", metavar="scene.pd4", help="file to package (- reads stdin), or a folder of packages")

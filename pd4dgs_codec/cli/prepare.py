@@ -26,7 +26,6 @@ examples:
 
 
 def parser() -> options.Parser:
-    """The options of `pd4dgs-prepare`."""
     p = options.Parser("prepare", "INPUT -o FOLDER", "Estimate the camera poses of a recording.", DETAILS)
     add = p.add_argument
     add("input", metavar="INPUT", help="a video, or a folder of frames")

@@ -50,7 +50,6 @@ class TrainingProgress:
         self.bar: Any = None
 
     def update(self, trainer: Trainer, record: dict[str, Any]) -> None:
-        """Called after every step with its log record."""
         psnr = "/".join(f"{value:.2f}" for value in trainer.curve[-1]["psnr"]) if trainer.curve else ""
         if self.stream.isatty():
             self._bar(trainer).set_postfix_str(f"{record['anchors']} anchors {psnr} dB" if psnr else "", refresh=False)
@@ -61,12 +60,10 @@ class TrainingProgress:
             say(f"{steps}, {trainer.seconds:.0f}{limit} s: {psnr} dB, {record['anchors']} anchors")
 
     def on_trial(self, done: int, steps: int) -> None:
-        """Called before every step on trial with the steps done and their number."""
         if self.bar is not None:
             self.bar.set_postfix_str(f"trial of motion or levels: step {done + 1}/{steps}")
 
     def close(self) -> None:
-        """Removes the bar."""
         if self.bar is not None:
             self.bar.close()
 

@@ -37,7 +37,6 @@ VIDEOS = (".gif", ".mp4")
 
 
 def parser() -> options.Parser:
-    """The options of `pd4dgs-render`."""
     p = options.Parser("render", "FILE -o OUT", "Render a .pd4 file or a checkpoint to images or a video.", DETAILS)
     p.add_argument("input", metavar="FILE", help=".pd4 file or .pt checkpoint; - reads a .pd4 from stdin")
     what = "images such as out/%%04d.png, or a .gif or .mp4"

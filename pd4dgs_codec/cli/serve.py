@@ -22,7 +22,6 @@ examples:
 
 
 def parser() -> options.Parser:
-    """The options of `pd4dgs-serve`."""
     p = options.Parser("serve", "DIR", "Serve a folder over HTTP, at the rate of a slow link if asked for.", DETAILS)
     p.add_argument("input", metavar="DIR", help="folder to serve")
     p.add_argument("--host", default="127.0.0.1", metavar="H", help="address to listen on (default: 127.0.0.1)")

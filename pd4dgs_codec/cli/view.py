@@ -27,7 +27,6 @@ PACKING_EFFORT = 1
 
 
 def parser() -> options.Parser:
-    """The options of `pd4dgs-view`."""
     p = options.Parser("view", "SCENE", "Show a scene in the browser.", DETAILS)
     p.add_argument("input", metavar="SCENE", help=".pd4 file, .pt checkpoint or URL of a .pd4; - reads stdin")
     p.add_argument("-o", "--output", metavar="FILE", help="write one HTML file that shows the scene, and do not serve")

@@ -92,7 +92,6 @@ class WatchedProgress(TrainingProgress):
         self.curve: Any = None
 
     def update(self, trainer: Trainer, record: dict[str, Any]) -> None:
-        """Called after every step."""
         super().update(trainer, record)
         clients = self.server.get_clients()
         if not clients:

@@ -210,7 +210,6 @@ class _Text:
         return ((i, line.strip()) for i, line in enumerate(self.raw, 1) if not line.startswith("#"))
 
     def cameras(self) -> Iterator[tuple[int, Lens]]:
-        """Lenses with their numbers."""
         for i, line in self.lines:
             if line:
                 key, model, *words = [*line.split(), "", ""][: max(2, len(line.split()))]
@@ -233,7 +232,6 @@ class _Text:
             yield words[9], self._whole(i, values[8]), values[1:8]
 
     def points(self) -> Iterator[tuple[float, ...]]:
-        """Rows x y z r g b."""
         return (tuple(self._values(i, line.split()[1:7], 6)) for i, line in self.lines if line)
 
     def _whole(self, i: int, value: float) -> int:

@@ -263,7 +263,7 @@ class _RowBits(torch.autograd.Function):
 
 
 def _sums(values: Array, classes: Array, centre: Array, power: int) -> Array:
-    """float64 [K, c]: those of `rate__class_sums`."""
+    """float64 [K, c]: those of `_class_sums`."""
     parts = np.zeros((-(-len(values) // _BLOCK), *centre.shape))
     _class_sums(parts, values, classes, centre, power)
     total: Array = parts.sum(0)

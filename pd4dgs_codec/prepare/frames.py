@@ -97,7 +97,6 @@ class FrameFolder:
         self.size = image_info(self.files[0])[:2]
 
     def looks(self) -> Iterator[np.ndarray]:
-        """Every frame, small and grey, uint8 [h, w]."""
         k = max(1, -(-self.size[0] // LOOK_WIDTH))
         for file in self.files:
             yield read_image(file, self.size, downscale=k).mean(axis=2).astype(np.uint8)

@@ -83,7 +83,6 @@ class Optimiser:
                 p.grad = g if p.grad is None else p.grad.add_(g)
 
     def zero_grad(self) -> None:
-        """Drops all gradients."""
         for p in self.parameters:
             p.grad = None
 

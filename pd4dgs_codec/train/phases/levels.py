@@ -94,7 +94,6 @@ class SelectLevels(phases.Phase):
         return {"left_out": json.dumps(self.left_out)}
 
     def restore(self, stored: Mapping[str, Any]) -> None:
-        """The inverse of `stored`."""
         self.left_out = list(json.loads(stored["left_out"]))
 
 

@@ -60,7 +60,6 @@ class Prefixes(Phase):
         return {"rank": torch.empty(0) if self.rank is None else self.rank}
 
     def restore(self, stored: Mapping[str, Any]) -> None:
-        """The inverse of `stored`."""
         self.rank = stored["rank"] if len(stored["rank"]) else None
         if self.rank is not None and self.rank.shape != stored["densifier"]["opacity"].shape:
             raise ValueError(f"a rank of shape {tuple(self.rank.shape)}, not one number for each anchor")
