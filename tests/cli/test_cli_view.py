@@ -49,15 +49,6 @@ def fetch(url: str) -> bytes:
         return data
 
 
-@pytest.mark.parametrize(("content", "says"), [(b"no scene", "checkpoint"), (None, "No such file")])
-def test_what_is_no_scene_is_one_line_and_no_page(tmp_path, content, says):
-    path = tmp_path / "scene.pd4"
-    if content is not None:
-        path.write_bytes(content)
-    out, err = run(path).communicate(timeout=300)
-    assert out == "" and says in err and len(err.splitlines()) == 1
-
-
 def test_a_checkpoint_may_come_through_stdin(model_pt):
     with open(model_pt, "rb") as stdin:
         process = run("-", stdin=stdin)
@@ -68,23 +59,24 @@ def test_a_checkpoint_may_come_through_stdin(model_pt):
         assert process.wait(60) == 0
 
 
-def test_one_html_file_instead_of_a_server(scene_pd4, tmp_path):
+def test_one_html_file_instead_of_a_server(cli, scene_pd4, tmp_path):
     output = tmp_path / "scene.html"
-    assert run(scene_pd4, "-o", output).wait(300) == 0
+    assert cli("view", scene_pd4, "-o", output).code == 0
     assert output.read_text() == show(scene_pd4).page
-    out, err = run(scene_pd4, "-o", output).communicate(timeout=300)
-    assert out == "" and "exists already" in err and len(err.splitlines()) == 1
-    out, err = run(scene_pd4, "-o", tmp_path / "none" / "a.html").communicate(timeout=300)
-    assert out == "" and "no folder" in err and len(err.splitlines()) == 1
+    for path, says in ((output, "exists already"), (tmp_path / "none" / "a.html", "no folder")):
+        done = cli("view", scene_pd4, "-o", path)
+        assert done.code == 1 and done.out == b"" and says in done.err and len(done.error_lines) == 1
 
 
-def test_a_damaged_file_is_said_here_and_not_in_the_page(scene_pd4, tmp_path):
-    data = bytearray(scene_pd4.read_bytes())
-    data[-30] ^= 1
-    (tmp_path / "scene.pd4").write_bytes(data)
-    process = run(tmp_path / "scene.pd4")
-    out, err = process.communicate(timeout=300)
-    assert process.returncode == 1 and out == "" and "CRC" in err and len(err.splitlines()) == 1
+def flipped(data: bytes) -> bytes:
+    return data[:-30] + bytes([data[-30] ^ 1]) + data[-29:]
+
+
+@pytest.mark.parametrize("change, says", [(lambda data: b"no scene", "checkpoint"), (flipped, "CRC")])
+def test_a_bad_file_is_said_here_and_not_in_the_page(cli, scene_pd4, tmp_path, change, says):
+    (tmp_path / "scene.pd4").write_bytes(change(scene_pd4.read_bytes()))
+    done = cli("view", tmp_path / "scene.pd4", "--no-browser")
+    assert done.code == 1 and done.out == b"" and says in done.err and len(done.error_lines) == 1
 
 
 def test_the_wheel_gets_every_package_and_what_the_page_needs():

@@ -180,19 +180,3 @@ def test_rendering_a_file_needs_no_torch_and_no_datasets(tmp_path):
     )
     assert done.returncode == 0, done.stderr
     assert Image.open(tmp_path / "out.png").size == (48, 36)
-
-
-DECODE = """
-import sys
-from pd4dgs_codec.cli.decode import main
-code = main([sys.argv[1]])
-assert not {"http", "ssl", "email", "numba", "torch"} & set(sys.modules), "a local file waits for no network"
-sys.exit(code)
-"""
-
-
-def test_decoding_a_local_file_imports_no_http(tmp_path):
-    file = tmp_path / "scene.pd4"
-    file.write_bytes(encode(_scene(), layers=2, effort=1))
-    done = subprocess.run([sys.executable, "-c", DECODE, file], cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr

@@ -11,12 +11,14 @@ import pytest
 import torch
 from teachers import Deformable, FourD, ball, fit
 from test_formats import make_splats
+from tiny import TINY
 from torch import nn
 
 from pd4dgs_codec.data.cameras import rotation_matrix
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange import runs
 from pd4dgs_codec.interchange.teacher import load_source, read_model
+from pd4dgs_codec.model.config import PRESETS
 
 DEFORMATION, PLY = "point_cloud/iteration_7/deformation.pth", "point_cloud/iteration_7/point_cloud.ply"
 TIMES = (0.0, 0.37, 1.0)
@@ -208,7 +210,8 @@ def test_import_says_how_to_learn_from_them(tmp_path, cli, kind):
     assert f"pd4dgs-train teacher:{run} learns from it" in result.err
 
 
-def test_teaching(tmp_path, cli):
+def test_teaching(tmp_path, cli, monkeypatch):
+    monkeypatch.setitem(PRESETS, "tiny", TINY)
     torch.manual_seed(0)
     model = FourD(ball(300))
     fit(model, 60)
