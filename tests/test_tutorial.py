@@ -8,6 +8,10 @@ import sys
 from importlib.metadata import entry_points
 from pathlib import Path
 
+from tiny import TINY
+
+from pd4dgs_codec.model.config import PRESETS
+
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
 
@@ -28,6 +32,7 @@ def run_command(line: str) -> None:
 
 def test_the_tutorial_runs_from_the_first_cell_to_the_last(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(PRESETS, "tiny", TINY)
     code = [source for kind, source in cells(PAGE) if kind == "code"]
     assert all(usual in "".join(code) for usual in SMALLER)
     shown: list[str] = []
