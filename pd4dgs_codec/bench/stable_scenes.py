@@ -1,5 +1,7 @@
 """Stability of scenes: HexPlanes and deformations out of range, degenerate Gaussians and cameras, hostile training."""
 
+from __future__ import annotations
+
 import itertools
 import math
 import tempfile

@@ -1,5 +1,7 @@
 """Stability of numbers and their codes: the rate R(a), priors, quantisers and masks."""
 
+from __future__ import annotations
+
 import itertools
 import math
 from collections.abc import Sequence

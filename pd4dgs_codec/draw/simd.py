@@ -14,6 +14,8 @@ Arrays are float32 or float64, C-contiguous, of any rank; an index is an offset 
 numba's cache watches only the file of the function it stores: after an edit here, touch the modules that import this.
 """
 
+from __future__ import annotations
+
 import functools
 import gc
 import operator

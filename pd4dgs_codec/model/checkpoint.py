@@ -5,6 +5,8 @@ Shapes come from the tensors; loading does not need the configuration that made 
 resuming and may be empty. "digest" covers all other entries, since torch reads damaged archives without an error.
 """
 
+from __future__ import annotations
+
 import hashlib
 import io
 import os

@@ -1,5 +1,7 @@
 """Model <-> Scene: torch tensors to the numpy arrays that the codec packs, and back."""
 
+from __future__ import annotations
+
 import numpy as np
 import torch
 

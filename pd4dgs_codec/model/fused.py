@@ -7,6 +7,8 @@ A row's columns are the heads of a deformation in the registry's order.
 `reference` has the same stages in plain torch.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import Any
 

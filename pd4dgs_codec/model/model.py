@@ -9,6 +9,8 @@ reads the planes of layer 1, coarse in space and time; F_local, in its place, re
 The gate m^(level) multiplies each Gaussian's opacity and scale.
 """
 
+from __future__ import annotations
+
 import math
 from dataclasses import dataclass
 from typing import Any, cast

@@ -3,6 +3,8 @@
 `cpu` is numba (`draw.rasteriser`), `gsplat` is CUDA, `reference` (`reference.py`) is a dense float64 torch oracle.
 """
 
+from __future__ import annotations
+
 import importlib
 import importlib.metadata
 from collections.abc import Callable, Sequence

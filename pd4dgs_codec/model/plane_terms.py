@@ -16,6 +16,8 @@ value of a plane has no neighbour and is free. Weighting |r| by its cost follows
 sparsity by reweighted l1 minimization (2008).
 """
 
+from __future__ import annotations
+
 import math
 from typing import Any
 

@@ -9,6 +9,8 @@ With d = |a - mu|, z = d/sigma, h = Q/(2 sigma), u = (d - Q/2)/sigma, v = (d + Q
 - centre, u < 0:             ln P = log_ndtr(-u) + log1mexp(log_ndtr(-v) - log_ndtr(-u))
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from typing import Any

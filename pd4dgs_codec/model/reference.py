@@ -8,6 +8,8 @@ is 10^8 times as long as a pixel is wide.
 The stages are the oracle of `fused`, and the path on CUDA and for networks that the kernels do not take.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 

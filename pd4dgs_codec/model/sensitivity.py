@@ -4,6 +4,8 @@ By these measures anchors leave a layer or a model and get their step classes, a
 most first.
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace

@@ -1,5 +1,7 @@
 """What packing does to a scene: the error of its pictures, the gain of its layers."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

@@ -1,5 +1,7 @@
 """A fresh model for a dataset: positions and sizes of the first anchors."""
 
+from __future__ import annotations
+
 import math
 
 import numpy as np

@@ -1,5 +1,7 @@
 """The training step: draw a level and a view, render, add the level's terms, update; the phases of a run in between."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Sequence
 from typing import Any

@@ -5,6 +5,8 @@ graph has leaves of its own: torch (2.13) holds a leaf's lock while it waits for
 graphs share a leaf can deadlock.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 

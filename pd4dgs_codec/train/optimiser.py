@@ -4,6 +4,8 @@ The update is torch's fused kernel. The class `torch.optim.Adam` would import to
 takes a second of every start.
 """
 
+from __future__ import annotations
+
 import math
 from typing import Any
 

@@ -9,6 +9,8 @@ still is complete without it.
 The rollouts of the paper have no key instant: they teach level 0 the mean over time.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import replace
 

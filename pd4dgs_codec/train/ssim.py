@@ -10,6 +10,8 @@ has a border case: [H + 10, stride], pixel (j, i) channel c at [j + 5, 15 + 3 i 
 kept per row: results do not depend on the number of threads. weights: [H, W]. taps: [11].
 """
 
+from __future__ import annotations
+
 from typing import Any
 
 import numpy as np

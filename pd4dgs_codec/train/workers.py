@@ -4,6 +4,8 @@ All hold the same model. Gradients are summed, so that all take the same step. O
 pruning, are made by the first worker for all. A single process communicates nothing.
 """
 
+from __future__ import annotations
+
 import os
 from collections.abc import Callable, Sequence
 from importlib import import_module

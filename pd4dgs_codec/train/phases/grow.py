@@ -1,5 +1,7 @@
 """Growing and pruning of anchors as in Scaffold-GS: grow where image gradients are large, prune what is transparent."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Sequence
 from typing import Any

@@ -5,6 +5,8 @@ only after the level below, which has seen few steps of its own, has tried to do
 is then no better. Both are compared in the pixels that the level changes, so that small things count as large ones do.
 """
 
+from __future__ import annotations
+
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence

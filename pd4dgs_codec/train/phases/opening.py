@@ -7,6 +7,8 @@ is not, and learns less in a narrow window. Which of the two a scene is shows in
 window predicts views well outside it, or all views take part at once.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 from typing import Any
 

@@ -5,6 +5,8 @@ some steps of level 0 render its most useful anchors alone, in the order in whic
 (nested dropout: Rippel, Gelbart and Adams, Learning ordered representations with nested dropout, 2014).
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any

@@ -6,6 +6,8 @@ anchors in one place each is redundant, but not all are: in each of several roun
 over the scene, can be pruned, and the rest is measured again.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 

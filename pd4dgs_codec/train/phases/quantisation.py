@@ -11,6 +11,8 @@ between anchors, and neither position nor size predicts it, so it is measured. T
 error follow: the next class doubles the steps, which quadruples the squared error and saves the same bits everywhere.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from typing import Any
 
