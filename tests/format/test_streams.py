@@ -83,14 +83,14 @@ def test_scenes_stay_as_they_were():
             scene.feature[:] = 0
 
 
-def test_a_scene_is_freed_as_soon_as_nobody_holds_it():
-    """An error for each piece held its frames and their scenes until the next collection of garbage."""
-    data, stream = many_slices(), open_stream()
+def test_a_stream_is_freed_as_soon_as_nobody_holds_it():
+    """An error for each piece held its frames, and so the stream's arrays, until the next collection of garbage."""
+    stream = open_stream()
+    held = weakref.ref(stream)
     gc.disable()
     try:
-        (scene,) = stream.feed(data[: ends()[3] + 9])
-        held = weakref.ref(scene)
-        del scene, stream
+        assert stream.feed(many_slices()[: ends()[3] + 9])
+        del stream
         assert held() is None
     finally:
         gc.enable()
