@@ -35,6 +35,8 @@ export class FetchError extends Error {
 
 /** Limit of layer 0 without a budget of bytes: bytes are held until their slice is complete. */
 const MOST_BYTES = 2 ** 28;
+/** Small pieces are gathered to so many bytes: one costs more to hand on than to read. */
+const GATHERED = 1024;
 /** HTTP status codes of temporary errors. */
 const TEMPORARY = [408, 425, 429, 500, 502, 503, 504];
 /** After so many changes the file counts as never stable. */
@@ -71,8 +73,8 @@ export class SceneSource {
     this._validator = null;
     /** The open connection. @type {AbortController | null} */
     this._controller = null;
-    /** Its response. skip: bytes that are here already.
-     * @type {{reader: Reader, skip: number, rest: Uint8Array} | null} */
+    /** Its response. skip: bytes that are here already. lapsed: why it was ended.
+     * @type {{reader: Reader, skip: number, rest: Uint8Array, lapsed: Cut | null} | null} */
     this._body = null;
     /** A wait of the connection: when it lapses, what ends it then, and the timer that looks.
      * @type {{at: number, end: (why: Cut) => void, timer: ReturnType<typeof setTimeout> | undefined}} */
@@ -83,6 +85,7 @@ export class SceneSource {
     this._repairedAt = -1;
     /** Preamble of the file. */
     this._head = new Uint8Array(PREAMBLE_SIZE);
+    this._gathered = new Uint8Array(GATHERED);
     signal?.addEventListener("abort", () => this._controller?.abort(signal.reason), { once: true });
   }
 
@@ -114,7 +117,7 @@ export class SceneSource {
         if (end === null || now() >= until) return;
         let block;
         try {
-          block = await this._read(end, 1000 * Math.min(this._stall, until - now()));
+          block = await this._read(end, until);
         } catch (error) {
           this.close();
           this._signal?.throwIfAborted();
@@ -182,68 +185,87 @@ export class SceneSource {
   }
 
   /**
-   * The next bytes to arrive, none beyond `end`, perhaps none at all; null if the file ends. Raises Cut, FetchError or
-   * an error of fetch.
+   * The next bytes to arrive, none beyond `end`, which nothing is decoded before; perhaps none at all; null if the file
+   * ends. The array is used again. Raises Cut, FetchError or an error of fetch.
    *
-   * @param {number} end @param {number} patience milliseconds to wait
+   * @param {number} end @param {number} until seconds
    * @returns {Promise<Uint8Array | null>}
    */
-  async _read(end, patience) {
+  async _read(end, until) {
     if (this.total !== null && this.received >= this.total) return null;
     if (!this._body) {
-      await this._request(patience);
+      await this._request(until);
       return NOTHING; // if the file has changed, it begins anew
     }
     const body = this._body;
-    if (!body.rest.length) {
-      const { done, value } = await this._within(body.reader.read(), patience);
-      if (done) {
-        this.close();
-        if (this.total !== null) throw new Cut(`ended at byte ${this.received} of ${this.total}`);
-        this.total = this.received; // a length that was never told ends with the response
-        return null;
+    const wanted = Math.min(end - this.received, GATHERED);
+    let filled = 0;
+    while (filled < wanted) {
+      if (!body.rest.length) {
+        this._await(until);
+        let came;
+        try {
+          came = await body.reader.read();
+        } catch (error) {
+          if (filled) break; // the next call meets it again, as the end below
+          throw error;
+        }
+        this._wait.at = Infinity;
+        if (came.done) {
+          if (filled) break;
+          if (body.lapsed) throw body.lapsed;
+          this.close();
+          if (this.total !== null) throw new Cut(`ended at byte ${this.received} of ${this.total}`);
+          this.total = this.received; // a length that was never told ends with the response
+          return null;
+        }
+        const skipped = Math.min(body.skip, came.value.length);
+        body.skip -= skipped;
+        body.rest = skipped ? came.value.subarray(skipped) : came.value;
       }
-      const skipped = Math.min(body.skip, value.length);
-      body.skip -= skipped;
-      body.rest = skipped ? value.subarray(skipped) : value;
-    }
-    const { rest } = body;
-    const all = rest.length <= end - this.received; // views take longer than a small piece
-    const block = all ? rest : rest.subarray(0, end - this.received);
-    body.rest = all ? NOTHING : rest.subarray(block.length);
-    if (block.length) {
-      if (this.received < PREAMBLE_SIZE) this._head.set(block, this.received);
-      this.received += block.length;
+      const { rest } = body;
+      const room = filled ? wanted - filled : end - this.received;
+      const all = rest.length <= room; // views take longer than a small piece
+      const piece = all ? rest : rest.subarray(0, room);
+      body.rest = all ? NOTHING : rest.subarray(room);
+      if (!piece.length) continue;
+      if (this.received < PREAMBLE_SIZE) this._head.set(piece, this.received);
+      this.received += piece.length;
       this._progress?.(this.received, this.total);
+      if (piece.length >= wanted) return piece;
+      this._gathered.set(piece, filled);
+      filled += piece.length;
     }
-    return block;
+    return this._gathered.subarray(0, filled);
   }
 
-  /**
-   * The value of `promise`, or a Cut if that takes longer. One timer serves all waits of a connection, since one for each
-   * would take longer than a small piece does; those that follow lapse no earlier.
-   *
-   * @template T @param {Promise<T>} promise @param {number} milliseconds @returns {Promise<T>}
-   */
-  _within(promise, milliseconds) {
+  /** The value of `promise`, or a Cut if it takes too long. @template T @param {Promise<T>} promise @param {number} until
+   * @returns {Promise<T>} */
+  _within(promise, until) {
     return new Promise((resolve, reject) => {
       promise.then(resolve, reject);
-      this._wait.at = performance.now() + milliseconds;
       this._wait.end = reject;
-      if (this._wait.timer === undefined) this._look();
+      this._await(until);
     });
+  }
+
+  /** Begins a wait. One timer serves all of a connection, since one for each would take longer than a small piece does;
+   * those that follow lapse no earlier. @param {number} until */
+  _await(until) {
+    this._wait.at = Math.min(performance.now() + 1000 * this._stall, 1000 * until);
+    if (this._wait.timer === undefined) this._look();
   }
 
   /** Ends the wait if it has lapsed, else looks again when it will have. */
   _look() {
     const left = this._wait.at - performance.now();
     const later = Math.min(Math.ceil(left) + 1, 2 ** 31 - 1); // more would fire at once
-    this._wait.timer = left > 0 ? setTimeout(() => this._look(), later) : undefined;
+    this._wait.timer = left > 0 && left < Infinity ? setTimeout(() => this._look(), later) : undefined;
     if (left <= 0) this._wait.end(new Cut("no byte arrived for too long"));
   }
 
-  /** Requests the missing bytes. @param {number} patience milliseconds to wait for the response */
-  async _request(patience) {
+  /** Requests the missing bytes. @param {number} until */
+  async _request(until) {
     const start = this.received;
     /** @type {Record<string, string>} */
     const headers = start && this._validator ? { Range: `bytes=${start}-`, "If-Range": this._validator } : {};
@@ -251,12 +273,16 @@ export class SceneSource {
     this._requested = { at: now(), received: start };
     // a request after a cut or damage bypasses caches
     const cache = start ? "no-store" : "default";
-    const response = await this._within(this._fetch(this.url, { headers, signal, cache }), patience);
+    const response = await this._within(this._fetch(this.url, { headers, signal, cache }), until);
     const skip = this._accept(response, "Range" in headers);
     if (skip === null) this.close();
     else {
       const reader = (response.body ?? new Blob().stream()).getReader();
-      this._body = { reader, skip, rest: NOTHING };
+      const body = (this._body = { reader, skip, rest: NOTHING, lapsed: /** @type {Cut | null} */ (null) });
+      this._wait.end = (why) => {
+        body.lapsed = why;
+        reader.cancel().catch(() => {}); // ends the pending read
+      };
     }
   }
 
