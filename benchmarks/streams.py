@@ -3,19 +3,23 @@
     pd4dgs-encode model.pt -o scene.pd4 --slices 4k
     python benchmarks/streams.py scene.pd4     # two minutes; without a browser, the rows of Chromium are left out
 
-Time is the least of seven runs, processor time, in a page wall time; memory is the peak of arrays in Python, of the
-whole process, one for each figure, in Node and Chromium (on Linux).
+Time is the least of seven runs, processor time of the process, in Chromium of the page's; memory is the peak of arrays
+in Python, of the process, one for each figure, in Node and Chromium (on Linux). A server writes its pieces to a socket
+one by one, and the reader gets what has arrived.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import subprocess
 import sys
+import threading
 import time
 import tracemalloc
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -58,55 +62,88 @@ def cost(work: Callable[[], Any], runs: int) -> tuple[float, int]:
     return min(seconds), peak
 
 
+@contextlib.contextmanager
+def served(path: Path, size: int) -> Iterator[str]:
+    """The address of a server of the player's files and, in pieces of `size` bytes, of scene.pd4."""
+
+    class Handler(SimpleHTTPRequestHandler):
+        disable_nagle_algorithm = True
+
+        def translate_path(self, asked: str) -> str:
+            return str(path if asked == "/scene.pd4" else PLAYER / asked[1:])
+
+        def copyfile(self, source: Any, to: Any) -> None:
+            while piece := source.read(size):
+                to.write(piece)
+
+        def log_message(self, *args: Any) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
+        threading.Thread(target=server.serve_forever).start()
+        yield f"http://127.0.0.1:{server.server_port}"
+        server.shutdown()
+
+
 def node(path: Path, way: str, size: int) -> tuple[float, int]:
     """(seconds, peak bytes of the process)."""
-    words = ["node", str(PLAYER / "testing" / "streams.mjs"), str(path), way, str(size)]
-    seconds, peak = json.loads(subprocess.run(words, capture_output=True, check=True).stdout)
+    with served(path, size) as address:
+        script = str(PLAYER / "testing" / "streams.mjs")
+        words = ["node", script, str(path), way, str(size), f"{address}/scene.pd4"]
+        seconds, peak = json.loads(subprocess.run(words, capture_output=True, check=True).stdout)
     return seconds, peak
 
 
 def chromium(path: Path, way: str, size: int) -> tuple[float, int]:
-    """(seconds of wall time, peak bytes of the page's process). Raises DataError without a browser."""
-    with launched() as browser:
+    """(seconds, peak bytes of the page's process). Raises DataError without a browser."""
+    others = renderers()
+    with served(path, size) as address, launched() as browser:
         page = browser.new_page()
         page.set_default_timeout(PATIENCE_MS)
-        page.route("**/*.js", lambda route: route.fulfill(path=PLAYER / route.request.url.split("/", 3)[3]))
-        page.route("**/scene.pd4", lambda route: route.fulfill(path=path))
-        page.route("http://localhost/", lambda route: route.fulfill(content_type="text/html", body=""))
-        page.goto("http://localhost/")
-        seconds = page.evaluate(
-            """async ([way, size]) => {
-              const { cost } = await import("/testing/splits.js");
-              const bytes = new Uint8Array(await (await fetch("/scene.pd4")).arrayBuffer());
-              return await cost(bytes, way, size, () => performance.now() / 1000);
+        page.goto(f"{address}/package.json")
+        page.evaluate(
+            """async ([way, size, url]) => {
+              const { working } = await import("/testing/splits.js");
+              const bytes = new Uint8Array(await (await fetch(url)).arrayBuffer());
+              globalThis.work = working(bytes, way, size, url);
             }""",
-            [way, size],
+            [way, size, f"{address}/scene.pd4"],
         )
-        return seconds, max(renderer_peaks())
+        (own,) = renderers() - others
+        seconds = []
+        for _ in range(7):
+            start = processor_time(own)
+            page.evaluate("work()")
+            seconds.append(processor_time(own) - start)
+        return min(seconds), 1024 * int((own / "status").read_text().split("VmHWM:")[1].split()[0])
 
 
-def renderer_peaks() -> list[int]:
-    """Peak bytes of Chromium's processes for pages."""
-    found = []
+def renderers() -> set[Path]:
+    """Chromium's processes for pages, in /proc."""
+    found = set()
     for folder in Path("/proc").glob("[0-9]*"):
-        try:
+        with contextlib.suppress(OSError):  # it has ended
             if b"--type=renderer" in (folder / "cmdline").read_bytes():
-                told = (folder / "status").read_text().split("VmHWM:")[1].split()[0]
-                found.append(1024 * int(told))
-        except (OSError, IndexError):
-            pass  # it has ended
+                found.add(folder)
     return found
+
+
+def processor_time(process: Path) -> float:
+    """Seconds, of all threads."""
+    return sum(int(task.read_text().split()[0]) for task in process.glob("task/*/schedstat")) / 1e9
 
 
 ROWS = [
     ("Python", python, "stream"),
     ("Python, the newest scene kept", python, "kept"),
     ("Node, `Stream`", node, "stream"),
-    ("Node, `SceneSource`", node, "source"),
-    ("Node, reading its pieces alone", node, "pieces"),
+    ("Node, `SceneSource` of a server", node, "served"),
+    ("Node, `SceneSource` of a script's pieces", node, "source"),
+    ("Node, reading these alone", node, "pieces"),
     ("Chromium, `Stream`", chromium, "stream"),
-    ("Chromium, `SceneSource`", chromium, "source"),
-    ("Chromium, reading its pieces alone", chromium, "pieces"),
+    ("Chromium, `SceneSource` of a server", chromium, "served"),
+    ("Chromium, `SceneSource` of a script's pieces", chromium, "source"),
+    ("Chromium, reading these alone", chromium, "pieces"),
 ]
 
 

@@ -40,10 +40,11 @@ export async function least(work, clock, runs) {
   return found;
 }
 
-/** The least time of seven runs, of which the first ones are compiled. "pieces" are those of "source", read alone.
- * @param {Uint8Array} bytes @param {"decode" | "stream" | "source" | "pieces"} way @param {number} size of a piece
- * @param {() => number} clock */
-export function cost(bytes, way, size, clock) {
+/** @typedef {"decode" | "stream" | "served" | "source" | "pieces"} Way */
+
+/** What one way does. "pieces" are those of "source", read alone; "served" reads a URL.
+ * @param {Uint8Array} bytes @param {Way} way @param {number} size of a piece @param {string} [url] */
+export function working(bytes, way, size, url = "") {
   const cuts = way === "stream" ? every(bytes, size) : [];
   /** The newest one is held, as by a caller who draws it. @type {{scene?: Scene}} */
   const kept = {};
@@ -51,6 +52,9 @@ export function cost(bytes, way, size, clock) {
     decode: () => void (kept.scene = decode(bytes)),
     stream: () => {
       for (kept.scene of fed(bytes, cuts));
+    },
+    served: async () => {
+      for await (kept.scene of new SceneSource(url).scenes());
     },
     source: async () => {
       for await (kept.scene of fetched(bytes, size));
@@ -60,5 +64,5 @@ export function cost(bytes, way, size, clock) {
       while (!(await reader.read()).done);
     },
   };
-  return least(ways[way], clock, 7);
+  return ways[way];
 }
