@@ -9,6 +9,7 @@ import contextlib
 import errno
 import math
 import os
+import re
 import shutil
 import stat
 import tempfile
@@ -20,12 +21,22 @@ from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.signals import held
 
 PREFIX = ".pd4dgs-"
+#: What begins as a URI does, which as a path would make a folder `s3:`. A drive has one letter, and most names with a
+#: colon, as `12:30.pd4`, are names.
+URI = re.compile(r"(?i)[a-z][a-z0-9+.-]+:(?:/|$)|(?:s3|gs|https?|file):")
 #: Temporary folders that there are.
 _FOLDERS: set[Path] = set()
 
 
+def check_path(path: str | Path) -> None:
+    """Raises DataError for the URI of an output, instead of a path."""
+    if URI.match(str(path)):
+        raise DataError(f"{path}: looks like a URI, expected a path (./{path} is one)")
+
+
 def check_output(path: str | Path, overwrite: bool) -> None:
-    """Raises DataError, before any work, if the output exists or its folder cannot be written to."""
+    """Raises DataError, before any work, if the output is a URI, exists or its folder cannot be written to."""
+    check_path(path)
     target = Path(path)
     if target.is_dir():
         raise DataError(f"{path}: is a folder, expected the name of an output file")
@@ -68,6 +79,7 @@ def whole_file(path: str | Path, overwrite: bool) -> Iterator[Path]:
 def whole_files(names: Sequence[str], overwrite: bool, told: str | None = None) -> Iterator[list[Path]]:
     """Temporary paths for outputs in one folder that appear together once all are written. The folder is made if
     missing. An OSError names `told`, or the first of them."""
+    check_path(names[0])
     parent = Path(names[0]).parent
     for name in names:
         if Path(name).exists() and not overwrite:

@@ -6,11 +6,13 @@ import signal
 import sys
 from functools import partial
 from itertools import count
+from pathlib import Path
 
 import pytest
 
 from pd4dgs_codec import io
 from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.prepare.stages import check_folder
 
 
 def test_a_file_that_appears_meanwhile_is_not_replaced(tmp_path):
@@ -31,6 +33,26 @@ def test_files_appear_together_or_not_at_all(tmp_path):
         for temporary in temporaries:
             temporary.write_bytes(b"1")
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["0.png", "1.png", "2.png"]
+
+
+@pytest.mark.parametrize("name", ["s3:", "s3:x", "s3:/x/y.pd4", "s3://x/y.pd4", "https://host/x.pd4", "Ftp:/x", "x.y:"])
+def test_a_uri_is_no_output(tmp_path, monkeypatch, name):
+    """`s3:` became the name of a folder."""
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(DataError, match="looks like a URI"):
+        io.write_bytes(name, b"", False)
+    with pytest.raises(DataError, match="looks like a URI"), io.whole_files([f"{name}/1.png"], False):
+        pass
+    with pytest.raises(DataError, match="looks like a URI"):
+        check_folder(Path(name), False)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["12:30.pd4", "run:2.pd4", "c:", "./s3:"])
+def test_a_name_with_a_colon_is_an_output(tmp_path, monkeypatch, name):
+    monkeypatch.chdir(tmp_path)
+    io.write_bytes(name, b"1", False)
+    assert Path(name).read_bytes() == b"1"
 
 
 def test_bytes_reach_the_disk_before_the_name(tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from pd4dgs_codec.errors import DataError, one_line, required
-from pd4dgs_codec.io import check_source, is_device, write_bytes
+from pd4dgs_codec.io import URI, check_source, is_device, write_bytes
 from pd4dgs_codec.web.headers import media_type
 
 RECORD = ".done.json"
@@ -54,7 +54,7 @@ def _system(place: str) -> tuple[Any, str, bool]:
     from fsspec.implementations.local import LocalFileSystem
 
     try:
-        if not _ABSOLUTE.match(place):
+        if not _ABSOLUTE.match(place) or (URI.match(place) and not re.match("(?:file|local):|.*://", place)):
             raise ValueError("expected a path, or a URI like file:///FOLDER or s3://BUCKET/FOLDER")
         system, path = url_to_fs(place)
     except Exception as error:  # each store has its own

@@ -13,7 +13,7 @@ from pd4dgs_codec.cli import common, options
 from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError
 from pd4dgs_codec.cli.progress import progress_bar
 from pd4dgs_codec.errors import DataError, required
-from pd4dgs_codec.io import whole_files
+from pd4dgs_codec.io import check_path, whole_files
 
 if TYPE_CHECKING:
     import numpy as np
@@ -114,6 +114,7 @@ def _check_usage(args: argparse.Namespace) -> None:
 
 def _check_folder(path: str, overwrite: bool) -> None:
     """Refuses a folder with frames of another run, which must not mix with the new ones."""
+    check_path(path)
     folder = Path(path)
     if folder.exists() and not folder.is_dir():
         raise DataError(f"{path}: is a file, expected the name of a folder")

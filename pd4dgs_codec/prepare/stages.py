@@ -19,7 +19,7 @@ import numpy as np
 
 from pd4dgs_codec.data.files import image_info
 from pd4dgs_codec.errors import DataError, one_line
-from pd4dgs_codec.io import finite, write_bytes
+from pd4dgs_codec.io import check_path, finite, write_bytes
 from pd4dgs_codec.prepare import poses
 from pd4dgs_codec.prepare.frames import (
     FEWEST_FRAMES,
@@ -98,6 +98,7 @@ def prepare(
 
 def check_folder(output: Path, overwrite: bool) -> None:
     """Raises DataError for an output that cannot be written, or exists and was not made by `prepare`."""
+    check_path(output)
     if output.exists() and not (overwrite and (output / REPORT).is_file() and (output / "sparse").is_dir()):
         how = "expected a folder that pd4dgs-prepare made" if overwrite else "--overwrite replaces what was made here"
         raise DataError(f"{output}: exists already; {how}")

@@ -143,7 +143,9 @@ def test_a_place_that_no_store_has_holds_no_manifest(place):
         Manifest(place, OPS["encode"], lambda options: None)
 
 
-@pytest.mark.parametrize("place", ["dir:///", "reference://", "github://", "", "file:", "file://", "file://host/x"])
+@pytest.mark.parametrize(
+    "place", ["dir:///", "reference://", "github://", "", "file:", "file://", "file://host/x", "s3:", "s3:/x", "s3:x"]
+)
 def test_a_place_that_no_store_has_takes_no_output(place, tmp_path, monkeypatch):
     """Without its last slashes a URI became the name of a folder, and / the folder where the command runs."""
     monkeypatch.chdir(tmp_path)
