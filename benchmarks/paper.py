@@ -55,8 +55,8 @@ QUALITIES = (0, 25, 50, 75, 100)
 
 
 def asked(run: Run) -> dict[tuple[str, str], tuple[tuple[str, ...], float]]:
-    """TRAININGS; the first few in a quick run."""
-    return dict(list(TRAININGS.items())[slice(2, 8) if run.quick else slice(None)])
+    """TRAININGS; in a quick run one of each kind of row."""
+    return dict(list(TRAININGS.items())[slice(2, 8, 2) if run.quick else slice(None)])
 
 
 def trainings(run: Run, scene: Scene) -> list[Training]:

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from tiny import write_views
 
 from pd4dgs_codec import encode
 from pd4dgs_codec.__main__ import MODULES
@@ -127,8 +128,6 @@ class _Payload:
 @pytest.fixture(scope="module")
 def bad_files(tmp_path_factory, model_pt, scene_pd4, scene):
     """The files that CASES name."""
-    from tiny import write_views
-
     folder = tmp_path_factory.mktemp("bad")
     data = scene_pd4.read_bytes()
     (folder / "cut.pd4").write_bytes(data[:-10])

@@ -8,16 +8,19 @@ import sys
 
 import numpy as np
 import pytest
+from strategies import make_scene
+
+from pd4dgs_codec.format.decoder import decode
+from pd4dgs_codec.format.encoder import encode
+from pd4dgs_codec.format.info import info
+from pd4dgs_codec.model import checkpoint
+from pd4dgs_codec.model.convert import to_scene
 
 ENCODE_KEYS = {"mode", "bytes", "verified", "seconds", "layers", "left_out"}
 LAYER_KEYS = {"layer", "bytes", "payload_bits", "rate_bits", "position_bits", "symbols", "anchors"}
 
 
 def test_encode_writes_what_the_codec_encodes(cli, model_pt, tmp_path):
-    from pd4dgs_codec.format.encoder import encode
-    from pd4dgs_codec.model import checkpoint
-    from pd4dgs_codec.model.convert import to_scene
-
     output = tmp_path / "s.pd4"
     result = cli("encode", model_pt, "-o", output, "--effort", 1, "--json")
     assert result.code == 0 and result.err == ""
@@ -61,8 +64,6 @@ def test_tables_without_json(cli, model_pt, scene_pd4, tmp_path):
 
 
 def test_decode_npz_holds_the_decoded_arrays(cli, scene_pd4, tmp_path):
-    from pd4dgs_codec.format.decoder import decode
-
     output = tmp_path / "s.npz"
     assert cli("decode", scene_pd4, "-o", output, "--max-layer", 1, "--symbols").code == 0
     scene, arrays = decode(scene_pd4.read_bytes(), max_layer=1), np.load(output)
@@ -156,11 +157,6 @@ def test_decoding_needs_no_torch_no_numba_and_for_a_local_file_no_network(scene_
 
 
 def test_max_bytes_stops_at_a_slice(cli, tmp_path):
-    from strategies import make_scene
-
-    from pd4dgs_codec import decode, encode
-    from pd4dgs_codec.format.info import info
-
     data, path = encode(make_scene(3, anchors=200), slices=2000, effort=1), tmp_path / "scene.pd4"
     path.write_bytes(data)
     ends = [part["end"] for row in info(data)["layers"] for part in row["slices"]]

@@ -12,6 +12,7 @@ import pytest
 from pd4dgs_codec import FORMAT_VERSION, io
 from pd4dgs_codec import __main__ as dispatcher
 from pd4dgs_codec.cli import options
+from pd4dgs_codec.data.bodies import MOTIONS, THINGS
 
 VERBS = {verb: import_module(f"pd4dgs_codec.cli.{dispatcher.MODULES.get(verb, verb)}") for verb in dispatcher.VERBS}
 
@@ -29,8 +30,6 @@ def test_help_has_a_summary_an_example_and_exits_0(verb, capsys):
 
 @pytest.mark.parametrize("verb", ("train", "render", "eval"))
 def test_help_lists_every_synthetic_scene(verb):
-    from pd4dgs_codec.data.bodies import MOTIONS, THINGS
-
     text = VERBS[verb].parser().format_help()
     for name in (*MOTIONS, *THINGS):
         assert f"synthetic:{name}" in text

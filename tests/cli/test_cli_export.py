@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 from tiny import sighted
 
+from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.interchange.formats import properties
 
 
@@ -29,8 +30,6 @@ def test_one_instant_as_ply(cli, scene_pd4, tmp_path):
 
 
 def test_gaussians_whose_colours_alone_depend_on_the_view_are_not_refined(cli, scene, tmp_path):
-    from pd4dgs_codec.format.encoder import encode
-
     file = tmp_path / "scene.pd4"
     file.write_bytes(encode(sighted(scene, "color"), effort=1))
     assert cli("info", file, "--json").json["view_dependent"] == ["color"]

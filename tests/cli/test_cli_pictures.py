@@ -2,11 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
+from tiny import TINY, write_views
 
 from pd4dgs_codec import decode
+from pd4dgs_codec.data.dataset import load
+from pd4dgs_codec.format.encoder import encode
+from pd4dgs_codec.format.info import info
+from pd4dgs_codec.model import checkpoint
+from pd4dgs_codec.model.config import PRESETS
+from pd4dgs_codec.model.convert import from_scene
+from pd4dgs_codec.model.picture import render_image
+from pd4dgs_codec.quality import perceptual
+from pd4dgs_codec.quality.evaluate import TEMPORAL_FRAMES, evaluate
+from pd4dgs_codec.quality.image import mpsnr, ssim, to_uint8
+from pd4dgs_codec.quality.levels import load_levels
+from pd4dgs_codec.quality.perceptual import Distance, Perceptual
 
 WIDTH, HEIGHT = 32, 24  # of the scene's camera and of the dataset's pictures
 
@@ -25,15 +40,6 @@ def test_eval_states_quality_and_bytes_per_level(cli, scene_pd4, shared_dataset)
 
 
 def test_eval_averages_the_views_of_each_levels_own_prefix(scene_pd4, shared_dataset):
-    from pd4dgs_codec.data.dataset import load
-    from pd4dgs_codec.format.decoder import decode
-    from pd4dgs_codec.format.info import info
-    from pd4dgs_codec.model.convert import from_scene
-    from pd4dgs_codec.model.picture import render_image
-    from pd4dgs_codec.quality.evaluate import evaluate
-    from pd4dgs_codec.quality.image import mpsnr
-    from pd4dgs_codec.quality.levels import load_levels
-
     data, dataset = scene_pd4.read_bytes(), load(str(shared_dataset), holdout=2)
     end = info(data)["layers"][1]["end"]
     rows = evaluate(load_levels(data[:end], 1), dataset)["levels"]
@@ -55,10 +61,6 @@ def test_eval_of_checkpoint_and_pipe(cli, model_pt, scene_pd4, shared_dataset):
 
 def test_eval_measures_what_moves_where_cameras_stand_still(cli, scene_pd4):
     """Against the region found from the truth at hand, with the pictures that render writes."""
-    from pd4dgs_codec.data.dataset import load
-    from pd4dgs_codec.quality.image import mpsnr
-    from pd4dgs_codec.quality.levels import load_levels
-
     source = "synthetic:flyby?size=32x32&frames=4"
     report = cli("eval", scene_pd4, source, "--json", "--max-layer", 1).json
     views, (*_, level) = load(source).test, load_levels(scene_pd4, 1)
@@ -77,15 +79,6 @@ def test_eval_measures_what_moves_where_cameras_stand_still(cli, scene_pd4):
 @pytest.mark.parametrize("given", [None, "0,0.6,1"])
 def test_truth_and_scene_have_the_background_of_the_file_or_the_option(cli, scene, tmp_path, given):
     """The pictures are transparent: what they show is the background alone."""
-    from dataclasses import replace
-
-    from tiny import write_views
-
-    from pd4dgs_codec.data.dataset import load
-    from pd4dgs_codec.format.encoder import encode
-    from pd4dgs_codec.quality.image import mpsnr
-    from pd4dgs_codec.quality.levels import load_levels
-
     folder, file = write_views(tmp_path / "set"), tmp_path / "green.pd4"
     for picture in folder.glob("*.png"):
         Image.fromarray(np.zeros((HEIGHT, WIDTH, 4), np.uint8)).save(picture)
@@ -106,11 +99,6 @@ def test_truth_and_scene_have_the_background_of_the_file_or_the_option(cli, scen
 
 
 def test_a_model_keeps_the_background_that_it_is_trained_on(cli, tmp_path, monkeypatch):
-    from tiny import TINY, write_views
-
-    from pd4dgs_codec.model import checkpoint
-    from pd4dgs_codec.model.config import PRESETS
-
     monkeypatch.setitem(PRESETS, "tiny", TINY)
     folder = write_views(tmp_path / "set")
     for picture in folder.glob("*.png"):
@@ -125,10 +113,6 @@ def test_a_model_keeps_the_background_that_it_is_trained_on(cli, tmp_path, monke
 
 def test_eval_by_the_protocol_of_3dgs(cli, scene_pd4, monkeypatch):
     """No masks, one LPIPS-VGG a picture; the masked metrics stay in the JSON."""
-    from pd4dgs_codec.data.dataset import load
-    from pd4dgs_codec.quality import perceptual
-    from pd4dgs_codec.quality.image import mpsnr, ssim
-    from pd4dgs_codec.quality.levels import load_levels
 
     def vgg():
         return perceptual.Distance("LPIPS-VGG", "by hand", lambda a, b: np.abs(a - b).max())
@@ -161,11 +145,6 @@ def test_eval_without_held_out_views_says_so(cli, scene_pd4, shared_dataset):
 
 
 def test_eval_adds_perceptual_distances_and_names_the_absent(cli, scene_pd4, shared_dataset, monkeypatch):
-    from pd4dgs_codec.data.dataset import load
-    from pd4dgs_codec.quality.evaluate import TEMPORAL_FRAMES
-    from pd4dgs_codec.quality.levels import load_levels
-    from pd4dgs_codec.quality.perceptual import Distance, Perceptual
-
     distance = Distance("MAE", "by hand", lambda a, b: np.abs(a - b).mean(axis=2))
     loaded = Perceptual({"mae": distance}, {"lpips": "it is not here"})
     monkeypatch.setattr("pd4dgs_codec.quality.perceptual.load_perceptual", lambda names: loaded)
@@ -188,10 +167,6 @@ def test_eval_adds_perceptual_distances_and_names_the_absent(cli, scene_pd4, sha
 
 
 def test_render_dataset_views_as_the_renderer_sees_them(cli, scene_pd4, shared_dataset, tmp_path):
-    from pd4dgs_codec.data.dataset import load
-    from pd4dgs_codec.quality.image import to_uint8
-    from pd4dgs_codec.quality.levels import load_levels
-
     options = ("--data", shared_dataset, "--split", "train", "--max-layer", 1, "--json")
     result = cli("render", scene_pd4, "-o", tmp_path / "out" / "%02d.png", *options)
     assert result.code == 0 and result.json["frames"] == 5 and result.json["levels"] == [1]

@@ -7,6 +7,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pd4dgs_codec.data.view import View
+from pd4dgs_codec.format.options import EncodeOptions
+from pd4dgs_codec.format.plan import plan
+from pd4dgs_codec.model import sensitivity
+from pd4dgs_codec.model.convert import from_scene
+from pd4dgs_codec.model.picture import render_image
+from pd4dgs_codec.quality import packing, target
+from pd4dgs_codec.quality.frames import own_frames
+from pd4dgs_codec.quality.image import to_uint8
+from pd4dgs_codec.quality.measure import RenderedLoss, leave_out_low_gain
+
 #: Fitting the priors of mode ans takes ten times as long.
 FAST = ("--mode", "lzma", "--effort", 1, "--json", "-f")
 
@@ -14,8 +25,6 @@ FAST = ("--mode", "lzma", "--effort", 1, "--json", "-f")
 @pytest.fixture(autouse=True)
 def _few_values(monkeypatch):
     """Each value costs an encode and its pictures: a few do here."""
-    from pd4dgs_codec.quality import packing, target
-
     monkeypatch.setattr(target, "OCTAVES", (0.0, 1.5, 3.0))
     monkeypatch.setattr(target, "SHARES", (0.0, 0.1, 0.5))
     monkeypatch.setattr(packing, "OWN_PICTURES", 2)
@@ -62,14 +71,6 @@ def test_layers_with_too_little_gain_are_left_out_with_their_figures(cli, model_
 
 
 def test_a_layer_that_explains_the_pictures_is_kept(scene):
-    from pd4dgs_codec.data.view import View
-    from pd4dgs_codec.format.options import EncodeOptions
-    from pd4dgs_codec.format.plan import plan
-    from pd4dgs_codec.model.convert import from_scene
-    from pd4dgs_codec.model.picture import render_image
-    from pd4dgs_codec.quality.image import to_uint8
-    from pd4dgs_codec.quality.measure import leave_out_low_gain
-
     camera, model = scene.info.camera, from_scene(plan(scene).symbols.scene())
     views = []
     for time in (0.2, 0.9):
@@ -80,11 +81,6 @@ def test_a_layer_that_explains_the_pictures_is_kept(scene):
 
 
 def test_the_estimated_omission_error_is_close_to_the_measured_one(scene, monkeypatch):
-    from pd4dgs_codec.format.plan import plan
-    from pd4dgs_codec.model import sensitivity
-    from pd4dgs_codec.quality.frames import own_frames
-    from pd4dgs_codec.quality.measure import RenderedLoss
-
     monkeypatch.setattr(sensitivity, "PROBES", 64)  # the anchors differ less here than in a trained scene
     planned = plan(scene).scene
     loss = RenderedLoss(planned, own_frames(planned.info, 2, 20.0))

@@ -7,17 +7,22 @@ import os
 import signal
 import subprocess
 import sys
+from argparse import Namespace
 
 import pytest
 import torch
 from tiny import TINY
 
 from pd4dgs_codec import decode, encode
+from pd4dgs_codec.cli.common import Console
+from pd4dgs_codec.cli.train import _device
+from pd4dgs_codec.errors import TrainError
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import PRESETS
 from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.scene import Widths
 from pd4dgs_codec.train.config import at_quality
+from pd4dgs_codec.train.learner import Learner
 
 
 @pytest.fixture(autouse=True)
@@ -84,8 +89,6 @@ def test_the_quality_sets_the_dial_and_single_options_replace_parts_of_it(train,
 
 
 def test_interrupted_and_resumed_run_repeats_the_uninterrupted_one(train, tmp_path, monkeypatch):
-    from pd4dgs_codec.train.learner import Learner
-
     assert train(tmp_path / "whole.pt", iterations=8).code == 0
     step = Learner.step
 
@@ -143,8 +146,6 @@ def test_resume_needs_training_state(cli, model_pt, shared_dataset, tmp_path):
 
 
 def test_time_limit_ends_cleanly_and_must_grow_on_resume(cli, train, tmp_path, shared_dataset, monkeypatch):
-    from pd4dgs_codec.train.learner import Learner
-
     slow = iter(range(1000))
     step = Learner.step
 
@@ -177,12 +178,6 @@ def test_cuda_that_is_absent_is_refused(train, tmp_path, monkeypatch):
 
 
 def test_a_gpu_that_gsplat_cannot_use_is_left_alone(monkeypatch, capsys):
-    from argparse import Namespace
-
-    from pd4dgs_codec.cli.common import Console
-    from pd4dgs_codec.cli.train import _device
-    from pd4dgs_codec.errors import TrainError
-
     console = Console(Namespace(json=False, verbose=False))
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
     monkeypatch.setitem(sys.modules, "gsplat", None)
@@ -194,16 +189,12 @@ def test_a_gpu_that_gsplat_cannot_use_is_left_alone(monkeypatch, capsys):
 
 
 def test_a_run_that_learnt_nothing_fails(train, tmp_path, monkeypatch):
-    from pd4dgs_codec.train.learner import Learner
-
     monkeypatch.setattr(Learner, "_learn", lambda *_: False)
     result = train(tmp_path / "m.pt")
     assert result.code == 1 and "nothing was learnt: in all 4 steps" in result.error_lines[-1]
 
 
 def test_a_second_interrupt_is_one_line(train, tmp_path, monkeypatch):
-    from pd4dgs_codec.train.learner import Learner
-
     monkeypatch.setattr(Learner, "step", lambda self: [signal.raise_signal(signal.SIGINT) for _ in range(2)])
     result = train(tmp_path / "m.pt")
     assert result.code == 1 and "interrupted twice" in result.error_lines[-1] and not (tmp_path / "m.pt").exists()

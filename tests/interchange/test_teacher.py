@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 import torch
 from test_formats import make_splats
+from tiny import write_views
 
+from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.formats import fourdgs_bytes, ply_bytes, read_splats, spz_bytes
 from pd4dgs_codec.interchange.splats import Splats, camera_eye, picture
@@ -153,10 +155,6 @@ def test_pictures_are_those_of_the_frame_next_to_each_view(tmp_path):
 
 
 def test_cameras_of_a_dataset_keep_its_held_out_pictures(tmp_path):
-    from tiny import write_views
-
-    from pd4dgs_codec.data.dataset import load
-
     folder, like = _sequence(tmp_path / "seq"), write_views(tmp_path / "set")
     data, truth = load_source(f"teacher:{folder}?cameras={like}"), load(like)
     assert [view.image.tobytes() for view in data.test] == [view.image.tobytes() for view in truth.test]
