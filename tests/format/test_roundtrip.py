@@ -222,7 +222,8 @@ def test_step_classes_and_centres_come_back(seed, priors, mode):
     options = {"layers": 2, "effort": 1, "priors": priors, "mode": mode, "omit": "nothing"}
     rng = np.random.default_rng(seed)
     noisy = replace(given, feature=(given.feature + rng.normal(size=given.feature.shape) / 50).astype(np.float32))
-    scene, data = decode(encode(noisy, **options)), encode(noisy, **options)
+    data = encode(noisy, **options)
+    scene = decode(data)
     assert scene.grading is not None and scene.grading.classes.max() > 0
     assert encode(scene, **options) == data
     scaled = decode(encode(noisy, step_scale=1.5, **options))
