@@ -28,6 +28,8 @@ from rooms import picture, pose, texture
 from pd4dgs_codec.data.dataset import load
 
 COUNT, SIZE, FOCAL = 80, (854, 480), 700.0
+#: The walls' pattern repeats after so many pixels, twice what a picture shows: matching takes repeats for one place.
+PATTERN = 2048
 #: A blurred picture is the mean of so many, over this share of the time between two.
 SAMPLES, SHUTTER = 5, 0.5
 COMMAND = "import sys; from pd4dgs_codec.cli.prepare import main; sys.exit(main())"
@@ -77,7 +79,7 @@ class Walk:
         """Makes the video: 30 frames a second, or between 15 and 60."""
         gaps = np.ones(COUNT) if self.even else np.random.default_rng(0).uniform(0.5, 2, COUNT)
         times = np.round(np.cumsum(gaps / 30) - gaps[0] / 30, 3)  # as the list below says
-        steps, textures = times / times[-1], [texture(seed) for seed in range(4)]
+        steps, textures = times / times[-1], [texture(seed, PATTERN) for seed in range(4)]
         pictures = [self.frame(step, textures) for step in steps]
         for k, each in enumerate(pictures):
             Image.fromarray(np.rot90(each) if self.upright else each).save(folder / f"{k:03d}.png", compress_level=1)

@@ -252,7 +252,7 @@ def main() -> None:
             model.save(run, ball())
             size = sum(path.stat().st_size for path in run.rglob("*") if path.is_file())
             start = time.process_time()
-            source = f"teacher:{run}?views=64&size=120x120&background=white"
+            source = f"teacher:{run}?size=120x120&background=white"
             command("train", source, "-o", made, "--preset", "tiny", "--iterations", options.iterations)
             command("encode", made, "-o", packed)
             quality = command("eval", packed, source)["levels"][-1]["mpsnr"]

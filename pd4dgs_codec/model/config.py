@@ -31,8 +31,8 @@ class ModelConfig:
     """Both deformations (None: absent), of equal channels and width, and the counts of anchors that training starts
     from and stays below.
 
-    Layer 1 is coarse in space and time. Layer 2 adds a scale that is finer in space and one that is finer in time too:
-    fast motion needs an instant for four pictures or so, but training does not find it with such planes alone.
+    Layer 1 is coarse in time. Layer 2 adds a scale that is finer in it: fast motion needs an instant for four pictures
+    or so, but training does not find it with such planes alone.
     """
 
     global_deformation: DeformationConfig | None
@@ -50,12 +50,12 @@ class ModelConfig:
 
 PRESETS: dict[str, ModelConfig] = {
     "tiny": ModelConfig(
-        DeformationConfig(((16, 16),), 8, 32),
-        DeformationConfig(((32, 16), (32, 48)), 8, 32),
+        DeformationConfig(((16, 16), (32, 16)), 8, 32),
+        DeformationConfig(((32, 48),), 8, 32),
         initial_anchors=5_000,
         max_anchors=12_000,
     ),
-    "small": ModelConfig(DeformationConfig(((32, 24),), 16, 64), DeformationConfig(((64, 24), (64, 72)), 16, 64)),
+    "small": ModelConfig(DeformationConfig(((32, 24), (64, 24)), 16, 64), DeformationConfig(((64, 72),), 16, 64)),
     # the grids of the paper: 291,840 and 1,904,640 values; its networks are 128 wide, these 64
     "paper": ModelConfig(
         DeformationConfig(((32, 10), (64, 10)), 16, 64),
