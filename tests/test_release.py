@@ -58,9 +58,7 @@ def test_a_release_has_public_addresses_and_no_dead_links(stamped):
     for name in ("README.md", "player/README.md"):
         links = re.findall(r"\]\(([^)]+)\)", text(name, stamped))
         assert links and all(link.startswith(("https:", "#")) for link in links)
-    assert f"![The scene after 48 kB, then refining to 300 kB while it plays]({URL}/raw/HEAD/docs/img/" in text(
-        "README.md", stamped
-    )
+    assert f"plays]({URL}/raw/HEAD/docs/img/refining.gif)" in text("README.md", stamped)
 
 
 def test_the_repository_names_no_address_of_its_own():
