@@ -81,8 +81,10 @@ def served(path: Path, size: int) -> Iterator[str]:
 
     with ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
         threading.Thread(target=server.serve_forever).start()
-        yield f"http://127.0.0.1:{server.server_port}"
-        server.shutdown()
+        try:
+            yield f"http://127.0.0.1:{server.server_port}"
+        finally:  # else a failing reader leaves a thread that the program waits for
+            server.shutdown()
 
 
 def node(path: Path, way: str, size: int) -> tuple[float, int]:

@@ -115,7 +115,7 @@ def timed(dataset, monkeypatch, clock, machine, limit: float = LIMIT) -> Trainer
     return trainer
 
 
-@pytest.mark.parametrize("machine", list(MACHINES)[1:])  # a quiet one is resumed below
+@pytest.mark.parametrize("machine", MACHINES)
 def test_a_time_limit_is_kept_and_the_schedule_completes(dataset, tmp_path, monkeypatch, clock, machine):
     turns, apply = [], Prune.apply
     monkeypatch.setattr(Prune, "apply", lambda self, *args: turns.append(self.turn) or apply(self, *args))
