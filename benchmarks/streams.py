@@ -140,12 +140,14 @@ ROWS = [
     ("Python, the newest scene kept", python, "kept"),
     ("Node, `Stream`", node, "stream"),
     ("Node, `SceneSource` of a server", node, "served"),
+    ("Node, reading the server alone", node, "serverAlone"),
     ("Node, `SceneSource` of a script's pieces", node, "source"),
-    ("Node, reading these alone", node, "pieces"),
+    ("Node, reading these alone", node, "sourceAlone"),
     ("Chromium, `Stream`", chromium, "stream"),
     ("Chromium, `SceneSource` of a server", chromium, "served"),
+    ("Chromium, reading the server alone", chromium, "serverAlone"),
     ("Chromium, `SceneSource` of a script's pieces", chromium, "source"),
-    ("Chromium, reading these alone", chromium, "pieces"),
+    ("Chromium, reading these alone", chromium, "sourceAlone"),
 ]
 
 

@@ -40,9 +40,15 @@ export async function least(work, clock, runs) {
   return found;
 }
 
-/** @typedef {"decode" | "stream" | "served" | "source" | "pieces"} Way */
+/** Reads an answer to its end. @param {Response} answered */
+async function drained({ body }) {
+  const reader = /** @type {ReadableStream} */ (body).getReader();
+  while (!(await reader.read()).done);
+}
 
-/** What one way does. "pieces" are those of "source", read alone; "served" reads a URL.
+/** @typedef {"decode" | "stream" | "served" | "serverAlone" | "source" | "sourceAlone"} Way */
+
+/** What one way does. "served" reads a URL; the ways "alone" read what "served" and "source" do and decode nothing.
  * @param {Uint8Array} bytes @param {Way} way @param {number} size of a piece @param {string} [url] */
 export function working(bytes, way, size, url = "") {
   const cuts = way === "stream" ? every(bytes, size) : [];
@@ -59,10 +65,8 @@ export function working(bytes, way, size, url = "") {
     source: async () => {
       for await (kept.scene of fetched(bytes, size));
     },
-    pieces: async () => {
-      const reader = /** @type {ReadableStream} */ (answer(bytes, size).body).getReader();
-      while (!(await reader.read()).done);
-    },
+    serverAlone: async () => drained(await fetch(url)),
+    sourceAlone: () => drained(answer(bytes, size)),
   };
   return ways[way];
 }
