@@ -26,9 +26,9 @@ from pd4dgs_codec.train.state import TrainingView, TrainState
 #: One training view in so many is held back until levels are selected, if there are enough of them.
 EVERY = 16
 MIN_VIEWS = 4
-#: A level stays if it is better by so many dB: level 2 by more, since level 1 has seen a tenth of the steps and has not
-#: caught up in its practice; level 1 together with what level 2 gained, for both tell that something moves, ...
-MIN_GAINS = {1: 1.5, 2: 2.0}
+#: A level stays if it is better by so many dB, level 1 together with what level 2 gained, for both tell that something
+#: moves, ...
+MIN_GAINS = {1: 1.5, 2: 1.0}
 #: ... in the pixels in which it changes some colour by so much, if there are so many of them, ...
 MIN_CONTRAST, MIN_PIXELS = 0.02, 32
 #: ... than the level below after so many further steps: a share of the run, and so many at least.
