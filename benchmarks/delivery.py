@@ -48,10 +48,15 @@ def latency_text(rows: Sequence[Row]) -> str:
 # -- slices ------------------------------------------------------------------------------------------------------------
 
 
+#: (bytes of a prefix, held-out mPSNR in dB).
+Point = tuple[int, float]
+
+
 def measure_slices(run: Run, scene: Scene) -> list[Row]:
-    """A row per slice of a file in slices, with the quality of the prefix that ends with it."""
+    """A row per slice of a file in slices, with the quality of the prefix that ends with it. whole: the same of every
+    layer of a file with one slice each."""
     size = "60k" if run.quick else "50k"
-    whole = run.packed(scene).stat().st_size
+    whole = [(row["bytes"], row["mpsnr"]) for row in levels(scene, run.packed(scene))]
     file = run.packed(scene, "--slices", size, *scene.data, name="slices")
     rows = []
     for layer in command("info", file)["layers"]:
@@ -63,32 +68,51 @@ def measure_slices(run: Run, scene: Scene) -> list[Row]:
     return [row | {"whole": whole} for row in rows]
 
 
+def share_of_bytes(slices: Sequence[Point], whole: Sequence[Point]) -> float:
+    """The median, over the qualities between the first prefix and the whole file, of the bytes that `slices` take to a
+    quality as a share of those that whole layers take."""
+    least, most = slices[0][1], min(slices[-1][1], whole[-1][1])
+    qualities = [least + (most - least) * i / 100 for i in range(1, 100)]
+    reached = [[next(size for size, found in curve if found >= q) for curve in (slices, whole)] for q in qualities]
+    return median(own / other for own, other in reached)
+
+
 def slices_text(rows: Sequence[Row]) -> str:
-    """One row per scene: what the first slice and layer 0 show, and what slices cost."""
+    """One row per scene: what the first slices show beside whole layers, and what slices cost."""
     cells = []
     for scene in dict.fromkeys(row["scene"] for row in rows):
         own = [row for row in rows if row["scene"] == scene]
-        base = [row for row in own if row["layer"] == 0][-1]
-        fall = max((a["mpsnr"] - b["mpsnr"] for a, b in pairwise(own)), default=0.0)
+        points, whole = [(row["bytes"], row["mpsnr"]) for row in own], own[0]["whole"]
+        moving = [point for point, row in zip(points, own, strict=True) if row["layer"]]
+        fall = max((a - b for (_, a), (_, b) in pairwise(points)), default=0.0)
+        shown = [whole[0], *moving[:1], points[-1]]
+        texts = [f"{number(quality)} in {size:,}" for size, quality in shown]
         cells.append(
-            (scene, len(own), number(own[0]["bytes"], 0), seconds_at(own[0]["bytes"]), number(own[0]["mpsnr"]))
-            + (f"{number(base['mpsnr'])} in {base['bytes']:,}", f"{number(own[-1]['mpsnr'])} in {own[-1]['bytes']:,}")
-            + (f"{own[-1]['bytes'] / own[-1]['whole'] - 1:+.1%}", number(max(fall, 0.0), 3))
+            (scene, len(own), number(points[0][0], 0), seconds_at(points[0][0]), number(points[0][1]), texts[0])
+            + (texts[1] if moving else "-", texts[-1], f"{points[-1][0] / whole[-1][0] - 1:+.1%}")
+            + (number(max(fall, 0.0), 3), number(share_of_bytes(points, whole)))
         )
-    head = ("scene", "slices", "first slice", "s at 2 Mbps", "mPSNR dB", "layer 0", "all", "cost", "largest fall dB")
+    head = ("scene", "slices", "first slice", "s at 2 Mbps", "mPSNR dB", "layer 0 whole", "first that moves", "all")
+    more = ("cost", "largest fall dB", "share")
     return (
-        "`pd4dgs-encode --slices 50k --data SOURCE`; the quality of every prefix on held-out views. *cost*: bytes "
-        f"beyond those of the same layers in one slice each.\n\n{table(head, cells)}"
+        "`pd4dgs-encode --slices 50k --data SOURCE`; the quality of every prefix on held-out views. *layer 0 whole* "
+        "and *cost* compare with a file of one slice for each layer. *share*: the bytes to a quality, of those that "
+        f"whole layers take; median of all qualities above the first slice's.\n\n{table((*head, *more), cells)}"
     )
 
 
 def slices_pictures(rows: Sequence[Row], folder: Path) -> list[str]:
-    """Quality over bytes, of two scenes."""
+    """Quality over bytes, of two scenes, beside that of whole layers."""
     scenes = list(dict.fromkeys(row["scene"] for row in rows))[: len(TWO)]
-    with drawing(folder / "slices.png", scenes, "held-out mPSNR, dB", (4.6, 3.4)) as axes:
+    with drawing(folder / "slices.png", scenes, "held-out mPSNR, dB", (4.6, 3.4), legend=True) as axes:
         for axis, scene in zip(axes, scenes, strict=True):
-            points = [(row["bytes"] / 1e3, row["mpsnr"]) for row in rows if row["scene"] == scene]
-            axis.plot(*zip(*points, strict=True), "-o", color="black", mfc="white")
+            own = [row for row in rows if row["scene"] == scene]
+            points = [(row["bytes"], row["mpsnr"]) for row in own]
+            for curve, style, name in ((own[0]["whole"], "s", "layers"), (points, "o", "slices")):
+                sizes, qualities = zip(*curve, strict=True)
+                colour = "black" if name == "slices" else "tab:blue"
+                axis.step([size / 1e3 for size in sizes], qualities, "-", color=colour, where="post", alpha=0.4)
+                axis.plot([size / 1e3 for size in sizes], qualities, style, color=colour, mfc="white", label=name)
             axis.set_xlabel("kB")
     return ["slices.png"]
 

@@ -26,7 +26,8 @@ that ends with a layer can be shown. Parts without visible effect are left out, 
 minute or more. Without --data only views of the file's own camera count.
 
 --slices 50k lets the first frame appear after 50 kB and improve with each further slice. The anchors that matter most
-in renderings come first. It takes minutes, too.
+in renderings come first; without target sizes others pass to a higher layer, so that motion need not wait for them. It
+takes minutes, too.
 
 {options.SOURCES}
 

@@ -142,7 +142,7 @@ def _signs(image: Tensor, generator: torch.Generator, weights: Tensor | None) ->
 
 # -- the order of anchors ----------------------------------------------------------------------------------------------
 
-#: Pixels along the longer side of the pictures for `utility`: holes are larger than such a pixel.
+#: Pixels along the longer side of the pictures that decide: holes are larger than such a pixel.
 SIDE = 128
 #: The share of a layer's anchors that stay after each round, and the count below which all leave in one round.
 STAY, FEW = 0.8, 64
@@ -151,37 +151,20 @@ STAY, FEW = 0.8, 64
 def utility(
     scene: Scene, places: Sequence[Place], step: Callable[[], None] = lambda: None, fewest: int = 0
 ) -> np.ndarray:
-    """float64 [N]: the order in which the anchors of each layer should come, the highest first: by the gain of the
-    pictures at `places` (times 0..1) per byte, at the layer's level with all earlier layers present. Anchors that reach
-    no picture have 0, the least. step is called after each round.
+    """float64 [n]: the order in which the n anchors of the highest layer should come, the highest first: by the gain of
+    the pictures at `places` (times 0..1) per byte, with all earlier layers present. Anchors that reach no picture have
+    0, the least. step is called after each round.
 
     Anchors leave one after another, the least first, as in a backward elimination, since the gain of an anchor depends
-    on the others: what stands behind it shows when it is gone. Omitting anchor i changes the squared error of a picture
-    I against that of the whole level by about -2 <I - J, dI/dg_i> + ||dI/dg_i||^2, g_i a gate on its opacities and
-    scales that goes from 1 to 0: the first term tells anchors that make up for absent ones from anchors that have
-    become wrong.
+    on the others: what stands behind it shows when it is gone. The last `fewest` are equal. Omitting anchor i changes
+    the squared error of a picture I against that of the whole level by about -2 <I - J, dI/dg_i> + ||dI/dg_i||^2, g_i a
+    gate on its opacities and scales that goes from 1 to 0: the first term tells anchors that make up for absent ones
+    from anchors that have become wrong.
     """
-    places = [(_smaller(camera), time) for camera, time in places]
-    rank, first = np.zeros(len(scene.anchor_q)), 0
-    for index, (layer, end) in enumerate(zip(scene.layers, scene.rows, strict=True)):
-        bits = layer_symbols(scene, index).bits_per_row()
-        rank[first:end] = _layer_utility(scene.prefix(layer), layer, first, bits, places, step, fewest)
-        first = end
-    return rank
-
-
-def _layer_utility(
-    scene: Scene,
-    level: int,
-    first: int,
-    bits: np.ndarray,
-    places: Sequence[Place],
-    step: Callable[[], None],
-    fewest: int,
-) -> np.ndarray:
-    """float64 [rows of the highest layer]: the round in which each anchor leaves, and its rank within the round."""
-    own = scene.rows[-1] - first
-    rank, alive = np.zeros(own), np.ones(own, bool)
+    places = [(smaller(camera), time) for camera, time in places]
+    level, first = scene.level, scene.rows[-2] if len(scene.rows) > 1 else 0
+    bits = layer_symbols(scene, len(scene.layers) - 1).bits_per_row()
+    rank, alive = np.zeros(len(bits)), np.ones(len(bits), bool)
     whole = from_scene(scene)
     references = [torch.from_numpy(render_image(whole, level, time, camera)) for camera, time in places]
     generator, rounds = torch.Generator().manual_seed(0), 0
@@ -216,7 +199,7 @@ def without(scene: Scene, rows: np.ndarray) -> Scene:
     )
 
 
-def _smaller(camera: Camera) -> Camera:
+def smaller(camera: Camera) -> Camera:
     """The same view with about SIDE pixels along the longer side."""
     factor = min(1.0, SIDE / max(camera.width, camera.height))
     width, height = (max(1, round(side * factor)) for side in (camera.width, camera.height))

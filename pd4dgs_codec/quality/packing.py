@@ -8,6 +8,8 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from pd4dgs_codec.format.decoder import every_prefix
 from pd4dgs_codec.format.encoder import Report, encode_with_report, with_metadata
 from pd4dgs_codec.format.metadata import Metadata
@@ -18,8 +20,6 @@ from pd4dgs_codec.quality.frames import Frame, dataset_frames, own_frames
 from pd4dgs_codec.scene import Scene
 
 if TYPE_CHECKING:
-    import numpy as np
-
     from pd4dgs_codec.data.view import Dataset, View
     from pd4dgs_codec.model.model import Model
 
@@ -90,7 +90,8 @@ def pack(
     slices and the gain of layers; without them the file's own camera takes the pictures, 1/downscale as wide and high,
     and layers are kept whatever they gain. min_gain: dB of mPSNR per megabyte below which a layer is left out, if all
     layers are asked for; 0 keeps all. metadata: stored in the file. With options.slices anchors are ordered by the gain
-    of the pictures per byte, in a file without views or a camera by size.
+    of the pictures per byte, and without target sizes some pass to later layers, see `slicing.in_order`; in a file
+    without views or a camera the largest come first.
 
     Only views, target sizes and slices need torch. Raises EncodeError, RenderError for a file without a camera.
     """
@@ -113,7 +114,7 @@ def pack(
         scene, more, target = pictures.fit(scene, options, target_sizes)
         left_out += more
     if options.slices:
-        data, report, slices = pictures.in_slices(scene, options, left_out, metadata)
+        data, report, slices = pictures.in_slices(scene, options, left_out, metadata, passing=target is None)
     else:
         slices = None
         data, report = encode_with_report(scene, options, left_out=left_out, metadata=metadata)
@@ -170,20 +171,31 @@ class _Pictures:
         return fitted, left_out + dropped, report
 
     def in_slices(
-        self, scene: Scene, options: EncodeOptions, left_out: list[LeftOut], metadata: Metadata | None
+        self,
+        scene: Scene,
+        options: EncodeOptions,
+        left_out: list[LeftOut],
+        metadata: Metadata | None,
+        *,
+        passing: bool,
     ) -> tuple[bytes, Report, dict[str, Any]]:
-        """(sliced file, its report, the slices of the report)."""
-        from pd4dgs_codec.model.sensitivity import utility
+        """(sliced file, its report, the slices of the report). passing: whether anchors may pass to later layers."""
         from pd4dgs_codec.quality.measure import true_psnr
+        from pd4dgs_codec.quality.slicing import in_order
 
         about: dict[str, Any] = {"order": "gate times area", "cameras": None, "pictures": 0}
         order: Callable[[Scene], np.ndarray] | None = None
         if frames := self.frames(scene) if self.views is not None or scene.info.camera is not None else []:
             about = {"order": "rendered gain per byte", "cameras": self.cameras, "pictures": len(frames)}
+            planned = plan(scene, options)
+            left_out = [*left_out, *planned.left_out]
+            with self.progress("ordering anchors") as step:
+                places = [(frame.camera, frame.time) for frame in frames]
+                scene, utility = in_order(planned.scene, places, options, step, passing=passing)
+            ranks = dict(zip(map(tuple, scene.anchor_q.tolist()), utility.tolist(), strict=True))
 
             def order(decoded: Scene) -> np.ndarray:
-                with self.progress("ordering anchors") as step:
-                    return utility(decoded, [(frame.camera, frame.time) for frame in frames], step)
+                return np.array([ranks[voxel] for voxel in map(tuple, decoded.anchor_q.tolist())])
 
         data, report = encode_with_report(scene, options, left_out=left_out, utility=order)
         if self.held_out:

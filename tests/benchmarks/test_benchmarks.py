@@ -18,6 +18,7 @@ import quality
 import run
 import viewers
 from common import QUICK, ROOT, Run, Training
+from delivery import share_of_bytes
 from PIL import Image
 from refining_gif import LIMIT
 from strategies import make_scene
@@ -86,6 +87,12 @@ def test_figures_are_of_the_files_that_were_packed(made):
     assert 0.95 < slices[-1]["bytes"] / (folder / "slices.pd4").stat().st_size < 1  # the metadata comes last
     rivals = {row["part"]: row for row in found["rivals"]["rows"]}
     assert rivals["attributes"]["ours"] < rivals["attributes"]["gauss"] and rivals["positions"]["lzma"] > 0
+
+
+def test_the_share_of_bytes_is_the_median_over_qualities():
+    """Most qualities take 60 bytes instead of 120."""
+    assert share_of_bytes([(40, 10.0), (60, 28.0), (120, 30.0)], [(80, 12.0), (120, 30.0)]) == 0.5
+    assert share_of_bytes([(40, 10.0), (120, 30.0)], [(80, 12.0), (120, 30.0)]) == 1.0
 
 
 def test_the_animation_has_a_picture_for_every_prefix(made):

@@ -11,8 +11,9 @@ from pd4dgs_codec.data.view import View
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
-from pd4dgs_codec.format.info import hashes, info, metadata_of
+from pd4dgs_codec.format.info import info, metadata_of
 from pd4dgs_codec.format.options import CHOICES, EncodeOptions
+from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.model.sensitivity import utility, without
 from pd4dgs_codec.quality.packing import Views, pack
 
@@ -74,8 +75,21 @@ def test_the_files_own_camera_decides(scene):
         "cameras": "the file's own camera",
         "pictures": 16,
     }
-    assert hashes(packed.data) == hashes(pack(scene, replace(SLICED, slices=0)).data)
+    whole, sliced = (decode(data) for data in (pack(scene, replace(SLICED, slices=0)).data, packed.data))
+    assert sliced.rows[0] <= whole.rows[0] and sliced.rows[1] < whole.rows[1]  # anchors wait for motion
+    assert sliced.rows[2] == whole.rows[2]
+    orders = [np.lexsort(found.anchor_q.T) for found in (whole, sliced)]
+    for before, after in zip(whole.attributes.values(), sliced.attributes.values(), strict=True):
+        np.testing.assert_array_equal(before[orders[0]], after[orders[1]])
     assert metadata_of(packed.data) is None
+
+
+def test_slices_of_target_sizes_leave_anchors_in_their_layers(scene):
+    sizes = {0: 6000, 1: 3000}
+    packed = pack(scene, SLICED, target_sizes=sizes)
+    added = packed.report.added_bytes()
+    assert all(added[layer] <= most * 1.1 for layer, most in sizes.items())
+    assert decode(packed.data).rows == decode(pack(scene, replace(SLICED, slices=0), target_sizes=sizes).data).rows
 
 
 def test_views_held_out_are_scored_after_each_slice(scene):
@@ -93,9 +107,11 @@ def test_views_held_out_are_scored_after_each_slice(scene):
 
 
 def test_anchors_that_show_nothing_are_worth_least(scene):
-    values = utility(scene, [(camera(), 0.0), (camera(), 1.0)])
-    assert values.shape == (len(scene.anchor_q),) and np.isfinite(values).all()
-    hidden = scene.mask[-1] == 0
+    first = plan(scene).scene.prefix(0)
+    dim = replace(first, mask=(np.where(np.arange(first.rows[0]) % 3 == 0, np.uint8(0), first.mask[0]),))
+    values = utility(dim, [(camera(), 0.0), (camera(), 1.0)])
+    assert values.shape == first.mask[0].shape and np.isfinite(values).all()
+    hidden = dim.mask[0] == 0
     assert hidden.any() and (values > 0).any() and (values[hidden] == 0).all()
 
 

@@ -1,0 +1,61 @@
+"""The order of a sliced file: anchors pass to the layer whose motion should come before them."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from strategies import make_scene
+from tiny import camera_ahead
+
+from pd4dgs_codec.format.options import EncodeOptions
+from pd4dgs_codec.format.plan import plan
+from pd4dgs_codec.quality.slicing import in_order
+
+PLACES = [(camera_ahead(3.0, 20.0, 24, 16), time) for time in (0.0, 0.5, 1.0)]
+OPTIONS = EncodeOptions(effort=1)
+
+
+def planned(seed=3, **options):
+    return plan(make_scene(seed, anchors=90, **options), OPTIONS).scene
+
+
+def by_voxel(scene):
+    order = np.lexsort(scene.anchor_q.T)
+    return [scene.anchor_q[order], *(values[order] for values in scene.attributes.values()), scene.mask[-1][order]]
+
+
+def moving(head, by):
+    """A scene of two layers, all of whose anchors are visible at both, and layer 1 adds `by` to what `head` changes."""
+    scene = planned(layers=(0, 1), heads=({head: 3}, None))
+    n = scene.rows[-1]
+    field = scene.global_deformation
+    ((weight, bias),) = field.networks[head]
+    networks = field.networks | {head: ((weight * 0, np.full_like(bias, by)),)}
+    masks = np.full((2, n), 255, np.uint8)
+    return replace(scene, rows=(n, n), mask=tuple(masks), global_deformation=replace(field, networks=networks))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_highest_level_stays_and_masks_rise(seed):
+    scene = planned(seed)
+    found, values = in_order(scene, PLACES, OPTIONS)
+    assert values.shape == scene.anchor_q.shape[:1] and found.rows[-1] == scene.rows[-1]
+    for before, after in zip(by_voxel(scene), by_voxel(found), strict=True):
+        np.testing.assert_array_equal(before, after)
+    assert (np.diff(np.stack(found.full_masks()).astype(int), axis=0) >= 0).all()
+    assert list(found.rows) == sorted(found.rows) and found.rows[0] > 0
+    assert all(after <= before for before, after in zip(scene.rows, found.rows, strict=True))
+    rearranged = plan(found, OPTIONS).scene  # as a file has them
+    assert rearranged.rows == found.rows
+
+
+def test_motion_of_everything_comes_before_most_anchors_and_motion_of_nothing_after_all():
+    far, still = moving("position", 3.0), moving("position", 0.0)
+    assert in_order(far, PLACES, OPTIONS)[0].rows[0] < 0.3 * far.rows[0]
+    assert in_order(still, PLACES, OPTIONS)[0].rows == still.rows
+
+
+def test_anchors_stay_where_they_may_not_pass():
+    scene = moving("position", 3.0)
+    found, _ = in_order(scene, PLACES, OPTIONS, passing=False)
+    assert found is scene
