@@ -280,8 +280,10 @@ def test_a_scene_that_needs_no_anchor_keeps_some(dataset, monkeypatch, rollout):
 
 
 def judged(dataset, monkeypatch, least):
-    """(a learner after its levels were judged with `least` as MIN_GAINS, its parameters and moments before)."""
-    monkeypatch.setattr(levels, "MIN_GAINS", dict.fromkeys(levels.MIN_GAINS, least))
+    """(a learner after its levels were judged with `least` as what they need, its parameters and moments before)."""
+    for name in ("MIN_GAIN_1", "MIN_GAIN_2"):
+        monkeypatch.setattr(levels, name, least)
+    monkeypatch.setattr(levels, "SHARE_2", min(least, 0.0))
     monkeypatch.setattr(levels, "MIN_PRACTICE", 3)
     learner = Trainer(TrainConfig(preset="tiny", iterations=30), replace(dataset, train=dataset.train * 12)).learner
     with torch.no_grad():
@@ -313,22 +315,27 @@ def test_levels_without_gain_go_from_the_top_and_leave_their_anchors(dataset, mo
     assert learner.model.masks(0).mean() > torch.sigmoid(before[3][:, 0]).mean() + 0.2
 
 
+@pytest.mark.usefixtures("short_runs_have_phases")
 @pytest.mark.parametrize(
-    "gains, kept", [((0.9, 0.7), 1), ((0.8, 0.6), 0), ((-3.0, 1.6), 1), ((-3.0, 1.4), 0), ((1.0, 0.0), 2)]
+    "gain_2, over_0, gain_1, kept",
+    [(0.6, 3.9, 0.0, 2), (0.6, 4.1, 1.0, 1), (0.6, 4.1, 0.8, 0)]
+    + [(0.4, 0.1, 1.2, 1), (0.4, 0.1, 1.0, 0), (-3.0, 9.0, 1.6, 1), (-3.0, 9.0, 1.4, 0)],
 )
-def test_what_level_2_gained_counts_for_level_1(dataset, monkeypatch, gains, kept):
+def test_level_2_needs_a_share_of_all_motion_and_counts_for_level_1(dataset, monkeypatch, gain_2, over_0, gain_1, kept):
     """Both tell that something moves: quick motion shows in level 2, and hardly in the few instants of level 1."""
-    monkeypatch.setattr(levels.SelectLevels, "_gain", lambda self, state, level, views, needed: gains[2 - level])
+    told = iter([over_0, gain_2, gain_1])
+    monkeypatch.setattr(levels, "gain_in", lambda *of: next(told))
+    monkeypatch.setattr(levels, "MIN_PIXELS", 0)
     learner, record = trainer_of(replace(dataset, train=dataset.train * 12)).learner, {}
     learner.levels.apply(learner, record)
-    assert learner.model.level == kept and record["level_gains"] == list(gains[: 3 - max(kept, 1)])
+    assert learner.model.level == kept and record["level_gains"] == [gain_2, gain_1][: 3 - max(kept, 1)]
 
 
 @pytest.mark.usefixtures("short_runs_have_phases")
 def test_a_removed_level_stays_away(dataset, tmp_path, monkeypatch):
     """From the model, its optimiser, the log, the file and a resumed run."""
     monkeypatch.setattr(
-        levels.SelectLevels, "_gain", lambda self, state, level, views, needed: 0.0 if level == 2 else 9.0
+        levels.SelectLevels, "_gain", lambda self, state, level, views, above: (0.0 if level == 2 else 9.0, 1.0)
     )
     views = replace(dataset, train=dataset.train * 12)
     config = TrainConfig(preset="tiny", iterations=30)

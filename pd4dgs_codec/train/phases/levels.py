@@ -26,9 +26,9 @@ from pd4dgs_codec.train.state import TrainingView, TrainState
 #: One training view in so many is held back until levels are selected, if there are enough of them.
 EVERY = 16
 MIN_VIEWS = 4
-#: A level stays if it is better by so many dB, level 1 together with what level 2 gained, for both tell that something
-#: moves, ...
-MIN_GAINS = {1: 1.5, 2: 1.0}
+#: Level 1 stays if it is better by so many dB, together with what level 2 gained, for both tell that something moves;
+#: level 2 if it gains this share of what it gains over level 0, and so many dB at least, ...
+MIN_GAIN_1, SHARE_2, MIN_GAIN_2 = 1.5, 0.15, 0.5
 #: ... in the pixels in which it changes some colour by so much, if there are so many of them, ...
 MIN_CONTRAST, MIN_PIXELS = 0.02, 32
 #: ... than the level below after so many further steps: a share of the run, and so many at least.
@@ -56,8 +56,7 @@ class SelectLevels(phases.Phase):
         above = 0.0
         while state.model.level:
             level, views = state.model.level, [state.views[index] for index in sorted(held_back_views(state))]
-            needed = MIN_GAINS[level] - above
-            gain = self._gain(state, level, views, needed)
+            gain, needed = self._gain(state, level, views, above)
             gains.append(gain)
             if gain >= needed:
                 break
@@ -66,21 +65,24 @@ class SelectLevels(phases.Phase):
             self.left_out.append({"level": level, "gain": gain, "views": len(views)})
         record["left_out"] = self.left_out
 
-    def _gain(self, state: TrainState, level: int, views: list[TrainingView], needed: float) -> float:
-        """By how many dB `level` is better in the pixels that it changes than the level below after practice. The state
-        is as before if that is what is `needed` for the level to stay."""
+    def _gain(self, state: TrainState, level: int, views: list[TrainingView], above: float) -> tuple[float, float]:
+        """(by how many dB `level` is better in the pixels that it changes than the level below after practice, what it
+        needs to stay). The state is as before if the level stays. above: what the level above gained."""
         below = max(layer for layer in (0, *state.model.deformations) if layer < level)
-        pictures = [images(state, view, (below, level)) for view in views]
-        acts = [changes(*pair) for pair in pictures]
+        pictures = [images(state, view, (0, below, level)) for view in views]
+        acts = [changes(*pair) for _, *pair in pictures]
+        still, with_it = [found[0] for found in pictures], [found[-1] for found in pictures]
+        needed = MIN_GAIN_1 - above
+        if level == 2:
+            needed = max(MIN_GAIN_2, SHARE_2 * workers.alike(lambda: gain_in(views, acts, still, with_it)))
         before, logits = state.snapshot(), state.model.mask_logits
         with torch.no_grad():
             logits[:, below] += softplus(logits[:, level])  # the anchors of the level, without its motion
         if sum(int(mask.sum()) for mask in acts) < MIN_PIXELS:
-            return 0.0
+            return 0.0, needed
 
         def measure() -> float:
-            without = [images(state, view, (below,))[0] for view in views]
-            return gain_in(views, acts, without, [with_it for _, with_it in pictures])
+            return gain_in(views, acts, [images(state, view, (below,))[0] for view in views], with_it)
 
         gain = math.inf
         try:
@@ -89,7 +91,7 @@ class SelectLevels(phases.Phase):
         finally:  # a picture that is not finite ends the phase, and the level stays
             if gain >= needed:
                 state.return_to(before)
-        return gain
+        return gain, needed
 
     def stored(self) -> dict[str, Any]:
         """left_out, as JSON."""
