@@ -49,7 +49,7 @@ def text(rows: Sequence[Row]) -> str:
     return (
         f"`pd4dgs-train 'synthetic:SCENE?seed=SEED' --preset tiny --iterations {STEPS}`: the camera sweeps. "
         "*gain*: dB by which a level stays or goes, in pixels that it changes of views held back from training, over "
-        f"the level below after practice. 2 needs {SHARE_2:.0%} of what it gains over level 0, and {MIN_GAIN_2:g} dB at "
+        f"the level below after practice. 2 needs {SHARE_2:.0%} of what it gains over level 0, {MIN_GAIN_2:g} dB at "
         f"least; 1 needs {MIN_GAIN_1:g} dB, to which the gain of 2 counts, and is judged where 2 goes.\n\n"
         f"{table(head, cells)}"
     )
