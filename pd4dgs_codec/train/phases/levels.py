@@ -28,7 +28,7 @@ EVERY = 16
 MIN_VIEWS = 4
 #: Level 1 stays if it is better by so many dB, together with what level 2 gained, for both tell that something moves;
 #: level 2 if it gains this share of what it gains over level 0, and so many dB at least, ...
-MIN_GAIN_1, SHARE_2, MIN_GAIN_2 = 1.5, 0.15, 0.5
+MIN_GAIN_1, SHARE_2, MIN_GAIN_2 = 1.1, 0.15, 0.5
 #: ... in the pixels in which it changes some colour by so much, if there are so many of them, ...
 MIN_CONTRAST, MIN_PIXELS = 0.02, 32
 #: ... than the level below after so many further steps: a share of the run, and so many at least.
@@ -47,8 +47,9 @@ class SelectLevels(phases.Phase):
         self.left_out: list[dict[str, Any]] = []
 
     def due(self, state: TrainState) -> bool:
-        """At `Schedule.rounding`, if views are held back for it."""
-        return state.reached(state.schedule.rounding) and bool(held_back_views(state))
+        """At `Schedule.rounding`, if views are held back for it and a timed run has not become too slow."""
+        judges = state.reached(state.schedule.rounding) and bool(held_back_views(state))
+        return judges and state.steps_in(1.0) >= phases.MIN_ITERATIONS
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
         """From the highest level down, until one stays."""
