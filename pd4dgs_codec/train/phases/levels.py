@@ -34,6 +34,9 @@ MIN_CONTRAST, MIN_PIXELS = 0.02, 32
 #: ... than the level below after so many further steps: a share of the run, and so many at least.
 PRACTICE, MIN_PRACTICE = 1 / 10, 75
 
+#: A timed run of fewer steps keeps its levels: quick motion is not learnt by then, and nobody has asked for so few.
+MIN_TIMED = 1000
+
 
 class SelectLevels(phases.Phase):
     """Where planes and weights begin to be rounded, removes the levels of little use.
@@ -49,7 +52,7 @@ class SelectLevels(phases.Phase):
     def due(self, state: TrainState) -> bool:
         """At `Schedule.rounding`, if views are held back for it and a timed run has not become too slow."""
         judges = state.reached(state.schedule.rounding) and bool(held_back_views(state))
-        return judges and state.steps_in(1.0) >= phases.MIN_ITERATIONS
+        return judges and (state.share is None or state.steps_in(1.0) >= MIN_TIMED)
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
         """From the highest level down, until one stays."""
