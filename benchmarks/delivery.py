@@ -108,11 +108,10 @@ def slices_pictures(rows: Sequence[Row], folder: Path) -> list[str]:
         for axis, scene in zip(axes, scenes, strict=True):
             own = [row for row in rows if row["scene"] == scene]
             points = [(row["bytes"], row["mpsnr"]) for row in own]
-            for curve, style, name in ((own[0]["whole"], "s", "layers"), (points, "o", "slices")):
-                sizes, qualities = zip(*curve, strict=True)
-                colour = "black" if name == "slices" else "tab:blue"
-                axis.step([size / 1e3 for size in sizes], qualities, "-", color=colour, where="post", alpha=0.4)
-                axis.plot([size / 1e3 for size in sizes], qualities, style, color=colour, mfc="white", label=name)
+            curves = (own[0]["whole"], "-s", "tab:blue", "layers"), (points, "-o", "black", "slices")
+            for curve, style, colour, name in curves:
+                sizes, qualities = zip(*((size / 1e3, quality) for size, quality in curve), strict=True)
+                axis.step(sizes, qualities, style, color=colour, mfc="white", where="post", label=name)
             axis.set_xlabel("kB")
     return ["slices.png"]
 

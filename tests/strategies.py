@@ -161,6 +161,12 @@ def make_scene(
     )
 
 
+def by_voxel(scene: Scene) -> list[np.ndarray]:
+    """Voxels, attributes and codes at the highest level of all anchors, in an order that no layer decides."""
+    order = np.lexsort(scene.anchor_q.T)
+    return [values[order] for values in (scene.anchor_q, *scene.attributes.values(), scene.mask[-1])]
+
+
 @cache
 def small_file(layers: tuple[int, ...] = (0, 1, 2), **options: object) -> bytes:
     """make_scene(7) with twenty anchors as a file, encoded by the first test that asks and not while tests are

@@ -88,7 +88,7 @@ def plan(scene: Scene, options: EncodeOptions = DEFAULTS) -> Plan:
         scene, dropped = _drop_heads(scene, LAYER_KINDS[layer])
         left_out += dropped
     kept = [layer for layer in scene.layers if layer == 0 or not auto or scene.deformation(layer) is not None]
-    arranged, inactive = _arranged(scene, tuple(kept))
+    arranged, inactive = in_file_order(scene, tuple(kept))
     if inactive:
         why = f"mask at or below the threshold at level {scene.level}"
         left_out.append(LeftOut(f"{inactive} anchors", why, anchors=inactive))
@@ -136,7 +136,15 @@ def _drop_heads(scene: Scene, kind: LayerKind) -> tuple[Scene, list[LeftOut]]:
     return scene.with_tensors(kind.layer, rest), gone
 
 
-def _arranged(scene: Scene, kept: tuple[int, ...]) -> tuple[Scene, int]:
+def passed(scene: Scene, index: int, rows: np.ndarray) -> Scene:
+    """The scene, not planned, in which the anchors `rows` (int64 [n]) of scene.layers[index] come with the next layer:
+    their mask codes of this one are 0."""
+    masks = scene.full_masks()
+    masks[index][rows] = 0
+    return replace(scene, rows=(scene.rows[-1],) * len(masks), mask=tuple(masks))
+
+
+def in_file_order(scene: Scene, kept: tuple[int, ...]) -> tuple[Scene, int]:
     """(scene with the layers `kept` and rows sorted by (layer, Morton order), number of anchors dropped)."""
     codes = scene.full_masks()
     by_layer = dict(zip(scene.layers, codes, strict=True))

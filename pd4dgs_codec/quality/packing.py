@@ -8,8 +8,6 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from pd4dgs_codec.format.decoder import every_prefix
 from pd4dgs_codec.format.encoder import Report, encode_with_report, with_metadata
 from pd4dgs_codec.format.metadata import Metadata
@@ -20,6 +18,8 @@ from pd4dgs_codec.quality.frames import Frame, dataset_frames, own_frames
 from pd4dgs_codec.scene import Scene
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from pd4dgs_codec.data.view import Dataset, View
     from pd4dgs_codec.model.model import Model
 
@@ -191,11 +191,10 @@ class _Pictures:
             left_out = [*left_out, *planned.left_out]
             with self.progress("ordering anchors") as step:
                 places = [(frame.camera, frame.time) for frame in frames]
-                scene, utility = in_order(planned.scene, places, options, step, passing=passing)
-            ranks = dict(zip(map(tuple, scene.anchor_q.tolist()), utility.tolist(), strict=True))
+                scene, values = in_order(planned.scene, places, options, step, passing=passing)
 
-            def order(decoded: Scene) -> np.ndarray:
-                return np.array([ranks[voxel] for voxel in map(tuple, decoded.anchor_q.tolist())])
+            def order(_: Scene) -> np.ndarray:
+                return values
 
         data, report = encode_with_report(scene, options, left_out=left_out, utility=order)
         if self.held_out:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from pd4dgs_codec.format.options import EncodeOptions
-from pd4dgs_codec.format.plan import tensor_bytes
+from pd4dgs_codec.format.plan import in_file_order, passed, tensor_bytes
 from pd4dgs_codec.format.registry import LAYER_KINDS
 from pd4dgs_codec.format.symbols import layer_symbols
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.model.sensitivity import Place, smaller, utility, without
+from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import Scene
 
 #: So many parts of a layer's bytes, after each of which the next layer may begin.
@@ -28,38 +28,45 @@ def in_order(
     *,
     passing: bool = True,
 ) -> tuple[Scene, np.ndarray]:
-    """(a planned scene, some of whose anchors have passed to the next layer, float64 [N] the utility of all in their
-    layers, see `utility`).
+    """(a planned scene, some of whose anchors have passed to the next layer, in the order of a file; float64 [N] the
+    utility of all in their layers, see `utility`).
 
     A layer keeps its most useful anchors until the next layer's planes and networks gain the pictures at `places` more
     per byte than its own next anchors would; with `passing` the others pass. The highest level stays as it is. step is
     called after each round of `utility`.
     """
-    places = [(smaller(camera), time) for camera, time in places]
-    found = list[np.ndarray]()
+    shots = [(smaller(camera), time) for camera, time in places]
+    whole, found = _pictures(scene, scene.level, shots), list[np.ndarray]()
     for index, layer in enumerate(scene.layers):
-        own = utility(scene.prefix(layer), places, step)
+        own = utility(scene.prefix(layer), shots, step)
         if passing and layer < scene.level:
-            first, order = scene.rows[index] - len(own), np.argsort(-own, kind="stable")
-            order = order[: _enough(scene, index, first + order, places, options)]
-            scene, own = _keeping(scene, index, first + order), own[order]
+            order = np.argsort(-own, kind="stable")
+            first = scene.rows[index] - len(own)
+            kept, others = np.split(order, [_enough(scene, index, first + order, shots, whole, options)])
+            own = own[kept[morton_order(scene.anchor_q[first + kept])]]
+            scene, _ = in_file_order(passed(scene, index, first + others), scene.layers)
         found.append(own)
     return scene, np.concatenate(found)
 
 
-def _enough(scene: Scene, index: int, order: np.ndarray, places: Sequence[Place], options: EncodeOptions) -> int:
+def _enough(
+    scene: Scene,
+    index: int,
+    order: np.ndarray,
+    shots: Sequence[Place],
+    whole: Sequence[np.ndarray],
+    options: EncodeOptions,
+) -> int:
     """How many anchors of scene.layers[index] come before the next layer. order: int64 [n], its rows, the most useful
-    one first."""
+    one first. whole: the pictures of the highest level."""
     level, above = scene.layers[index : index + 2]
-    whole = from_scene(scene)
-    references = [render_image(whole, scene.level, time, camera) for camera, time in places]
 
     def error(level: int, count: int) -> float:
         """The squared error of the pictures at `level` with so many of the anchors and none of later layers."""
-        later = np.arange(scene.rows[index], scene.prefix(level).rows[-1])
-        model = from_scene(without(scene.prefix(level), np.concatenate([order[count:], later])))
-        pictures = (render_image(model, level, time, camera) for camera, time in places)
-        return float(sum(np.square(a - b).sum() for a, b in zip(pictures, references, strict=True)))
+        prefix = scene.prefix(level)
+        later = np.arange(scene.rows[index], prefix.rows[-1])
+        shown = _pictures(without(prefix, np.concatenate([order[count:], later])), level, shots)
+        return float(sum(np.square(a - b).sum() for a, b in zip(shown, whole, strict=True)))
 
     motion = tensor_bytes(scene.tensors(above), LAYER_KINDS[above], scene.steps, options)
     size = np.cumsum(layer_symbols(scene, index).bits_per_row()[order - (scene.rows[index] - len(order))]) / 8
@@ -75,12 +82,7 @@ def _enough(scene: Scene, index: int, order: np.ndarray, places: Sequence[Place]
     return len(order)
 
 
-def _keeping(scene: Scene, index: int, rows: np.ndarray) -> Scene:
-    """The scene in which scene.layers[index] keeps the anchors `rows`, int64 [n], in this order; the others pass to the
-    next layer."""
-    first, end = (scene.rows[index - 1] if index else 0), scene.rows[index]
-    passed = np.setdiff1d(np.arange(first, end), rows)
-    order = np.concatenate([np.arange(first), rows, passed, np.arange(end, scene.rows[-1])])
-    counts = (*scene.rows[:index], first + len(rows), *scene.rows[index + 1 :])
-    masks = tuple(codes[order][:n] for codes, n in zip(scene.full_masks(), counts, strict=True))
-    return replace(scene, rows=counts, mask=masks, **scene.of_anchors(order))
+def _pictures(scene: Scene, level: int, shots: Sequence[Place]) -> list[np.ndarray]:
+    """The pictures [H, W, 3] at `level`."""
+    model = from_scene(scene)
+    return [render_image(model, level, time, camera) for camera, time in shots]

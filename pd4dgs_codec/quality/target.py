@@ -22,7 +22,7 @@ from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.payload import write_layer
-from pd4dgs_codec.format.plan import LeftOut, Plan, plan
+from pd4dgs_codec.format.plan import LeftOut, Plan, passed, plan
 from pd4dgs_codec.format.registry import LAYER_KINDS
 from pd4dgs_codec.scene import Scene
 
@@ -232,10 +232,10 @@ class _Layer:
         steps = list(scene.attributes) if layer == 0 else []
         if layer == 0 or scene.deformation(layer) is not None:
             steps += LAYER_KINDS[layer].step_names
-        self.masks = scene.full_masks()
-        active = self.masks[self.index] > 0
+        masks = scene.full_masks()
+        active = masks[self.index] > 0
         if self.index:
-            active &= self.masks[self.index - 1] == 0
+            active &= masks[self.index - 1] == 0
         own = np.flatnonzero(active)
         errors = omission_error(scene, layer)[own]
         order = np.argsort(errors, kind="stable")
@@ -252,10 +252,7 @@ class _Layer:
         """The scene at a setting, not planned: steps not rounded, rows with the anchors that left."""
         given = vars(self.scene.steps)
         steps = replace(self.scene.steps, **{k: given[k] * 2.0**v for k, v in setting.items() if k != ANCHORS})
-        masks = [codes.copy() for codes in self.masks]
-        masks[self.index][self.order[: self._moved(setting)]] = 0
-        rows = (len(self.scene.anchor_q),) * len(masks)
-        return replace(self.scene, steps=steps, mask=tuple(masks), rows=rows)
+        return replace(passed(self.scene, self.index, self.order[: self._moved(setting)]), steps=steps)
 
     def size(self, setting: Setting, effort: int = SEARCH_EFFORT) -> int:
         """Bytes that the layer adds to the file; 0 if the plan leaves it out."""

@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from strategies import make_scene
+from strategies import by_voxel, make_scene
 from tiny import camera_ahead
 
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import plan
+from pd4dgs_codec.model.sensitivity import utility
 from pd4dgs_codec.quality.slicing import in_order
 
 PLACES = [(camera_ahead(3.0, 20.0, 24, 16), time) for time in (0.0, 0.5, 1.0)]
@@ -19,18 +20,13 @@ def planned(seed=3, **options):
     return plan(make_scene(seed, anchors=90, **options), OPTIONS).scene
 
 
-def by_voxel(scene):
-    order = np.lexsort(scene.anchor_q.T)
-    return [scene.anchor_q[order], *(values[order] for values in scene.attributes.values()), scene.mask[-1][order]]
-
-
-def moving(head, by):
-    """A scene of two layers, all of whose anchors are visible at both, and layer 1 adds `by` to what `head` changes."""
-    scene = planned(layers=(0, 1), heads=({head: 3}, None))
+def moving(by):
+    """A scene of two layers whose anchors are visible at both; layer 1 moves them by `by` along each axis."""
+    scene = planned(layers=(0, 1), heads=({"position": 3}, None))
     n = scene.rows[-1]
     field = scene.global_deformation
-    ((weight, bias),) = field.networks[head]
-    networks = field.networks | {head: ((weight * 0, np.full_like(bias, by)),)}
+    ((weight, bias),) = field.networks["position"]
+    networks = field.networks | {"position": ((weight * 0, np.full_like(bias, by)),)}
     masks = np.full((2, n), 255, np.uint8)
     return replace(scene, rows=(n, n), mask=tuple(masks), global_deformation=replace(field, networks=networks))
 
@@ -47,15 +43,28 @@ def test_the_highest_level_stays_and_masks_rise(seed):
     assert all(after <= before for before, after in zip(scene.rows, found.rows, strict=True))
     rearranged = plan(found, OPTIONS).scene  # as a file has them
     assert rearranged.rows == found.rows
+    np.testing.assert_array_equal(rearranged.anchor_q, found.anchor_q)
+
+
+def test_values_belong_to_the_anchors_in_the_order_of_a_file():
+    """Morton order depends on which anchors a layer has."""
+    scene = moving(3.0)
+    found, values = in_order(scene, PLACES, OPTIONS)
+    assert 0 < found.rows[0] < found.rows[1]
+    of_voxel = dict(zip(map(tuple, scene.anchor_q.tolist()), utility(scene.prefix(0), PLACES), strict=True))
+    own = [of_voxel[voxel] for voxel in map(tuple, found.anchor_q[: found.rows[0]].tolist())]
+    np.testing.assert_array_equal(values[: found.rows[0]], own)
+    assert sorted(own) == sorted(of_voxel.values())[-len(own) :]
+    np.testing.assert_array_equal(values[found.rows[0] :], utility(found, PLACES))
 
 
 def test_motion_of_everything_comes_before_most_anchors_and_motion_of_nothing_after_all():
-    far, still = moving("position", 3.0), moving("position", 0.0)
+    far, still = moving(3.0), moving(0.0)
     assert in_order(far, PLACES, OPTIONS)[0].rows[0] < 0.3 * far.rows[0]
     assert in_order(still, PLACES, OPTIONS)[0].rows == still.rows
 
 
 def test_anchors_stay_where_they_may_not_pass():
-    scene = moving("position", 3.0)
+    scene = moving(3.0)
     found, _ = in_order(scene, PLACES, OPTIONS, passing=False)
     assert found is scene

@@ -73,25 +73,25 @@ class SelectLevels(phases.Phase):
         """(by how many dB `level` is better in the pixels that it changes than the level below after practice, what it
         needs to stay). The state is as before if the level stays. above: what the level above gained."""
         below = max(layer for layer in (0, *state.model.deformations) if layer < level)
-        pictures = [images(state, view, (0, below, level)) for view in views]
-        acts = [changes(*pair) for _, *pair in pictures]
-        still, with_it = [found[0] for found in pictures], [found[-1] for found in pictures]
+        pictures = [images(state, view, (below, level)) for view in views]
+        acts, with_it = [changes(*pair) for pair in pictures], [shown for _, shown in pictures]
+
+        def gain_over(other: int) -> float:
+            return gain_in(views, acts, [images(state, view, (other,))[0] for view in views], with_it)
+
         needed = MIN_GAIN_1 - above
         if level == 2:
-            needed = max(MIN_GAIN_2, SHARE_2 * workers.alike(lambda: gain_in(views, acts, still, with_it)))
+            needed = max(MIN_GAIN_2, SHARE_2 * workers.alike(lambda: gain_over(0)))
         before, logits = state.snapshot(), state.model.mask_logits
         with torch.no_grad():
             logits[:, below] += softplus(logits[:, level])  # the anchors of the level, without its motion
         if sum(int(mask.sum()) for mask in acts) < MIN_PIXELS:
             return 0.0, needed
 
-        def measure() -> float:
-            return gain_in(views, acts, [images(state, view, (below,))[0] for view in views], with_it)
-
         gain = math.inf
         try:
             self._practise(below, max(MIN_PRACTICE, state.steps_in(PRACTICE)))
-            gain = workers.alike(measure)
+            gain = workers.alike(lambda: gain_over(below))
         finally:  # a picture that is not finite ends the phase, and the level stays
             if gain >= needed:
                 state.return_to(before)
