@@ -13,7 +13,6 @@ from pd4dgs_codec.format.symbols import layer_symbols
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.model.sensitivity import Place, smaller, utility, without
-from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import Scene
 
 #: So many parts of a layer's bytes, after each of which the next layer may begin.
@@ -43,8 +42,10 @@ def in_order(
             order = np.argsort(-own, kind="stable")
             first = scene.rows[index] - len(own)
             kept, others = np.split(order, [_enough(scene, index, first + order, shots, whole, options)])
-            own = own[kept[morton_order(scene.anchor_q[first + kept])]]
+            voxels = scene.anchor_q[first + kept]
             scene, _ = in_file_order(passed(scene, index, first + others), scene.layers)
+            by_voxel = np.lexsort(scene.anchor_q[first : first + len(kept)].T)
+            own = own[kept[np.lexsort(voxels.T)]][np.argsort(by_voxel)]
         found.append(own)
     return scene, np.concatenate(found)
 
