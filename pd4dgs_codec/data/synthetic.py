@@ -26,7 +26,12 @@ SUPERSAMPLING = 2
 SECONDS = 59 / 12
 #: Allowed values of the options.
 SIZES, FRAMES = range(8, 8193), range(3, 10_001)
-EXAMPLES = {"seed": "seed=1", "size": "size=960x540", "frames": "frames=300", "path": "path=pass, sweeps or jump"}
+EXAMPLES = {
+    "seed": "seed=1",
+    "size": f"size=960x540, each {SIZES[0]} to {SIZES[-1]}",
+    "frames": f"frames=300, {FRAMES[0]} to {FRAMES[-1]}",
+    "path": "path=pass, sweeps or jump",
+}
 #: How often the camera goes to and fro; None: it is at a random place at each instant. If it passes each place once,
 #: place and time are the same, and a static scene with a view-dependent look explains every motion.
 PATHS = {"pass": 0.5, "sweeps": 2.5, "jump": None}

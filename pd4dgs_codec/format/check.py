@@ -67,7 +67,9 @@ def _check_masks(scene: Scene) -> None:
     for layer, rows, codes in zip(scene.layers, scene.rows, scene.mask, strict=True):
         expect_array(f"mask of layer {layer}", codes, np.uint8, (rows,))
         odd = (codes > 0) & (codes < MASK_MIN_CODE)
-        expect(not odd.any(), f"mask of layer {layer}: a code in 1..{MASK_MIN_CODE - 1}, expected 0 or more")
+        expect(
+            not odd.any(), f"mask of layer {layer}: a code below {MASK_MIN_CODE}, expected 0 or {MASK_MIN_CODE}..255"
+        )
     for (low, high), layer in zip(pairwise(scene.mask), scene.layers[1:], strict=True):
         expect(bool((high[: low.size] >= low).all()), f"mask of layer {layer} falls below that of the layer before")
 

@@ -237,7 +237,7 @@ class Stream:
         """
         if self._error is not None:
             raise self._error
-        self._buffer += data
+        self._buffer.extend(data)  # `+=` of an array would add numbers
         if self.consumed + len(self._buffer) < self._needs:
             return []
         scenes, pending = list[Scene](), False

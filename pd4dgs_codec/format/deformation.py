@@ -103,6 +103,8 @@ def check_tensors(tensors: Deformation, kind: LayerKind, widths: Widths, below: 
     channels_below = len(below.planes[0]["xy"]) if below else 0
     for s, planes in enumerate(tensors.planes):
         expect(set(planes) == {p for p, _, _ in PLANES}, f"{own} scale {s}: planes {sorted(planes)}, expected six")
+        flat = [name for name, plane in planes.items() if plane.ndim != 3]
+        expect(not flat, f"{own} scale {s}: planes {flat} do not have 3 axes")
         channels, first = len(planes["xy"]), channels_below or len(tensors.planes[0]["xy"])
         expect(channels == first, f"{own} scale {s}: {channels} channels, expected {first} as in the first scale")
         expect(min(channels, *plane_sides(planes)) >= 1, f"{own} scale {s}: an empty plane")

@@ -75,6 +75,7 @@ def quantise(
 
 def all_finite(k: np.ndarray, step: float) -> bool:
     """Whether dequantise(k, step) holds no infinity; |k| <= MAX_SYMBOL."""
+    step = float(step)  # not a binary32 of numpy, whose products are binary32 too
     if MAX_SYMBOL * step < _TO_INFINITY:
         return True
     return magnitude(k) * step < _TO_INFINITY

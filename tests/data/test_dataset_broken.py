@@ -375,8 +375,10 @@ SYNTHETIC = {
     "nothing?seed=1": "expected synthetic:static",
     **{
         f"static?{query}": f"{query.split('=')[0]} is {query.split('=')[1]!r}; expected for example"
-        for query in ("seed=-1", "seed=x", "size=160", "size=7x160", "size=9000x90", "frames=2", "frames=", "path=1")
+        for query in ("seed=-1", "seed=x", "size=160", "size=9000x90", "frames=", "path=1")
     },
+    "static?size=7x160": "size is '7x160'; expected for example size=960x540, each 8 to 8192",
+    "static?frames=2": "frames is '2'; expected for example frames=300, 3 to 10000",
     **{
         f"static?{query}": "expected each of seed, size, frames, path once at most, as key=value"
         for query in ("", "a", "seed=1&a", "seed=1&seed=1", "seed=1&")

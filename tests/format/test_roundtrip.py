@@ -120,7 +120,7 @@ FAULTS = {
     "holds more than one anchor": broken(
         "anchor_q", lambda a: np.zeros_like(a), mask=tuple(np.full(6, 9, np.uint8) for _ in range(3))
     ),
-    "mask of layer 1: a code in 1..2": broken("mask", lambda m: (m[0], np.full_like(m[1], 2), m[2])),
+    "layer 1: a code below 3, expected 0 or 3..255": broken("mask", lambda m: (m[0], np.full_like(m[1], 2), m[2])),
     "mask of layer 2 falls": broken("mask", lambda m: (np.full_like(m[0], 9),) * 2 + (np.full_like(m[0], 8),)),
     "scaffold networks .'color'. are missing": broken("networks", lambda n: {k: n[k] for k in n if k != "color"}),
     "layers": broken("layers", lambda _: (0, 2, 1)),
@@ -130,6 +130,9 @@ FAULTS = {
     ),
     "planes.*expected six": broken(
         "local_deformation", lambda d: replace(d, planes=({k: v for k, v in d.planes[0].items() if k != "xt"},))
+    ),
+    r"scale 0: planes \['xy'\] do not have 3 axes": broken(
+        "global_deformation", lambda d: replace(d, planes=({**d.planes[0], "xy": d.planes[0]["xy"][0]},))
     ),
     "voxel_size": broken("info", lambda i: replace(i, voxel_size=0.0)),
     "info: a value": broken("info", lambda i: replace(i, near=float("inf"))),
@@ -159,6 +162,14 @@ def test_scenes_that_cannot_be_written_are_refused_in_one_line(message):
 def test_unknown_options_are_refused(options):
     with pytest.raises(EncodeError, match="expected"):
         encode(make_scene(0), **options)
+
+
+@pytest.mark.filterwarnings("error")
+def test_numbers_may_be_those_of_numpy():
+    scene = make_scene(0)
+    voxel, feature = np.float32(scene.info.voxel_size), np.float32(scene.steps.feature)
+    same = replace(scene, info=replace(scene.info, voxel_size=voxel), steps=replace(scene.steps, feature=feature))
+    assert encode(same, layers=2) == encode(scene, layers=2)
 
 
 def test_sizes_over_the_format_limits_are_refused_without_verification():

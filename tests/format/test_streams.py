@@ -70,6 +70,14 @@ def test_any_split_ends_in_the_scene_of_decoding(split):
     assert_same_scene(scenes[-2], decode(many_slices(), max_layer=0))
 
 
+@pytest.mark.parametrize("kind", [bytearray, memoryview, lambda piece: np.frombuffer(piece, np.uint8)])
+def test_pieces_of_any_kind_of_bytes(kind):
+    data, stream = many_slices(), open_stream()
+    scenes = [scene for at in range(0, len(data), 1000) for scene in stream.feed(kind(data[at : at + 1000]))]
+    stream.finish()
+    assert_same_scene(scenes[-1], decode(data))
+
+
 def test_scenes_stay_as_they_were():
     scenes = streamed(SPLITS["slices"]())
     assert len(scenes) == len(ends())
