@@ -14,7 +14,7 @@ Form 2, in a slice behind another of its layer, uses the block of that slice (`P
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Generic, TypeVar
@@ -167,19 +167,6 @@ class Past(Generic[AnyPrior]):
         """A copy that grows independently."""
         stages = [list(known) for known in self.stages]
         return Past(self.block, list(self.positions), list(self.masks), list(self.plain), stages)
-
-    def mark(self) -> Callable[[], None]:
-        """What undoes later additions."""
-        block, every = self.block, [self.positions, self.masks, self.plain]
-        every += self.stages
-        sizes = [len(known) for known in every]
-
-        def undo() -> None:
-            self.block = block
-            for known, size in zip(every, sizes, strict=True):
-                del known[size:]
-
-        return undo
 
 
 # -- writing -----------------------------------------------------------------------------------------------------------

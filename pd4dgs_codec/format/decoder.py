@@ -29,7 +29,7 @@ class LayerReader:
         self._scene_id = b""
         self._declared = Declared()
         self._taken = TakenVoxels()
-        self._past: Past[Prior] | None = None
+        self._past: Past[Prior] | None = None  # copied for each slice, as a fault must leave it as it is
 
     @property
     def complete(self) -> bool:
@@ -121,21 +121,13 @@ class LayerReader:
 
     def _read_slice(self, chunk: Chunk, kind: LayerKind, header: Header) -> LayerSymbols:
         later = kind.layer == self._layer
-        past = self._past if later else Past[Prior]() if chunk.more else None
-        undo = past.mark() if past else None
-        try:
-            part, declared = read_layer(
-                chunk.payload, kind, header.grid.widths, self._declared, header.mode, later, past
-            )
-            check_slice(part, self.scene.codes, header.info.voxel_size, header.grid)
-            missing = [name for name in part.steps if name not in header.error_bounds]
-            if missing:
-                raise Malformed(f"layer {kind.layer}: no error bound of {missing[0]} in the header, expected one")
-            self._taken.take(part.anchor_q)
-        except DecodeError:
-            if undo:
-                undo()
-            raise
+        past = self._past.copy() if later and self._past else Past[Prior]() if chunk.more else None
+        part, declared = read_layer(chunk.payload, kind, header.grid.widths, self._declared, header.mode, later, past)
+        check_slice(part, self.scene.codes, header.info.voxel_size, header.grid)
+        missing = [name for name in part.steps if name not in header.error_bounds]
+        if missing:
+            raise Malformed(f"layer {kind.layer}: no error bound of {missing[0]} in the header, expected one")
+        self._taken.take(part.anchor_q)
         self._declared, self._past = declared, past
         self._layer, self._number, self.count = kind.layer, chunk.slice, self.count + 1
         self.scene.add(part, not later)
@@ -167,10 +159,10 @@ def _read(
     return True
 
 
-def read_layers(data: bytes, *, max_layer: int | None = None) -> tuple[Header, SceneSymbols]:
-    """(header, what a complete file stores, or its layers <= max_layer). Raises as `decode` does."""
+def read_layers(data: bytes) -> tuple[Header, SceneSymbols]:
+    """(header, what a complete file stores). Raises as `decode` does."""
     reader, layers = LayerReader(), dict[int, list[LayerSymbols]]()
-    _read(reader, data, max_layer, take=lambda part: layers.setdefault(part.kind.layer, []).append(part))
+    _read(reader, data, None, take=lambda part: layers.setdefault(part.kind.layer, []).append(part))
     assert reader.header is not None
     header = reader.header
     return header, SceneSymbols(header.info, header.grid, [merged(parts) for parts in layers.values()])
