@@ -42,7 +42,7 @@ examples:
 FIRST_FRAME_RATE = 2e6
 #: Help of the options that are fields of EncodeOptions with a few choices.
 HELP = {
-    "mode": "entropy coder",
+    "mode": "entropy coder; the player reads ans alone",
     "priors": "distributions to choose from per channel",
     "layers": "auto leaves out layers without visible effect; a number keeps the layers up to it",
     "effort": "1 is fast, 9 makes the smallest files",
@@ -69,7 +69,7 @@ def parser() -> options.Parser:
     add("--target-size", type=options.layer_sizes, default={}, metavar="L0=425k,...", help=what)
     about = p.add_argument_group("metadata", "shown by pd4dgs-info; encoding a .pd4 file again keeps them")
     for name, what in (("title", "title of the scene"), ("source", "its origin"), ("licence", "terms of use")):
-        about.add_argument(f"--{name}", metavar="TEXT", help=what)
+        about.add_argument(f"--{name}", type=options.line, metavar="TEXT", help=what)
     views = p.add_argument_group("quality in renderings")
     what = "dataset, see below: its training views fit the sizes, its held-out views decide which layers are kept"
     views.add_argument("--data", metavar="SOURCE", help=what)

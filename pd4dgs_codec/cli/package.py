@@ -52,7 +52,7 @@ def parser() -> options.Parser:
     p.add_argument("--immutable", action="store_true", help="put digests into file names, for long-lived caches")
     p.add_argument("--no-video", action="store_true", help="leave out the 2D video")
     what = "frame rate of the 2D video (default: 20)"
-    p.add_argument("--fps", type=options.positive_float, default=20.0, metavar="F", help=what)
+    p.add_argument("--fps", type=options.fps, default=20.0, metavar="F", help=what)
     p.add_common()
     return p
 
@@ -125,8 +125,6 @@ def _render(scene: Scene, fps: float) -> Video:
         raise RenderError(f"it would have {count:,} frames, expected at most {MAX_FRAMES:,}; choose a lower --fps")
     frames = own_frames(scene.info, count)
     camera = frames[0].camera
-    if min(camera.width, camera.height) < 2:
-        raise RenderError(f"the file's camera has {camera.width}x{camera.height} pixels, a video takes 2x2 or more")
     with temporary_folder() as folder, progress_bar(len(frames), "frames", "video") as step:
         path = folder / "video.mp4"
         write_mp4(_pictures(frames, level_of(scene), step), path, fps, fragment=max(1, round(FRAGMENT_SECONDS * fps)))

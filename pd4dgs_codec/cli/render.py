@@ -53,7 +53,7 @@ def parser() -> options.Parser:
     what = "swing the file's camera by DEG degrees around the point it looks at (default: 0)"
     p.add_argument("--orbit", type=options.finite_float, default=0.0, metavar="DEG", help=what)
     what = "frame rate of a video (default: 20)"
-    p.add_argument("--fps", type=options.positive_float, default=20.0, metavar="F", help=what)
+    p.add_argument("--fps", type=options.fps, default=20.0, metavar="F", help=what)
     what = "show all levels side by side, and the ground truth with --data"
     p.add_argument("--side-by-side", action="store_true", help=what)
     p.add_common()

@@ -106,6 +106,8 @@ def write_mp4(frames: Iterator[np.ndarray], path: Path, fps: float, *, fragment:
     if first is None:
         return
     height, width = (size // 2 * 2 for size in first.shape[:2])
+    if min(height, width) < 2:
+        raise RenderError(f"the camera has {first.shape[1]}x{first.shape[0]} pixels, a video takes 2x2 or more")
     rate = str(Fraction(fps).limit_denominator())
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", rate]
     coding = ["-an", "-c:v", "libx264", "-crf", str(CRF), "-pix_fmt", "yuv420p", "-y"]

@@ -42,6 +42,8 @@ CASES = [
     (2, "encode m.pt -o s.pd4 --step-scale -1", "a number > 0"),
     (2, "encode m.pt -o s.pd4 --lay 1", "--lay"),
     (2, "encode m.pt -o s.pd4 --min-gain 1", "--min-gain needs --data"),
+    *((2, f"encode m.pt -o s.pd4 --source '{text}'", "one line of printable text") for text in ("a\nb", "\udcff")),
+    *((2, f"render s.pd4 -o a.gif --fps {fps}", "a number from 0.01 to 1000") for fps in (1e-4, 1e308)),
     *(
         (2, f"encode m.pt -o s.pd4 --target-size={text}", "expected sizes in bytes such as L0=425k")
         for text in ("425k", "L3=1k", "L0=1k,L0=2k", "L0=", "L0=-5", "L0=0.5", "L0=1k,")
@@ -110,7 +112,6 @@ CASES = [
     ),
     (1, "encode MODEL -o nowhere/s.pd4", "nowhere"),
     (1, "encode MODEL -o empty", "is a folder"),
-    (1, "encode SCENE -o no.pd4 --effort 1 --source 'two\nlines'", "source"),
     (1, "render SCENE -o a.gif --threads 100000", "100000"),
 ]  # fmt: skip
 

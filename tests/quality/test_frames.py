@@ -91,6 +91,11 @@ def test_captions_state_the_size():
     assert movie.level_caption(2, 6_880_000) == "level 2, 6.88 MB"
 
 
+def test_a_film_of_one_pixel_is_refused_in_one_line(tmp_path):
+    with pytest.raises(RenderError, match="1x2 pixels, a video takes 2x2 or more"):
+        movie.write_mp4(iter([np.zeros((2, 1, 3), np.uint8)]), tmp_path / "a.mp4", 10.0)
+
+
 def test_gif_keeps_order_count_and_speed(tmp_path):
     colours = [(200, 30, 30), (30, 200, 30), (30, 30, 200)]
     images = [np.full((8, 10, 3), c, np.uint8) for c in colours]
