@@ -16,6 +16,7 @@ from pd4dgs_codec.cli import common, options
 from pd4dgs_codec.cli.common import FAILED, OK, STDIO, Console, UsageError, check_output, is_pd4, read_bytes
 from pd4dgs_codec.cli.progress import TrainingProgress, progress_bar
 from pd4dgs_codec.errors import DataError, DecodeError, TrainError
+from pd4dgs_codec.format.options import MODES
 
 if TYPE_CHECKING:
     from pd4dgs_codec.bench.report import Panel
@@ -78,8 +79,9 @@ QUICK: Options = {"step_scales": (1.0, 2.0), "efforts": (1,), "repeats": 1}
 
 
 def _codec_options(p: options.Parser) -> None:
+    mode = options.checked(str, MODES.__contains__, f"one of {', '.join(MODES)}")
     effort = options.checked(int, lambda value: 1 <= value <= 9, "an integer from 1 to 9")
-    scales, modes, efforts = map(options.listed, (options.positive_float, options.one_of("ans", "lzma"), effort))
+    scales, modes, efforts = map(options.listed, (options.positive_float, mode, effort))
     add = p.add_argument
     add("input", metavar="FILE", help="checkpoint of pd4dgs-train, or a .pd4 file (- for stdin)")
     add("--step-scales", type=scales, metavar="X,...", help="factors on all quantisation steps (default: 0.5,1,2,4)")

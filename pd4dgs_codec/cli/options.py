@@ -157,11 +157,6 @@ def background(text: str) -> tuple[float, float, float]:
     raise argparse.ArgumentTypeError(f"found {text!r}, expected black, white or R,G,B in 0..1")
 
 
-def one_of(*names: str) -> Callable[[str], str]:
-    """The type of a name within a list; a single name uses argparse's choices."""
-    return checked(str, lambda text: text in names, f"one of {', '.join(names)}")
-
-
 def rate(text: str) -> float:
     """A link rate in bits per second with k, M or G for 1e3, 1e6, 1e9: "2M" -> 2e6."""
     return _scaled(text, {"k": 1e3, "M": 1e6, "G": 1e9}, "a rate in bits per second such as 2M or 500k")

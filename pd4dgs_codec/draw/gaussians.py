@@ -472,7 +472,7 @@ def assemble(
             gaussians[k, i] = anchors[n, i] + anchors[n, offset + 3 * o + i] * extent[n, i]
             gaussians[k, SCALE + i] = extent[n, 3 + i] * relative[k, i]
             gaussians[k, COLOR + i] = color[k, i]
-        inverse = 1 / _norm(shape, k, 3)
+        inverse = 1 / _norm(shape, k)
         for i in range(4):
             gaussians[k, QUAT + i] = shape[k, 3 + i] * inverse
         gaussians[k, OPACITY] = opacity[n, o]
@@ -480,25 +480,24 @@ def assemble(
 
 
 @kernel(inline=True)
-def _norm(values: Array, k: int, first: int) -> Any:
-    """The norm of the four values of row k from column `first` on, at least MIN_NORM."""
-    square = values[k, first] * values[k, first] + values[k, first + 1] * values[k, first + 1]
-    square += values[k, first + 2] * values[k, first + 2] + values[k, first + 3] * values[k, first + 3]
-    return max(math.sqrt(square), values.dtype.type(MIN_NORM))
+def _norm(shape: Array, k: int) -> Any:
+    """The norm of the quaternion in row k of shape [K, 7], at least MIN_NORM."""
+    square = shape[k, 3] * shape[k, 3] + shape[k, 4] * shape[k, 4]
+    square += shape[k, 5] * shape[k, 5] + shape[k, 6] * shape[k, 6]
+    return max(math.sqrt(square), shape.dtype.type(MIN_NORM))
 
 
 @kernel(inline=True)
-def _unit_backward(out: Array, values: Array, g: Array, k: int, to: int, of: int, at: int) -> None:
-    """Stores to row k of `out`, from column `to` on, the gradient by the four values from `of` on, from the gradient by
-    their quotients by `_norm`, in g from `at` on."""
-    norm = _norm(values, k, of)
-    along = values.dtype.type(0)
-    if norm > values.dtype.type(MIN_NORM):
+def _unit_backward(g_shape: Array, shape: Array, g: Array, k: int) -> None:
+    """Stores to row k of g_shape the gradient by the quaternion of shape, from that by the unit quaternion, in g."""
+    norm = _norm(shape, k)
+    along = shape.dtype.type(0)
+    if norm > shape.dtype.type(MIN_NORM):
         for i in range(4):
-            along += g[k, at + i] * values[k, of + i]
+            along += g[k, QUAT + i] * shape[k, 3 + i]
         along /= norm * norm
     for i in range(4):
-        out[k, to + i] = (g[k, at + i] - along * values[k, of + i]) / norm
+        g_shape[k, 3 + i] = (g[k, QUAT + i] - along * shape[k, 3 + i]) / norm
 
 
 @parallel(lambda *given: given[-1])
@@ -537,7 +536,7 @@ def assemble_backward(
                 g_shape[k, i] = slope * size * (1 - size)
                 value = gaussians[k, COLOR + i]
                 g_color[k, i] = g[k, COLOR + i] * value * (1 - value)
-            _unit_backward(g_shape, shape, g, k, 3, 3, QUAT)
+            _unit_backward(g_shape, shape, g, k)
             value = gaussians[k, OPACITY]
             g_opacity[n, o] = g[k, OPACITY] * (1 - value * value)
             g_mask[n] += g_gates[k]

@@ -175,18 +175,9 @@ def _joined(eyes: Sequence[tuple[np.ndarray, ...]]) -> Gaussians:
 def warm_up() -> None:
     """Loads the kernels (where none are cached: compiles them) by drawing one anchor with both deformations. A viewer
     calls it in a thread, with the import of this module, while the first layer is on its way."""
-    scene = _one_anchor()
-    assert scene.info.camera is not None
-    Player(scene).picture(scene.info.camera, 0.5)
-
-
-def _one_anchor(side: int = 16) -> Scene:
-    """One anchor in front of a camera of side x side pixels."""
     widths, box = Widths(), np.array([[-1, -1, 1], [1, 1, 3]], np.float32)
-    K = np.array([[side, 0, side / 2], [0, side, side / 2], [0, 0, 1]], np.float32)
-    camera = Camera(np.eye(4, dtype=np.float32), K, side, side)
-
-    return Scene(
+    camera = Camera(np.eye(4, dtype=np.float32), np.array([[16, 0, 8], [0, 16, 8], [0, 0, 1]], np.float32), 16, 16)
+    scene = Scene(
         info=SceneInfo(1.0, box, (0.0, 1.0), (0.0, 0.0, 0.0), 0.1, 100.0, (0.0, -1.0, 0.0), 0.0, camera),
         steps=Steps(),
         layers=(0, 1, 2),
@@ -200,3 +191,4 @@ def _one_anchor(side: int = 16) -> Scene:
         global_deformation=still("position", 3),
         local_deformation=still("position", 3),
     )
+    Player(scene).picture(camera, 0.5)

@@ -311,10 +311,9 @@ def check_camera(camera: Camera) -> None:
         raise RenderError("viewmat or K has a value that is not finite")
     if viewmat[3] != [0.0, 0.0, 0.0, 1.0]:
         raise RenderError(f"the last row of a viewmat is {viewmat[3]}, expected [0, 0, 0, 1]")
-    rows = [row[:3] for row in viewmat[:3]]
-    (a, b, c), (d, e, f), (g, h, i) = rows
-    if not abs(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)) >= LEAST_VOLUME:
-        raise RenderError(f"the viewmat {rows} flattens the scene, expected a rotation")
+    rows = np.array(viewmat)[:3, :3]
+    if not abs(np.linalg.det(rows)) >= LEAST_VOLUME:
+        raise RenderError(f"the viewmat {rows.tolist()} flattens the scene, expected a rotation")
     if [K[0][1], K[1][0], *K[2]] != [0.0, 0.0, 0.0, 0.0, 1.0]:
         raise RenderError(f"K is {K}, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] (no skew)")
     if not (K[0][0] > 0 and K[1][1] > 0):

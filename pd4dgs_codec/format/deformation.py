@@ -382,8 +382,7 @@ def read_sections(take: Callable[[Section, int], bytes], shape: Shape) -> Deform
     sizes = [math.prod(one) for one in shape.weights]
     data = take(Section.PLANES, sum(map(math.prod, shape.planes)))
     residuals = read_planes(data, shape.planes) if data else []
-    weights = take(Section.WEIGHTS, sum(sizes))
-    return _restored(shape, residuals, decode_channels(weights, sizes) if weights else [])
+    return _restored(shape, residuals, decode_channels(take(Section.WEIGHTS, sum(sizes)), sizes))
 
 
 def channel_sizes(shape: Shape) -> tuple[list[int], list[int]]:

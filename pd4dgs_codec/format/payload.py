@@ -281,7 +281,7 @@ def _read_ans(sections: _Sections, parameters: Parameters, past: Past[Prior] | N
     rows, widths = parameters.rows, parameters.widths
     sizes = [parameters.rises, rows]
     masks = sections.take(Section.MASKS, sum(sizes))
-    increase, own = decode_channels(masks, sizes, past.masks if past else None) if masks else _zeros(sizes)
+    increase, own = decode_channels(masks, sizes, past.masks if past else None)
     data = sections.take(Section.ATTRIBUTES, rows)
     classes, attributes = NO_CLASSES, np.zeros((widths.channels, 0), np.int32)
     if data:
@@ -295,12 +295,8 @@ def _read_lzma(sections: _Sections, parameters: Parameters, past: Past[Prior] | 
     last = first + widths.channels
     sizes = [parameters.rises, *[parameters.rows] * (last - 1), *planes, *weights]
     data = sections.take(Section.SYMBOLS, sum(sizes))
-    channels = decode_channels_lzma(data, sizes) if data else _zeros(sizes)
+    channels = decode_channels_lzma(data, sizes) if data else [np.zeros(0, np.int32) for _ in sizes]
     classes, attributes = channels[2] if widths.graded else NO_CLASSES, np.stack(channels[first:last])
     end = last + len(planes)
     tensors = deformation.from_channels(channels[last:end], channels[end:], parameters.shape)
     return channels[0], channels[1], classes, attributes, tensors
-
-
-def _zeros(sizes: list[int]) -> list[np.ndarray]:
-    return [np.zeros(size, np.int32) for size in sizes]

@@ -83,9 +83,9 @@ class Eyes:
         return np.asarray(self.weights[:, None] * np.where(inside, 1.0, OUTSIDE))
 
 
-def eyes_of_cameras(cameras: Sequence[Camera], count: int = EYES) -> Eyes:
-    """`count` of the cameras, evenly spaced in their order; all of them if there are fewer."""
-    chosen = spread(cameras, count)
+def eyes_of_cameras(cameras: Sequence[Camera]) -> Eyes:
+    """EYES of the cameras, evenly spaced in their order; all of them if there are fewer."""
+    chosen = spread(cameras, EYES)
     return Eyes(chosen, np.ones(len(chosen)))
 
 

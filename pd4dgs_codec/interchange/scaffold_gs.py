@@ -163,24 +163,24 @@ def _decoders(place: Path) -> tuple[dict[str, Any], np.ndarray | None]:
         raise DataError(f"{united}: has no {missing[0]}, expected Scaffold-GS's three decoders")
     if embedding is None:
         return found, None
-    tables = [value for value in _flat(embedding).values() if isinstance(value, np.ndarray)]
+    tables = list(_tensors(embedding).values())
     if len(tables) != 1 or tables[0].ndim != 2 or not len(tables[0]) or not np.isfinite(tables[0]).all():
         raise DataError(f"{where}: expected one embedding of finite numbers, pictures x dimensions")
     return found, tables[0].astype(np.float64)
 
 
-def _flat(content: Any, prefix: str = "") -> dict[str, Any]:
-    """Members of nested modules and dicts under dotted names, as in a state dict, down to DEPTH."""
-    flat: dict[str, Any] = {}
-    waiting = [(prefix, content)]
+def _tensors(content: Any) -> dict[str, np.ndarray]:
+    """The tensors in nested modules and dicts under dotted names, as in a state dict, down to DEPTH."""
+    found: dict[str, np.ndarray] = {}
+    waiting = [("", content)]
     while waiting:
         name, value = waiting.pop()
         members = value.members if isinstance(value, Module) else value
-        if not isinstance(members, dict):
-            flat[name] = value
-        elif name.count(".") < DEPTH:
+        if isinstance(value, np.ndarray):
+            found[name] = value
+        elif isinstance(members, dict) and name.count(".") < DEPTH:
             waiting += [(f"{name}.{key}" if name else str(key), part) for key, part in members.items()]
-    return flat
+    return found
 
 
 def _network(
@@ -192,7 +192,7 @@ def _network(
         kinds, usual_kinds = ", ".join(part.kind for part in parts), ", ".join(LAYERS[name])
         if kinds != usual_kinds:
             raise DataError(f"{path}: layers are {kinds[:120]}; expected {usual_kinds}")
-    tensors = {key: value for key, value in _flat(decoder).items() if isinstance(value, np.ndarray)}
+    tensors = _tensors(decoder)
     expected = ("0.bias", "0.weight", "2.bias", "2.weight")
     if tuple(sorted(tensors)) != expected:
         raise DataError(f"{path}: has tensors {', '.join(sorted(tensors))[:120]}, expected {', '.join(expected)}")

@@ -21,7 +21,7 @@ from pd4dgs_codec.archives import read_tensors
 from pd4dgs_codec.errors import DataError, one_line
 from pd4dgs_codec.format.check import check_scene
 from pd4dgs_codec.io import read_source, write_bytes
-from pd4dgs_codec.model.convert import from_scene
+from pd4dgs_codec.model.convert import check_finite, from_scene
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.networks import MLP
@@ -82,7 +82,7 @@ def load(path: str | Path | BinaryIO) -> tuple[Model, dict[str, Any]]:
     try:
         if content.get("digest") != _digest(content):
             raise DataError(f"{path}: damaged: its digest does not match its content")
-        _refuse_not_finite(content["state"])
+        check_finite(content["state"])
         return _build(content), dict(content["training"])
     except Exception as error:  # of many kinds, for a file that lies about its content
         reason = one_line(str(error))  # torch's messages have several lines
@@ -115,12 +115,6 @@ def _digest(content: dict[str, Any]) -> str:
 
     walk({key: item for key, item in content.items() if key != "digest"})
     return hasher.hexdigest()
-
-
-def _refuse_not_finite(state: dict[str, torch.Tensor]) -> None:
-    for name, tensor in state.items():
-        if not torch.isfinite(tensor).all():
-            raise DataError(f"tensor {name} holds a NaN or an infinity; expected finite numbers")
 
 
 def _build(content: dict[str, Any]) -> Model:

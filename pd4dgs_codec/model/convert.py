@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import torch
 
@@ -13,14 +15,19 @@ from pd4dgs_codec.model.networks import MLP, mask_logits
 from pd4dgs_codec.scene import MASK_STEP, SCAFFOLD_NETWORKS, Grading, Scene
 
 
+def check_finite(state: Mapping[str, torch.Tensor]) -> None:
+    """Raises DataError naming a tensor that holds a NaN or an infinity."""
+    for name, tensor in state.items():
+        if not torch.isfinite(tensor).all():
+            raise DataError(f"tensor {name} holds a NaN or an infinity; expected finite numbers")
+
+
 def to_scene(model: Model) -> Scene:
     """Every anchor of the model as one unplanned scene: rows (N, ...), masks of inactive anchors 0.
 
-    Raises DataError naming the tensor that holds a NaN or an infinity.
+    Raises DataError as `check_finite` does.
     """
-    for name, tensor in model.state_dict().items():
-        if tensor.is_floating_point() and not torch.isfinite(tensor).all():
-            raise DataError(f"model tensor {name} holds a NaN or an infinity; expected finite numbers")
+    check_finite(model.state_dict())
     deformations = {layer: field.arrays() for layer, field in model.deformations.items()}
     layers = (0, *deformations)
     n = len(model.anchor_q)

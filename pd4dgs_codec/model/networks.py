@@ -13,14 +13,15 @@ from torch.nn import functional as F
 
 from pd4dgs_codec.scene import Network
 
+POOL = 1 << 23  #: numbers of `Noise`
+
 
 class Noise:
     """Uniform noise in -0.5..0.5, cut at random places from one long pool: drawing it anew would cost 5 ms a step."""
 
-    def __init__(self, seed: int, device: torch.device | str = "cpu", size: int = 1 << 23):
-        generator = torch.Generator().manual_seed(seed)
-        self.pool = (torch.rand(size, generator=generator) - 0.5).to(device)
-        self.generator = generator
+    def __init__(self, seed: int, device: torch.device | str = "cpu"):
+        self.generator = torch.Generator().manual_seed(seed)
+        self.pool = (torch.rand(POOL, generator=self.generator) - 0.5).to(device)
 
     def draw(self, shape: torch.Size) -> Tensor:
         """A tensor of `shape`."""

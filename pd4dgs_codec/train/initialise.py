@@ -20,6 +20,7 @@ GRID = 1024
 MASK_START = 2.0
 #: a_j of absent levels: its softplus is 4e-18, so their masks are those of the highest level present.
 TIED = -40.0
+NEAREST = 3  #: points whose distance is the size of an anchor
 #: For a dataset without points: random candidates per initial point, and training views that score them.
 CARVE_CANDIDATES = 20
 CARVE_VIEWS = 40
@@ -147,13 +148,13 @@ def carved_points(dataset: Dataset, count: int, generator: torch.Generator) -> T
     return points[torch.multinomial(share.square(), count, generator=generator)]
 
 
-def nearest_distances(points: Tensor, k: int = 3) -> Tensor:
-    """Root mean squared distance of points [n, 3] to their k nearest others, [n]; exact."""
+def nearest_distances(points: Tensor) -> Tensor:
+    """Root mean squared distance of points [n, 3] to their NEAREST nearest others, [n]; exact."""
     n = len(points)
     if n < 2:
         return torch.full((n,), 1.0)
     squares, order = np.empty(n, np.float32), points[:, 0].argsort()
-    _nearest_squares(squares, points[order].numpy(), min(k, n - 1))
+    _nearest_squares(squares, points[order].numpy(), min(NEAREST, n - 1))
     out = torch.empty(n)
     out[order] = torch.from_numpy(squares).sqrt()
     return out
