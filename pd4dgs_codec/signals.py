@@ -7,7 +7,7 @@ raise KeyboardInterrupt in the main thread, as Ctrl-C does in any Python program
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from types import FrameType
 from typing import Any
@@ -60,9 +60,6 @@ def ignore_more() -> None:
 def interruptible() -> Iterator[bool]:
     """Within the block ENDING raise KeyboardInterrupt, but those that are ignored or that others handle. Gives whether
     any does; in other threads than the main one, and within another such block, none does."""
-    main = threading.current_thread() is threading.main_thread()
-    before = {number: signal.getsignal(number) for number in ENDING if main}
-    before = {number: handler for number, handler in before.items() if handler in UNHANDLED}
     hook = sys.unraisablehook
 
     def lost(event: Any) -> None:
@@ -72,14 +69,43 @@ def interruptible() -> Iterator[bool]:
         else:
             hook(event)
 
+    outermost = False
+    try:
+        with _handled(ENDING, _received, UNHANDLED.__contains__) as outermost:
+            if outermost:
+                sys.unraisablehook = lost
+            yield outermost
+    finally:
+        if outermost:
+            sys.unraisablehook, _State.over, _State.waiting = hook, False, False
+
+
+@contextmanager
+def stop_request() -> Iterator[threading.Event]:
+    """Gives what the first Ctrl-C or SIGTERM sets; every further one raises KeyboardInterrupt. Ignored signals stay
+    ignored, and in other threads than the main one nothing changes."""
+    stop = threading.Event()
+
+    def received(number: int, frame: FrameType | None) -> None:
+        if stop.is_set():
+            raise KeyboardInterrupt
+        stop.set()
+
+    with _handled((signal.SIGINT, signal.SIGTERM), received, lambda handler: handler is not signal.SIG_IGN):
+        yield stop
+
+
+@contextmanager
+def _handled(numbers: Iterable[int], by: Callable[..., None], replaced: Callable[[Any], bool]) -> Iterator[bool]:
+    """Within the block those of the signals whose handlers are to be `replaced` call `by`. Gives whether any does; none
+    outside of the main thread, where Python allows no handlers."""
+    main = threading.current_thread() is threading.main_thread()
+    before = {number: signal.getsignal(number) for number in numbers if main}
+    before = {number: handler for number, handler in before.items() if replaced(handler)}
     try:
         for number in before:
-            signal.signal(number, _received)
-        if before:
-            sys.unraisablehook = lost
+            signal.signal(number, by)
         yield bool(before)
     finally:
         for number, handler in before.items():
-            signal.signal(number, handler)
-        if before:
-            sys.unraisablehook, _State.over, _State.waiting = hook, False, False
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)

@@ -80,18 +80,15 @@ def _text(result: dict[str, Any]) -> str:
     what = "held-out" if result["split"] == "test" else "training"
     masked = "covisibility masks" if result["masked"] else "no covisibility masks"
     masked = masked if result["protocol"] == "dycheck" else "protocol 3dgs"
+    share = result["moving_share"]
     lines = [
         f"{result['source']}: {result['views']} {what} views, {result['width']}x{result['height']}, {masked}",
         table(head, rows),
-        *_moving_lines(result["moving_share"]),
+        *([f"moving: the {100 * share:.1f} % of pixels that change where cameras stand still"] if share else []),
         *_distance_lines(result.get("perceptual")),
         f"baseline, the mean training image: {number(result['baseline_mean_image_psnr'])} dB",
     ]
     return "\n".join(lines)
-
-
-def _moving_lines(share: float | None) -> list[str]:
-    return [f"moving: the {100 * share:.1f} % of pixels that change where cameras stand still"] if share else []
 
 
 def _distance_lines(perceptual: dict[str, Any] | None) -> list[str]:

@@ -225,7 +225,7 @@ def _cost(args: argparse.Namespace, export: Export) -> dict[str, Any]:
     if not views:
         raise DataError(f"{args.compare}: has no held-out views; expected another --holdout")
     with progress_bar(len(views), "views", "comparing") as step:
-        return dict(vars(cost(export, views, step)))
+        return cost(export, views, step)
 
 
 def _text(result: dict[str, Any]) -> str:

@@ -123,10 +123,6 @@ def _left_out(layers: list[dict[str, Any]]) -> list[dict[str, str]]:
     return [{"what": what, "why": why} for what in missing]
 
 
-def _left_out_line(left_out: list[dict[str, str]]) -> list[str]:
-    return [f"left out: {', '.join(row['what'] for row in left_out)} ({left_out[0]['why']})"] if left_out else []
-
-
 def _about_lines(metadata: dict[str, Any] | None) -> list[str]:
     if metadata is None:
         return []
@@ -155,6 +151,7 @@ def _slice_lines(result: dict[str, Any]) -> list[str]:
 def _text(result: dict[str, Any]) -> str:
     cut = "" if result["available"] >= result["bytes"] else f", of which {result['available']:,} are present"
     low, high = result["time_range"]
+    left_out = result["left_out"]
     lines = [
         f"{shown_name(result['input'])}: .pd4 format {result['format_version']}, {result['bytes']:,} bytes{cut}",
         f"mode {result['mode']}, header {result['header_bytes']} bytes, "
@@ -169,7 +166,7 @@ def _text(result: dict[str, Any]) -> str:
         ),
         *_slice_lines(result),
         *_about_lines(result["metadata"]),
-        *_left_out_line(result["left_out"]),
+        *([f"left out: {', '.join(row['what'] for row in left_out)} ({left_out[0]['why']})"] if left_out else []),
         "error bounds: " + ", ".join(f"{what} {bound:.4g}" for what, bound in result["error_bounds"].items()),
         "first frame: " + ", ".join(f"{s:.2f} s at {rate}bps" for rate, s in result["first_frame_seconds"].items()),
     ]

@@ -17,13 +17,12 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
-from pd4dgs_codec.data.cameras import Lens, UnreadView, rectify
+from pd4dgs_codec.data.cameras import UnreadView, rectify
 from pd4dgs_codec.data.files import check_downscale, check_pixels, check_regular, shrink_image, shrink_mask
 from pd4dgs_codec.data.posed import geometry, without_first_camera
 from pd4dgs_codec.data.view import Dataset, View
@@ -325,9 +324,8 @@ def _frames_of(camera: UnreadView, downscale: int) -> tuple[StoredFrames, np.nda
     check_downscale((lens.width, lens.height), downscale, str(camera.image))
     if not lens.is_pinhole:
         mask = shrink_mask(rectify(np.zeros((lens.height, lens.width, 3), np.uint8), lens)[1], downscale)
-    how = f"{downscale} {'' if lens.is_pinhole else lens}"
-    return stored_frames(camera.image, how, partial(_ideal, lens=lens, downscale=downscale)), mask
 
+    def ideal(picture: np.ndarray) -> np.ndarray:
+        return shrink_image(picture if lens.is_pinhole else rectify(picture, lens)[0], downscale)
 
-def _ideal(picture: np.ndarray, lens: Lens, downscale: int) -> np.ndarray:
-    return shrink_image(picture if lens.is_pinhole else rectify(picture, lens)[0], downscale)
+    return stored_frames(camera.image, f"{downscale} {'' if lens.is_pinhole else lens}", ideal), mask

@@ -174,6 +174,13 @@ class Decoders:
         assemble(gaussians, gates, keep, anchors, extent, look.opacity, mask, shape, relative, sigmoid(color))
         return Made(gaussians, gates, shape, relative, extent)
 
+    def colors(self, anchors: Array, eye: Array, keep: Array) -> Array:
+        """[K, 3] of the kept slots of anchors, as an eye at [3], world, sees them; for Gaussians of which nothing else
+        depends on it."""
+        x, _ = _seen_from(anchors, eye, self._features)
+        color = self._heads[-1]
+        return self._functions.sigmoid(color(keep, color.hidden(x)))
+
     def backward(
         self, anchors: Array, look: Look, keep: Array, made: Made, g: Array, g_gates: Array
     ) -> tuple[Array, Array, list[Layer]]:
@@ -227,18 +234,6 @@ class SlotHead:
         out = np.empty((len(keep), len(self.last[1]) // self._slots), hidden.dtype)
         linear(out, keep, hidden, column, *self._table)
         return out
-
-
-class Colors:
-    """The network of colours, for Gaussians of which nothing else depends on the eye."""
-
-    def __init__(self, network: Network, slots: int, features: int):
-        self._features, self._head = features, SlotHead(_viewing(network, features), slots)
-
-    def __call__(self, anchors: Array, eye: Array, keep: Array) -> Array:
-        """[K, 3] of the kept slots of anchors, as an eye at [3], world, sees them."""
-        x, _ = _seen_from(anchors, eye, self._features)
-        return NUMPY.sigmoid(self._head(keep, self._head.hidden(x)))
 
 
 def _viewing(network: Sequence[Layer], features: int) -> list[Layer]:

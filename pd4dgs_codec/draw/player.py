@@ -14,7 +14,6 @@ from pd4dgs_codec.draw.gaussians import (
     MIN_OPACITY,
     OFFSET_REACH,
     SIGMA_REACH,
-    Colors,
     Decoders,
     Gaussians,
     check_time,
@@ -49,10 +48,9 @@ class Player:
         self._radius = OFFSET_REACH * extent[:, :3].max(axis=1) + SIGMA_REACH * extent[:, 3:].max(axis=1)
         motion = scene.motion(scene.level)
         self._field = None if motion is None else Field(motion, scene.info.box, scene.widths.heads)
-        networks, widths = [scene.networks[name] for name in SCAFFOLD_NETWORKS], scene.widths
-        self._decoders = Decoders(networks, widths.feature)
+        widths = scene.widths
+        self._decoders = Decoders([scene.networks[name] for name in SCAFFOLD_NETWORKS], widths.feature)
         self.shapes_are_blind = widths.shapes_are_blind  #: whether of the Gaussians colours alone depend on the eye
-        self._colors = Colors(networks[-1], self.slots, widths.feature) if self.shapes_are_blind else None
         self._time: float | None = None
         self._moved = self._table  # at self._time
         if self._field is not None:
@@ -105,8 +103,8 @@ class Player:
         if not again:
             self._time, self._known[:], self._count[:] = t, self._field is None, -1
             self._slots, self._grown = self._slots[:0], self._grown[:0]
-        if self._colors is not None and (again or len(eyes) > 1):
-            return self._of_colors(rows, t, eyes, self._colors)
+        if self.shapes_are_blind and (again or len(eyes) > 1):
+            return self._of_colors(rows, t, eyes)
         mask, anchors = self._mask[rows], self._anchors(rows, t)
         looks = [self._decoders.look(anchors, eye) for eye in eyes]
         shown = [seen(look.opacity, mask, MIN_OPACITY) for look in looks]
@@ -121,7 +119,7 @@ class Player:
             found.append((means, quats, scales, opacities, colors, slots))
         return _joined(found)
 
-    def _of_colors(self, rows: np.ndarray, t: float, eyes: list[np.ndarray], colors: Colors) -> Gaussians:
+    def _of_colors(self, rows: np.ndarray, t: float, eyes: list[np.ndarray]) -> Gaussians:
         """`_of_eyes` where nothing but colours depends on the eye."""
         anchors = self._anchors(rows, t)
         self._grow(rows, anchors)
@@ -132,7 +130,7 @@ class Player:
         keep, found = slots + np.repeat((np.arange(len(rows)) - rows) * self.slots, count), []
         for eye in eyes:
             gaussians = self._grown.take(places, axis=0)
-            gaussians[:, COLOR:] += colors(anchors, eye, keep)
+            gaussians[:, COLOR:] += self._decoders.colors(anchors, eye, keep)
             found.append((*finished(gaussians, gates), slots))
         return _joined(found)
 

@@ -159,10 +159,10 @@ def _read(
     return True
 
 
-def read_layers(data: bytes) -> tuple[Header, SceneSymbols]:
-    """(header, what a complete file stores). Raises as `decode` does."""
+def read_layers(data: bytes, *, max_layer: int | None = None) -> tuple[Header, SceneSymbols]:
+    """(header, what a complete file stores, or its layers <= max_layer). Raises as `decode` does."""
     reader, layers = LayerReader(), dict[int, list[LayerSymbols]]()
-    _read(reader, data, None, take=lambda part: layers.setdefault(part.kind.layer, []).append(part))
+    _read(reader, data, max_layer, take=lambda part: layers.setdefault(part.kind.layer, []).append(part))
     assert reader.header is not None
     header = reader.header
     return header, SceneSymbols(header.info, header.grid, [merged(parts) for parts in layers.values()])

@@ -106,9 +106,9 @@ def _about(payload: bytes) -> dict[str, Any]:
     return {**texts, **quality, **slices, **({"still_bytes": len(found.still)} if found.still else {})}
 
 
-def hashes(data: bytes) -> list[dict[str, Any]]:
-    """Per layer {layer, symbols, tensors}: SHA-256 in hex of the integers and the float32 values of a complete file.
-    Clause 12.4.
+def hashes(data: bytes, max_layer: int | None = None) -> list[dict[str, Any]]:
+    """Per layer {layer, symbols, tensors}: SHA-256 in hex of the integers and the float32 values of a complete file, or
+    of its layers <= max_layer alone (bytes after those are not looked at). Clause 12.4.
 
     symbols: int32 little-endian, C order, of anchor_q [n, 3], the rise of earlier rows' mask codes, the codes of own
     rows, their step classes if there are any, attributes [channels, n], then planes [C, H, W] scale by scale in the
@@ -116,7 +116,7 @@ def hashes(data: bytes) -> list[dict[str, Any]]:
     tensors: float32 little-endian of anchor [n, 3], feature [n, D], scaling_log [n,
     6], offset [n, G, 3] of own rows, then planes and networks as above.
     """
-    _, symbols = read_layers(data)
+    _, symbols = read_layers(data, max_layer=max_layer)
     scene, rows = symbols.scene(), []
     for index, layer in enumerate(symbols.layers):
         integers, tensors = _digest(layer.arrays(), "<i4"), _digest(float_tensors(scene, index), "<f4")

@@ -165,6 +165,11 @@ class Grid:
     def _spacing(self, classes: np.ndarray) -> np.ndarray | int:
         return 1 << classes.astype(np.int64) if self.widths.graded else 1
 
+    def _with_centres(self, symbols: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
+        """(name of an attribute, its rows of symbols [channels, n], their centres [rows, 1])."""
+        both = (attribute_rows(rows, self.widths) for rows in (symbols, self.centre[:, None]))
+        yield from ((name, own, centre) for (name, own), (_, centre) in zip(*both, strict=True))
+
     def farthest(self, symbols: np.ndarray, classes: np.ndarray) -> dict[str, int]:
         """By attribute, the largest |m + k 2^c|; 0 without anchors."""
         most = dict.fromkeys(ATTRIBUTES, 0)
@@ -179,9 +184,7 @@ class Grid:
     def quantise(self, values: dict[str, np.ndarray], classes: np.ndarray) -> np.ndarray:
         """Symbols of float32 [n, *shape] by attribute. Raises EncodeError for a value that has none."""
         symbols = np.empty((self.widths.channels, len(values[ATTRIBUTES[0]])), np.int32)
-        for (name, own), (_, centre) in zip(
-            attribute_rows(symbols, self.widths), attribute_rows(self.centre[:, None], self.widths), strict=True
-        ):
+        for name, own, centre in self._with_centres(symbols):
             for rows in row_blocks(symbols.shape[1]):
                 channels = values[name][rows].reshape(-1, len(centre)).T
                 own[:, rows] = quantise(channels, self.steps[name], name, centre, self._spacing(classes[rows]))
@@ -190,9 +193,7 @@ class Grid:
     def dequantise(self, symbols: np.ndarray, classes: np.ndarray) -> dict[str, np.ndarray]:
         """The inverse of `quantise`: float32 [n, *shape] by attribute, C-contiguous."""
         values = {}
-        for (name, own), (_, centre) in zip(
-            attribute_rows(symbols, self.widths), attribute_rows(self.centre[:, None], self.widths), strict=True
-        ):
+        for name, own, centre in self._with_centres(symbols):
             found = np.empty(own.shape[::-1], np.float32)
             for rows in row_blocks(own.shape[1]):
                 found[rows] = dequantise(own[:, rows], self.steps[name], centre, self._spacing(classes[rows])).T

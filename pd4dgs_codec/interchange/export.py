@@ -338,19 +338,12 @@ def turned_camera(camera: Camera, turn: np.ndarray) -> Camera:
     return replace(camera, viewmat=viewmat.astype(np.float32))
 
 
-@dataclass(frozen=True)
-class Cost:
-    """Means over held-out views, dB: direct pictures and exported Gaussians against the truth, and the second against
-    the first."""
+def cost(export: Export, views: Sequence[View], step: Step = lambda: None) -> dict[str, float]:
+    """The cost of exporting: the time of each view is exported by itself and drawn from the view's camera.
 
-    views: int
-    direct_mpsnr: float
-    exported_mpsnr: float
-    exported_to_direct_psnr: float
-
-
-def cost(export: Export, views: Sequence[View], step: Step = lambda: None) -> Cost:
-    """The cost of exporting: the time of each view is exported by itself and drawn from the view's camera."""
+    views: their number; and means over them, dB: direct_mpsnr and exported_mpsnr, of direct pictures and of exported
+    Gaussians against the truth, and exported_to_direct_psnr, of the second against the first.
+    """
     rows, info = [], export.player.info
     for view in views:
         direct = export.player.picture(view.camera, view.time)
@@ -360,4 +353,5 @@ def cost(export: Export, views: Sequence[View], step: Step = lambda: None) -> Co
         to_direct = -10 * np.log10(max(error, np.finfo(float).tiny))
         rows.append((mpsnr(direct, view.image, view.mask), mpsnr(image, view.image, view.mask), to_direct))
         step()
-    return Cost(len(views), *np.mean(rows, axis=0).tolist())
+    names = ("direct_mpsnr", "exported_mpsnr", "exported_to_direct_psnr")
+    return {"views": len(views), **dict(zip(names, np.mean(rows, axis=0).tolist(), strict=True))}

@@ -21,7 +21,7 @@ import numpy as np
 from pd4dgs_codec.archives import read_tensors
 from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, LARGEST, read_file, read_vertices
 from pd4dgs_codec.errors import DataError, one_line, required
-from pd4dgs_codec.interchange.splats import MAX_DEGREE, SH_C0, Splats, unit
+from pd4dgs_codec.interchange.splats import MAX_DEGREE, Splats, unit
 
 EXTRA = "interchange"  #: of gaussforge and fourdgs
 #: Coefficients of the harmonics without the constant, by degree.
@@ -208,7 +208,7 @@ def ply_bytes(splats: Splats) -> bytes:
         splats.means,
         np.zeros((n, 3)),
         splats.sh[:, 0],
-        splats.sh[:, 1:].transpose(0, 2, 1).reshape(n, 3 * (splats.sh.shape[1] - 1)),
+        splats.rest,
         np.log(p / (1 - p))[:, None],
         np.log(np.maximum(splats.scales, LEAST_SCALE)),
         splats.quats,
@@ -220,10 +220,9 @@ def ply_bytes(splats: Splats) -> bytes:
 
 def glb_bytes(splats: Splats) -> bytes:
     """A binary glTF 2.0 file. Viewers without the extension show coloured points. glTF's +y is up: rotate first."""
-    colors = np.clip(splats.sh[:, 0] * np.float32(SH_C0) + np.float32(0.5), 0, 1)
     attributes = {
         "POSITION": splats.means,
-        "COLOR_0": np.concatenate([_linear(colors), splats.opacities[:, None]], axis=1),
+        "COLOR_0": np.concatenate([_linear(splats.base_colors), splats.opacities[:, None]], axis=1),
         f"{EXTENSION}:ROTATION": splats.quats[:, [1, 2, 3, 0]],
         f"{EXTENSION}:SCALE": splats.scales,
         f"{EXTENSION}:OPACITY": splats.opacities[:, None],
@@ -300,19 +299,17 @@ def fourdgs_bytes(frames: Sequence[tuple[float, Splats, np.ndarray]], seconds: f
             _, later, later_slots = frames[i + 1]
             _, here, there = np.intersect1d(slots, later_slots, assume_unique=True, return_indices=True)
             speed[here] = (later.means[there] - splats.means[here]) / np.float32(ends[i] - start)
-        rest = splats.sh[:, 1:].transpose(0, 2, 1).reshape(n, 3 * (splats.sh.shape[1] - 1))
-        rgb = np.clip(splats.sh[:, 0] * np.float32(SH_C0) + np.float32(0.5), 0, 1)
         for name, values in {
             "positions": splats.means + speed * np.float32(middle - start),
             "scales": splats.scales,
             "rotations": splats.quats[:, [1, 2, 3, 0]],
-            "colors": np.concatenate([rgb, splats.opacities[:, None]], axis=1),
+            "colors": np.concatenate([splats.base_colors, splats.opacities[:, None]], axis=1),
             "motions": speed,
             "mu_t": np.full(n, middle, np.float32),
             "sigma_t": np.full(n, np.inf, np.float32),
             "win_lo": np.full(n, start),
             "win_hi": np.full(n, ends[i]),
-            "sh": np.clip(np.rint((rest + SH_SPAN) * (255 / (2 * SH_SPAN))), 0, 255).astype(np.uint8),
+            "sh": np.clip(np.rint((splats.rest + SH_SPAN) * (255 / (2 * SH_SPAN))), 0, 255).astype(np.uint8),
         }.items():
             parts.setdefault(name, []).append(values)
     columns: dict[str, Any] = {name: np.concatenate(values) for name, values in parts.items()}

@@ -43,6 +43,16 @@ class Splats:
         basis = harmonics(unit(self.means - eye.astype(np.float32)), self.degree)
         return np.asarray(np.maximum(np.einsum("nj,njc->nc", basis, self.sh) + np.float32(0.5), 0))
 
+    @property
+    def base_colors(self) -> np.ndarray:
+        """float32 [N, 3] 0..1: the mean colours over all directions."""
+        return np.asarray(np.clip(self.sh[:, 0] * np.float32(SH_C0) + np.float32(0.5), 0, 1))
+
+    @property
+    def rest(self) -> np.ndarray:
+        """float32 [N, 3 ((degree + 1)^2 - 1)]: the other coefficients, channel by channel, as files have them."""
+        return np.asarray(self.sh[:, 1:].transpose(0, 2, 1).reshape(len(self.sh), 3 * (self.sh.shape[1] - 1)))
+
     def taken(self, rows: np.ndarray) -> Splats:
         """The Gaussians `rows`."""
         return Splats(*(part[rows] for part in vars(self).values()))

@@ -126,9 +126,8 @@ def _solid(source: str, teacher: Teacher, t: float) -> np.ndarray:
 def _points(teacher: Teacher, solid: np.ndarray) -> dict[str, Any]:
     """The fields of a Dataset on its points: at most POINTS of these rows."""
     rows = solid if len(solid) <= POINTS else solid[np.random.default_rng(0).permutation(len(solid))[:POINTS]]
-    splats = teacher.splats(teacher.nearest(MIDDLE))
-    colors = np.clip(splats.sh[rows, 0] * np.float32(SH_C0) + np.float32(0.5), 0, 1)
-    return {"points": splats.means[rows], "point_colors": np.rint(colors * 255).astype(np.uint8)}
+    splats = teacher.splats(teacher.nearest(MIDDLE)).taken(rows)
+    return {"points": splats.means, "point_colors": np.rint(splats.base_colors * 255).astype(np.uint8)}
 
 
 def _pictures(teacher: Teacher, poses: Sequence[tuple[Camera, float]], background: Triple, near: float) -> list[View]:

@@ -22,7 +22,7 @@ from pd4dgs_codec.format.deformation import plane_rate_bits
 from pd4dgs_codec.model import plane_terms
 from pd4dgs_codec.model.config import DeformationConfig
 from pd4dgs_codec.model.hexplane import HexPlane
-from pd4dgs_codec.model.networks import MLP
+from pd4dgs_codec.model.networks import MLP, rounded
 
 
 class DeformationField(nn.Module):
@@ -190,7 +190,7 @@ class _AddNetworks(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rows: Tensor, features: Tensor, settings: tuple[Any, ...], *parameters: Tensor) -> Tensor:
         columns, trunk, step = settings
-        used = [p if step is None else torch.div(p, step).round_().mul_(step) for p in parameters]
+        used = [rounded(p, step) for p in parameters]
         weight, bias = rows.new_zeros(rows.shape[1], used[trunk].shape[1]), rows.new_zeros(rows.shape[1])
         for (own, unit), w, b in zip(columns, used[trunk::2], used[trunk + 1 :: 2], strict=True):
             torch.mul(w, unit, out=weight[own])

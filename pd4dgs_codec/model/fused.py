@@ -19,7 +19,7 @@ from torch.autograd.function import once_differentiable
 
 from pd4dgs_codec.draw import gaussians as kernels
 from pd4dgs_codec.draw.gaussians import MIN_OPACITY, Decoders, Functions
-from pd4dgs_codec.model.networks import MLP, Quantisation
+from pd4dgs_codec.model.networks import MLP, Quantisation, rounded
 from pd4dgs_codec.scene import SCALING_DIM
 
 TORCH = Functions(
@@ -91,7 +91,7 @@ class _Grow(torch.autograd.Function):
     def forward(
         ctx: Any, anchors: Tensor, mask: Tensor, eye: Tensor, step: float | None, *parameters: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        used = [p if step is None else torch.div(p, step).round_().mul_(step) for p in parameters]
+        used = [rounded(p, step) for p in parameters]
         layers = [(w.numpy(), b.numpy()) for w, b in zip(used[::2], used[1::2], strict=True)]
         features = anchors.shape[1] - 3 - 3 * len(layers[1][1]) - SCALING_DIM
         decoders = Decoders([layers[:2], layers[2:4], layers[4:]], features, TORCH)

@@ -20,7 +20,7 @@ from torch.autograd.function import once_differentiable
 from pd4dgs_codec.draw import hexplane as kernels
 from pd4dgs_codec.draw.hexplane import TIME_AXIS, PlaneLayout
 from pd4dgs_codec.draw.simd import LANES
-from pd4dgs_codec.model.networks import round_straight_through
+from pd4dgs_codec.model.networks import round_straight_through, rounded
 from pd4dgs_codec.scene import PLANES, Planes, plane_sides
 from pd4dgs_codec.threads import kernel_threads
 
@@ -38,9 +38,7 @@ class _Sample(torch.autograd.Function):
         ctx: Any, grid: Tensor, layout: PlaneLayout, box: Tensor, points: Tensor, t: float, step: float | None
     ) -> Tensor:
         tables = (layout.reso, layout.start, layout.rows)
-        spatial = grid[: layout.n_spatial]
-        if step is not None:
-            spatial = torch.div(spatial, step).round_().mul_(step)
+        spatial = rounded(grid[: layout.n_spatial], step)
         rows = grid.new_empty(layout.n_rows, grid.shape[1])
         kernels.collapse(rows.numpy(), grid.numpy(), *tables, t, 0.0 if step is None else step)
         out = grid.new_empty(len(points), len(layout.reso) * grid.shape[1])

@@ -57,10 +57,15 @@ class Quantisation(NamedTuple):
     rounding: bool
 
 
+def rounded(x: Tensor, step: float | Tensor | None) -> Tensor:
+    """round(x / step) * step; x itself if step is None. For use within a forward pass, outside of the graph."""
+    return x if step is None else torch.div(x, step).round_().mul_(step)
+
+
 class _Round(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor, step: float | Tensor) -> Tensor:
-        return torch.div(x, step).round_().mul_(step)
+        return rounded(x, step)
 
     @staticmethod
     def backward(ctx: Any, g: Tensor) -> tuple[Tensor, None]:
@@ -68,11 +73,11 @@ class _Round(torch.autograd.Function):
 
 
 def round_straight_through(x: Tensor, step: float | Tensor | None) -> Tensor:
-    """round(x / step) * step with the identity's gradient; x itself if step is None."""
+    """`rounded` with the identity's gradient."""
     if step is None:
         return x
-    rounded: Tensor = _Round.apply(x, step)  # type: ignore[no-untyped-call]
-    return rounded
+    found: Tensor = _Round.apply(x, step)  # type: ignore[no-untyped-call]
+    return found
 
 
 class MLP(nn.Module):

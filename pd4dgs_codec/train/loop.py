@@ -5,13 +5,10 @@ from __future__ import annotations
 import contextlib
 import json
 import math
-import signal
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from statistics import median
-from types import FrameType
 from typing import Any, Protocol
 
 import torch
@@ -22,6 +19,7 @@ from pd4dgs_codec.io import finite
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import ModelConfig
 from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.signals import stop_request
 from pd4dgs_codec.threads import one_torch_thread
 from pd4dgs_codec.train import workers
 from pd4dgs_codec.train.config import DEFAULT_ITERATIONS, TrainConfig
@@ -273,28 +271,3 @@ class RecordLog:
 
     def _error(self, error: OSError) -> DataError:
         return DataError(f"{self.path}: the log cannot be written: {error.strerror or error}")
-
-
-@contextlib.contextmanager
-def stop_request() -> Iterator[threading.Event]:
-    """Gives what the first Ctrl-C or SIGTERM sets; every further one raises KeyboardInterrupt.
-
-    Signals that the process ignores stay ignored. Outside the main thread, where Python allows no handlers, nothing
-    changes.
-    """
-    stop, main = threading.Event(), threading.current_thread() is threading.main_thread()
-
-    def received(number: int, frame: FrameType | None) -> None:
-        if stop.is_set():
-            raise KeyboardInterrupt
-        stop.set()
-
-    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM) if main}
-    before = {number: handler for number, handler in before.items() if handler is not signal.SIG_IGN}
-    try:
-        for number in before:
-            signal.signal(number, received)
-        yield stop
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, signal.SIG_DFL if handler is None else handler)

@@ -114,7 +114,7 @@ def test_where_shapes_do_not_take_the_direction_another_eye_evaluates_colours_al
     player, eyes = Player(scene), np.array([[0, 0, -4], [3, 1, 2]], np.float32)
     for _ in range(2):  # from the second view on
         first = player.gaussians_of_eyes(player.active, 0.4, eyes[:1])
-    player._decoders = player._field = Untouchable()
+    player._decoders.look = player._decoders.make = player._field = Untouchable()
     second = player.gaussians_of_eyes(player.active, 0.4, eyes[1:])
     both = Player(scene).gaussians_of_eyes(player.active, 0.4, eyes)
     for name, values in vars(both).items():

@@ -123,8 +123,8 @@ def test_refinement_comes_closer_to_the_scenes_own_pictures(player):
 
 def test_the_cost_is_measured_on_held_out_views(player):
     report = cost(Export(player, eyes_of_scene(player, 6), 1, 0), disc(held_out=(0.2, 0.6)).test)
-    assert report.views == 2 and 0 < report.exported_to_direct_psnr < 100
-    assert 0 < report.exported_mpsnr < 60 and 0 < report.direct_mpsnr < 60
+    assert report["views"] == 2 and 0 < report["exported_to_direct_psnr"] < 100
+    assert 0 < report["exported_mpsnr"] < 60 and 0 < report["direct_mpsnr"] < 60
 
 
 @pytest.mark.parametrize("camera", [True, False])
