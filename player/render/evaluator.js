@@ -54,18 +54,9 @@ class Scaffold {
     for (let o = 0; o < first.outputs; o++) {
       for (let k = 0; k < this.views; k++) data[((o >> 2) * 3 + k) * 4 + (o & 3)] = weight[3 * o + k];
     }
-    this._gl = gpu.gl;
-    this._direction = gpu.uniforms(data);
+    /** The weights of the direction. */
+    this.direction = gpu.uniforms(data);
     this.last = last;
-  }
-
-  /** Makes the weights of the direction a uniform block. @param {number} index */
-  bind(index) {
-    this._gl.bindBufferBase(this._gl.UNIFORM_BUFFER, index, this._direction);
-  }
-
-  free() {
-    this._gl.deleteBuffer(this._direction);
   }
 
   /** Source that declares the weights of the direction. @param {number} index of the uniform block */
@@ -143,8 +134,8 @@ export class GpuEvaluator {
     this._opacity = scaffold(opacity);
     this._covariance = scaffold(covariance);
     this._color = scaffold(color);
-    this._scaffolds = [this._opacity, this._covariance, this._color];
-    this._first = new Linear(gpu, stack(this._scaffolds.map((scaffold) => scaffold.features)));
+    const scaffolds = [this._opacity, this._covariance, this._color];
+    this._first = new Linear(gpu, stack(scaffolds.map(({ features }) => features)));
     if (this._first.paddedBlocks > gpu.maxLayers) throw new TooLarge("the networks' first layers");
     const tables = levelOf(scene, 2).motion ? 3 : 1; // anchors, residuals, and anchors without those at the key instant
     const blocks = this._blocks * tables + this._first.paddedBlocks + blocksOf(slots);
@@ -351,7 +342,7 @@ ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i} * vec4(greaterThanEqual(y${
     const codes = /** @type {WebGLTexture} */ (this._codes);
     gpu.use(program, { ...this._anchorTextures(), before: this._before, codes });
     gpu.gl.uniform3fv(program.uniform("eye"), eye);
-    this._opacity.bind(1);
+    gpu.gl.bindBufferBase(gpu.gl.UNIFORM_BUFFER, 1, this._opacity.direction);
     linear.cover(this._opacities, 0, lines);
   }
 
@@ -381,8 +372,8 @@ ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i} * vec4(greaterThanEqual(y${
     const { _before: before, _list: list, _opacities: opacities, _codes: codes } = this;
     gpu.use(program, { ...this._anchorTextures(), before, list, opacities, codes });
     gl.uniform3fv(program.uniform("eye"), eye);
-    this._covariance.bind(1);
-    this._color.bind(2);
+    gl.bindBufferBase(gl.UNIFORM_BUFFER, 1, this._covariance.direction);
+    gl.bindBufferBase(gl.UNIFORM_BUFFER, 2, this._color.direction);
     for (let i = 0; i < this._slots; i++) {
       if (starts[i + 1] === starts[i]) continue;
       gl.bindBufferRange(gl.UNIFORM_BUFFER, 3, shapes.buffer, shapes.stride * i, shapes.shapeBytes);
@@ -460,12 +451,10 @@ ${repeat(L, (k) => `w += w4[${k}] * c${k};`)}
   }
 
   free() {
-    this._gpu.free(this._anchors, this._before, this._opacities, this._codes, this._list);
     this._freeMotion();
-    for (const scaffold of this._scaffolds) scaffold.free();
-    this._gpu.gl.deleteBuffer(this._shapes.buffer);
-    this._first.free();
-    this._opacityLast.free();
+    this._gpu.free(this._anchors, this._before, this._opacities, this._codes, this._list);
+    this._gpu.free(this._first.buffer, this._opacityLast.buffer, this._shapes.buffer);
+    this._gpu.free(...[this._opacity, this._covariance, this._color].map(({ direction }) => direction));
   }
 }
 

@@ -174,8 +174,7 @@ ${repeat(blocks, (c) => {
   }
 
   free() {
-    this._gpu.free(...this._planes, this._rows, ...this._scratch);
-    for (const linear of this._linears) linear.free();
+    this._gpu.free(...this._planes, this._rows, ...this._scratch, ...this._linears.map(({ buffer }) => buffer));
   }
 }
 

@@ -15,13 +15,6 @@ void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4. - 
 /** Between two looks at a fence, milliseconds. */
 const POLL_MS = 1;
 
-/** The WebGL context is lost; work restarts when it is restored. */
-export class ContextLost extends Error {
-  constructor() {
-    super("the WebGL context is lost");
-  }
-}
-
 /**
  * Texels of four floats in `blocks` layers, all of one size.
  *
@@ -33,8 +26,6 @@ export class ContextLost extends Error {
  *
  * @typedef {{program: WebGLProgram, uniform: (name: string) => WebGLUniformLocation | null}} Program
  */
-
-/** Some blocks of a field. @typedef {{field: Field, block: number}} Target */
 
 export class Gpu {
   /** @param {WebGL2RenderingContext} gl */
@@ -86,24 +77,21 @@ export class Gpu {
   _link(vertex, fragment) {
     const { gl } = this;
     const program = gl.createProgram();
-    if (!program) throw new ContextLost();
     for (const [type, source] of /** @type {[number, string][]} */ ([
       [gl.VERTEX_SHADER, vertex],
       [gl.FRAGMENT_SHADER, fragment],
     ])) {
-      const shader = gl.createShader(type);
-      if (!shader) throw new ContextLost();
+      const shader = /** @type {WebGLShader} */ (gl.createShader(type));
       gl.shaderSource(shader, source);
       gl.compileShader(shader);
       gl.attachShader(program, shader);
-      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) {
+      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) {
         throw new Error(`a shader does not compile: ${gl.getShaderInfoLog(shader)}`);
       }
       gl.deleteShader(shader); // it lives as long as the program
     }
     gl.linkProgram(program);
     if (!gl.getProgramParameter(program, gl.LINK_STATUS)) {
-      if (gl.isContextLost()) throw new ContextLost();
       throw new Error(`shaders do not link: ${gl.getProgramInfoLog(program)}`);
     }
     /** @type {Map<string, WebGLUniformLocation | null>} */
@@ -183,7 +171,6 @@ export class Gpu {
   _texture(target) {
     const { gl } = this;
     const texture = gl.createTexture();
-    if (!texture) throw new ContextLost();
     gl.bindTexture(target, texture);
     gl.texParameteri(target, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
     gl.texParameteri(target, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
@@ -192,11 +179,15 @@ export class Gpu {
     return texture;
   }
 
-  /** Frees fields and textures. @param {(Field | WebGLTexture | null | undefined)[]} things */
+  /** Frees fields, textures and buffers. @param {(Field | WebGLTexture | WebGLBuffer | null | undefined)[]} things */
   free(...things) {
     const { gl } = this;
     for (const thing of things) {
       if (!thing) continue;
+      if (thing instanceof WebGLBuffer) {
+        gl.deleteBuffer(thing);
+        continue;
+      }
       const texture = "texture" in thing ? thing.texture : thing;
       for (const framebuffer of this._framebuffers.get(texture)?.values() ?? []) gl.deleteFramebuffer(framebuffer);
       this._framebuffers.delete(texture);
@@ -216,7 +207,6 @@ export class Gpu {
     const key = `${first} ${count}`;
     const known = framebuffers.get(key);
     const framebuffer = known ?? gl.createFramebuffer();
-    if (!framebuffer) throw new ContextLost();
     gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
     if (known) return;
     framebuffers.set(key, framebuffer);
@@ -282,15 +272,14 @@ export class Gpu {
     }
   }
 
-  /** Waits until the GPU has run all commands so far. Throws ContextLost. */
+  /** Waits until the GPU has run all commands so far. Throws if the context is lost. */
   async finished() {
     const { gl } = this;
     const sync = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     gl.flush();
     for (;;) {
-      if (!sync || gl.isContextLost()) throw new ContextLost();
-      const status = gl.clientWaitSync(sync, 0, 0);
-      if (status === gl.WAIT_FAILED) throw new ContextLost();
+      const status = sync ? gl.clientWaitSync(sync, 0, 0) : gl.WAIT_FAILED;
+      if (status === gl.WAIT_FAILED) throw new Error("the WebGL context is lost");
       if (status !== gl.TIMEOUT_EXPIRED) break;
       await new Promise((resolve) => setTimeout(resolve, POLL_MS));
     }
@@ -301,7 +290,6 @@ export class Gpu {
   uniforms(data) {
     const { gl } = this;
     const buffer = gl.createBuffer();
-    if (!buffer) throw new ContextLost();
     gl.bindBuffer(gl.UNIFORM_BUFFER, buffer);
     gl.bufferData(gl.UNIFORM_BUFFER, data, gl.STATIC_DRAW);
     return buffer;

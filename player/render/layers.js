@@ -32,7 +32,7 @@ export class Linear {
       const at = (this._stride * c) / 4;
       pack(layer, c * this.chunkBlocks * 4, this.chunkBlocks, data.subarray(at, at + this._bytes / 4));
     }
-    this._buffer = gpu.uniforms(data);
+    this.buffer = gpu.uniforms(data);
   }
 
   /** Output blocks with those that only pad the last chunk. */
@@ -45,7 +45,7 @@ export class Linear {
   cover(field, row, rows) {
     const { gl } = this._gpu;
     for (let c = 0; c < this.chunks; c++) {
-      gl.bindBufferRange(gl.UNIFORM_BUFFER, 0, this._buffer, this._stride * c, this._bytes);
+      gl.bindBufferRange(gl.UNIFORM_BUFFER, 0, this.buffer, this._stride * c, this._bytes);
       this._gpu.cover(field, c * this.chunkBlocks, this.chunkBlocks, row, rows);
     }
   }
@@ -62,10 +62,6 @@ export class Linear {
       const terms = repeat(this.inputBlocks, (k) => `y${b} += w0[${b * this.inputBlocks + k}] * x${k};`);
       return `vec4 y${b} = b0[${b}];\n${terms}${relu ? `y${b} = max(y${b}, 0.);` : ""}`;
     });
-  }
-
-  free() {
-    this._gpu.gl.deleteBuffer(this._buffer);
   }
 }
 

@@ -97,10 +97,9 @@ export class Painter {
     this._gpu = gpu;
     const corners = new Uint16Array(6 * BATCH);
     for (let q = 0; q < BATCH; q++) corners.set([0, 1, 2, 2, 1, 3].map((corner) => 4 * q + corner), 6 * q);
-    this._corners = gl.createBuffer();
     this._array = gl.createVertexArray();
     gl.bindVertexArray(this._array);
-    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this._corners);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
     /** @type {WebGLTexture | null} */
@@ -150,7 +149,7 @@ export class Painter {
   /**
    * Draws onto the canvas, which has the camera's size, or for the eyes of a headset.
    *
-   * @param {Splats | null} splats @param {(Camera & {x?: number, y?: number})[]} views and where in the picture they are,
+   * @param {Splats} splats @param {(Camera & {x?: number, y?: number})[]} views and where in the picture they are,
    * pixels @param {ArrayLike<number>} background RGB @param {number} near scene units @param {Target} [target]
    */
   draw(splats, views, background, near, target) {
@@ -177,9 +176,9 @@ export class Painter {
     }
   }
 
-  /** @param {Splats | null} splats @param {Camera & {x?: number, y?: number}} view @param {number} near */
+  /** @param {Splats} splats @param {Camera & {x?: number, y?: number}} view @param {number} near */
   _drawView(splats, { viewmat, K, width, height, x = 0, y = 0 }, near) {
-    if (!splats || !this._order || !this.count) return;
+    if (!this._order || !this.count) return;
     const gpu = this._gpu;
     const { gl } = gpu;
     gl.viewport(x, y, width, height);
@@ -203,12 +202,5 @@ export class Painter {
     gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(this.count / BATCH));
     gl.bindVertexArray(null);
     gl.disable(gl.BLEND);
-  }
-
-  free() {
-    const { gl } = this._gpu;
-    gl.deleteBuffer(this._corners);
-    gl.deleteVertexArray(this._array);
-    this._gpu.free(this._order, this._picture);
   }
 }

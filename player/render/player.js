@@ -3,7 +3,7 @@
 import { centreOf, defaultCamera, fitted } from "./camera.js";
 import { CpuEvaluator } from "./cpu.js";
 import { GpuEvaluator, SPLAT_BLOCKS } from "./evaluator.js";
-import { ContextLost, Gpu } from "./gl.js";
+import { Gpu } from "./gl.js";
 import { levelOf, sameState, stateOf } from "./level.js";
 import { Clip } from "./loader.js";
 import { Pace } from "./pace.js";
@@ -234,16 +234,9 @@ export class Player extends Clip {
   /** The picture on show, its size that of the canvas. */
   snapshot() {
     const { width, height } = this.canvas;
-    const picture = new ImageData(width, height);
-    if (!this._gpu || !this._draw()) return picture;
-    const { gl } = this._gpu;
-    const pixels = new Uint8Array(4 * width * height);
-    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
-    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
-    for (let y = 0; y < height; y++) {
-      picture.data.set(pixels.subarray(4 * width * (height - 1 - y), 4 * width * (height - y)), 4 * width * y);
-    }
-    return picture;
+    const picture = /** @type {OffscreenCanvasRenderingContext2D} */ (new OffscreenCanvas(width, height).getContext("2d"));
+    if (this._draw()) picture.drawImage(this.canvas, 0, 0);
+    return picture.getImageData(0, 0, width, height);
   }
 
   /**
@@ -319,11 +312,15 @@ export class Player extends Clip {
     this._dirty = true;
   }
 
+  /** Forgets a GPU whose context is lost, and with it all that it held. */
   _dropGpu() {
-    this._painter?.free();
-    this._evaluator?.free();
-    this._gpu?.free(this._front?.splats.field, this._spare?.field);
     this._gpu = this._painter = this._evaluator = this._front = this._spare = null;
+  }
+
+  /** Whether what fails on a GPU does so because its context is lost; work restarts when that is restored.
+   * @param {Gpu} gpu */
+  _hasLost(gpu) {
+    return this.closed || gpu !== this._gpu || gpu.gl.isContextLost();
   }
 
   // --- the loop
@@ -435,7 +432,7 @@ export class Player extends Clip {
       this._dirty = true;
       if (playing) this._pace.evaluated(state.level, performance.now() - started, performance.now());
     } catch (error) {
-      if (this.closed || error instanceof ContextLost || gpu !== this._gpu) return;
+      if (this._hasLost(gpu)) return;
       if (this._onCpu(gpu, state.scene)) {
         this._fail(error);
         this._scene = null;
@@ -543,7 +540,7 @@ export class Player extends Clip {
       if (alone && moving) this._pace.drew(now - started);
       this._shown(state, now);
     } catch (error) {
-      if (!(error instanceof ContextLost) && !this.closed) this._fail(error);
+      if (!this._hasLost(gpu)) this._fail(error);
     } finally {
       this._drawing = false;
       this._wake();
