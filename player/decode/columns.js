@@ -1,9 +1,9 @@
-// The rows of a scene as slices bring them (clause 12.2): arrays that grow at their end.
+// Arrays that grow at their end: the rows of a scene as slices bring them (clause 12.2), and the visible Gaussians.
 
 /** An array is allocated for so many times its rows at most, however many are to come. */
 const MOST_GROWTH = 4;
 
-/** @typedef {Int32Array | Float32Array | Uint8Array} Values */
+/** @typedef {Int32Array | Uint32Array | Float32Array | Uint8Array} Values */
 
 /**
  * An array [rows, width] that grows. What was read from it before stays as it is.

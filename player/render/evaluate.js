@@ -1,6 +1,7 @@
 // Clauses 13.2 to 13.4 without a GPU: the Gaussians of a level at a time, for a camera's centre. For Spark, for
 // machines whose GPU is missing or slow, and the reference of the evaluator on the GPU.
 
+import { Column } from "../decode/columns.js";
 import { anchorColumns, columnsOf, headsOf } from "../decode/heads.js";
 import { Arena } from "./kernel.js";
 import { deformationUnit, eachAttribute, GAUSSIAN_COLUMNS as COLUMNS, levelOf, MIN_OPACITY } from "./level.js";
@@ -226,14 +227,14 @@ class Evaluator {
     const { rows, codes, motion } = levelOf(this.scene, level);
     const moving = motion && this._motionOf(motion);
     moving?.field.setTime(t);
-    const kept = new Records(rows);
+    const kept = { slot: new Column(Uint32Array, 1), records: new Column(Float32Array, COLUMNS) };
     const anchors = new Uint32Array(BATCH);
     for (let a = 0; a < rows; ) {
       let count = 0;
       for (; a < rows && count < BATCH; a++) if (codes[a]) anchors[count++] = a;
       this._keep(moving, anchors.subarray(0, count), codes, eye, kept);
     }
-    return kept.gaussians();
+    return { count: kept.slot.rows, slot: kept.slot.values, records: kept.records.values };
   }
 
   /** @param {Deformation} deformation @returns {Motion} */
@@ -273,7 +274,7 @@ class Evaluator {
    * Adds the visible Gaussians of at most BATCH anchors to `kept`.
    *
    * @param {Motion | null} moving at its time @param {Uint32Array} anchors @param {Uint8Array} codes
-   * @param {number[]} eye @param {Records} kept
+   * @param {number[]} eye @param {{slot: Column<Uint32Array>, records: Column<Float32Array>}} kept
    */
   _keep(moving, anchors, codes, eye, kept) {
     const { floats } = this.arena;
@@ -324,6 +325,9 @@ class Evaluator {
     this._covariance.run(alive.length, inputs, stride);
     this._color.run(alive.length, inputs, stride);
     const record = new Float32Array(COLUMNS);
+    const found = new Float32Array(alive.length * S * COLUMNS);
+    /** @type {number[]} */
+    const slots = [];
     alive.forEach((r, row) => {
       const from = r * wide;
       const gate = codes[anchors[r]] / 255;
@@ -342,39 +346,13 @@ class Evaluator {
         record[3] = opacity * gate;
         for (let k = 0; k < 4; k++) record[8 + k] = floats[v + 3 + k];
         normaliseQuaternion(record, 8);
-        if (record.every(Number.isFinite)) kept.add(S * anchors[r] + i, record);
+        if (!record.every(Number.isFinite)) continue;
+        found.set(record, slots.length * COLUMNS);
+        slots.push(S * anchors[r] + i);
       }
     });
-  }
-}
-
-/** A growing list of Gaussians. */
-class Records {
-  /** @param {number} expected */
-  constructor(expected) {
-    this.count = 0;
-    this._slots = new Uint32Array(Math.max(expected, 16));
-    this.data = new Float32Array(this._slots.length * COLUMNS);
-  }
-
-  /** @param {number} slot @param {Float32Array} record */
-  add(slot, record) {
-    if (this.count === this._slots.length) {
-      const slots = new Uint32Array(2 * this.count);
-      slots.set(this._slots);
-      const data = new Float32Array(2 * this.data.length);
-      data.set(this.data);
-      this._slots = slots;
-      this.data = data;
-    }
-    this._slots[this.count] = slot;
-    this.data.set(record, this.count++ * COLUMNS);
-  }
-
-  /** @returns {Gaussians} */
-  gaussians() {
-    const { count } = this;
-    return { count, slot: this._slots.slice(0, count), records: this.data.slice(0, count * COLUMNS) };
+    kept.slot.append(slots, 2);
+    kept.records.append(found.subarray(0, slots.length * COLUMNS), 2);
   }
 }
 
