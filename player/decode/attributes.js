@@ -77,13 +77,8 @@ function readStepClasses(reader, rows) {
  * @param {import("./channels.js").Prior[]} known */
 function decodePlain(bytes, stepClasses, rows, out, known) {
   const groups = stepClasses.length ? groupByClass(stepClasses, STEP_CLASSES) : null;
-  const sizes = groups ? [...groups.sizes] : [rows];
-  decodeChannels(bytes, Array.from({ length: out.length / rows }, () => sizes).flat(), out, known);
-  if (!groups) return;
-  for (let at = 0; at < out.length; at += rows) {
-    const coded = out.slice(at, at + rows);
-    groups.order.forEach((row, i) => (out[at + row] = coded[i]));
-  }
+  const channels = Array.from({ length: out.length / rows }, (_, c) => out.subarray(c * rows, (c + 1) * rows));
+  decodeStage(bytes, channels, channels.map(() => groups), known);
 }
 
 /** 8.6. @param {ByteReader} reader @param {import("./parameters.js").LayerKind} kind @returns {Block} */

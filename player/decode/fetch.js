@@ -5,8 +5,6 @@ import { DecodeError } from "./errors.js";
 import { Stream } from "./stream.js";
 /** @import { Scene } from "./scene.js" */
 
-/** @typedef {{layer: number, end: number}} LayerEnd */
-
 /** The file is not available, as opposed to one that cannot be decoded. */
 export class FetchError extends Error {
   /** @param {string} message */
@@ -73,12 +71,13 @@ export class SceneSource {
     this._validator = null;
     /** The open connection. @type {AbortController | null} */
     this._controller = null;
-    /** Its response. skip: bytes that are here already. lapsed: why it was ended.
-     * @type {{reader: Reader, skip: number, rest: Uint8Array, lapsed: Cut | null} | null} */
+    /** Its response. skip: bytes that are here already.
+     * @type {{reader: Reader, skip: number, rest: Uint8Array} | null} */
     this._body = null;
-    /** A wait of the connection: when it lapses, what ends it then, and the timer that looks.
-     * @type {{at: number, end: (why: Cut) => void, timer: ReturnType<typeof setTimeout> | undefined}} */
-    this._wait = { at: 0, end: () => {}, timer: undefined };
+    /** When a wait of the connection lapses, and the timer that looks. */
+    this._lapse = Infinity;
+    /** @type {ReturnType<typeof setTimeout> | undefined} */
+    this._timer = undefined;
     /** When the request was sent, and how many bytes were here then. */
     this._requested = { at: 0, received: 0 };
     /** Where the file was fetched anew after damage. */
@@ -93,8 +92,8 @@ export class SceneSource {
   close() {
     this._controller?.abort();
     this._controller = this._body = null;
-    clearTimeout(this._wait.timer);
-    this._wait.timer = undefined;
+    clearTimeout(this._timer);
+    this._timer = undefined;
   }
 
   /**
@@ -118,7 +117,9 @@ export class SceneSource {
         let block;
         try {
           block = await this._read(end, until);
-        } catch (error) {
+        } catch (thrown) {
+          const reason = this._controller?.signal.reason;
+          const error = reason instanceof Cut ? reason : thrown; // not all engines throw the reason
           this.close();
           this._signal?.throwIfAborted();
           if (now() >= until) return;
@@ -210,10 +211,9 @@ export class SceneSource {
           if (filled) break; // the next call meets it again, as the end below
           throw error;
         }
-        this._wait.at = Infinity;
+        this._lapse = Infinity;
         if (came.done) {
           if (filled) break;
-          if (body.lapsed) throw body.lapsed;
           this.close();
           if (this.total !== null) throw new Cut(`ended at byte ${this.received} of ${this.total}`);
           this.total = this.received; // a length that was never told ends with the response
@@ -239,29 +239,19 @@ export class SceneSource {
     return this._gathered.subarray(0, filled);
   }
 
-  /** The value of `promise`, or a Cut if it takes too long. @template T @param {Promise<T>} promise @param {number} until
-   * @returns {Promise<T>} */
-  _within(promise, until) {
-    return new Promise((resolve, reject) => {
-      promise.then(resolve, reject);
-      this._wait.end = reject;
-      this._await(until);
-    });
-  }
-
   /** Begins a wait. One timer serves all of a connection, since one for each would take longer than a small piece does;
    * those that follow lapse no earlier. @param {number} until */
   _await(until) {
-    this._wait.at = Math.min(performance.now() + 1000 * this._stall, 1000 * until);
-    if (this._wait.timer === undefined) this._look();
+    this._lapse = Math.min(performance.now() + 1000 * this._stall, 1000 * until);
+    if (this._timer === undefined) this._look();
   }
 
-  /** Ends the wait if it has lapsed, else looks again when it will have. */
+  /** Ends the connection if the wait has lapsed, else looks again when it will have. */
   _look() {
-    const left = this._wait.at - performance.now();
+    const left = this._lapse - performance.now();
     const later = Math.min(Math.ceil(left) + 1, 2 ** 31 - 1); // more would fire at once
-    this._wait.timer = left > 0 && left < Infinity ? setTimeout(() => this._look(), later) : undefined;
-    if (left <= 0) this._wait.end(new Cut("no byte arrived for too long"));
+    this._timer = left > 0 && left < Infinity ? setTimeout(() => this._look(), later) : undefined;
+    if (left <= 0) this._controller?.abort(new Cut("no byte arrived for too long"));
   }
 
   /** Requests the missing bytes. @param {number} until */
@@ -273,17 +263,11 @@ export class SceneSource {
     this._requested = { at: now(), received: start };
     // a request after a cut or damage bypasses caches
     const cache = start ? "no-store" : "default";
-    const response = await this._within(this._fetch(this.url, { headers, signal, cache }), until);
+    this._await(until);
+    const response = await this._fetch(this.url, { headers, signal, cache });
     const skip = this._accept(response, "Range" in headers);
     if (skip === null) this.close();
-    else {
-      const reader = (response.body ?? new Blob().stream()).getReader();
-      const body = (this._body = { reader, skip, rest: NOTHING, lapsed: /** @type {Cut | null} */ (null) });
-      this._wait.end = (why) => {
-        body.lapsed = why;
-        reader.cancel().catch(() => {}); // ends the pending read
-      };
-    }
+    else this._body = { reader: (response.body ?? new Blob().stream()).getReader(), skip, rest: NOTHING };
   }
 
   /**

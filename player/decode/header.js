@@ -14,7 +14,6 @@ import { unpack } from "./msgpack.js";
 
 /**
  * @typedef {object} Header
- * @property {number} size bytes
  * @property {ListedChunk[]} chunks
  * @property {[number, number, number]} steps of feature, scaling_log and offset
  * @property {import("./scene.js").Info} info
@@ -78,7 +77,6 @@ export function readHeader(bytes) {
   if (mode === 1 && new Set(layers).size < layers.length) throw malformed("header: mode lzma, and a layer in slices");
   if (mode === 1) throw unsupported("header: mode lzma, expected mode ans"); // an ans-only decoder (clause 16)
   return {
-    size: bytes.length,
     chunks,
     steps: [feature, scalingLog, offset],
     info: {

@@ -44,6 +44,9 @@ export class LayerReader {
     this.maxLayer = maxLayer;
     /** @type {Header | null} */
     this.header = null;
+    /** Each slice's layer with the end of its chunk in the file, in file order; empty until the header is there.
+     * @type {{layer: number, end: number}[]} */
+    this.layerEnds = [];
     /** Of the next chunk, or of the header before it is read. */
     this.offset = 0;
     /** What the layers read so far hold. @type {LayerParts[]} */
@@ -71,33 +74,30 @@ export class LayerReader {
     return (this._following[this._index] ?? Infinity) > this.maxLayer;
   }
 
-  /**
-   * Reads the header, unless it has been read. Raises Truncated, with nothing consumed, if `bytes` end before.
-   *
-   * @param {Uint8Array} bytes from offset on
-   * @returns {Header}
-   */
-  readHeader(bytes) {
-    if (this.header) return this.header;
+  /** Reads the header. Raises Truncated, with nothing consumed, if `bytes` end before. @param {Uint8Array} bytes */
+  _begin(bytes) {
     const packed = readPreamble(bytes);
-    this.header = readHeader(packed);
+    const header = readHeader(packed);
+    this.header = header;
     this.offset = PREAMBLE_SIZE + packed.length;
-    this._begin(this.header);
-    return this.header;
-  }
-
-  /** @param {Header} header */
-  _begin({ chunks, widths: { feature, slots } }) {
     this._following = [null];
-    for (const { type } of [...chunks].reverse()) {
+    for (const { type } of [...header.chunks].reverse()) {
       this._following.unshift(type < LAYER_TYPES ? type : this._following[0]);
     }
+    let end = this.offset;
     let come = 0;
-    const sums = chunks.map(({ type, length }) => (come += type < LAYER_TYPES ? length : 0));
+    const sums = header.chunks.map(({ type, length }) => {
+      end += CHUNK_OVERHEAD + length;
+      if (type >= LAYER_TYPES) return come;
+      this.layerEnds.push({ layer: type, end });
+      return (come += length);
+    });
     this._share = sums.map((sum) => sum / come);
+    const { feature, slots } = header.widths;
     const widths = { anchor: 3, feature, scalingLog: 6, offset: 3 * slots };
     this._columns = { voxels: new Column(Int32Array, 3) };
     for (const [name, width] of Object.entries(widths)) this._columns[name] = new Column(Float32Array, width);
+    return header;
   }
 
   /** Whether the layer of the latest slice has no further ones. */
@@ -116,7 +116,7 @@ export class LayerReader {
    */
   next(bytes) {
     const start = this.offset;
-    const header = this.readHeader(bytes);
+    const header = this.header ?? this._begin(bytes);
     while (!this.complete) {
       const slice = this._readChunk(bytes.subarray(this.offset - start), header);
       if (slice) return slice;

@@ -1,8 +1,6 @@
 // Clause 12.3: bytes as they arrive, to scenes.
 
-import { CHUNK_OVERHEAD, PREAMBLE_SIZE } from "./container.js";
 import { DecodeError } from "./errors.js";
-import { LAYER_TYPES } from "./header.js";
 import { LayerReader } from "./reader.js";
 /** @import { Scene } from "./scene.js" */
 
@@ -21,8 +19,6 @@ export class Stream {
     this._needs = 0;
     /** @type {DecodeError | null} */
     this._error = null;
-    /** @type {{layer: number, end: number}[]} */
-    this._ends = [];
   }
 
   /** Whether every layer that was asked for has arrived. */
@@ -37,15 +33,7 @@ export class Stream {
 
   /** Each slice's layer with the end of its chunk in the file, in file order; empty until the header is there. */
   get layerEnds() {
-    const header = this._reader.header;
-    if (!header || this._ends.length) return this._ends;
-    let end = PREAMBLE_SIZE + header.size;
-    const ends = [];
-    for (const { type, length } of header.chunks) {
-      end += CHUNK_OVERHEAD + length;
-      if (type < LAYER_TYPES) ends.push({ layer: type, end });
-    }
-    return (this._ends = ends);
+    return this._reader.layerEnds;
   }
 
   /**

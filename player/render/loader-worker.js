@@ -30,7 +30,8 @@ function ask(url, options) {
   if (!early || url !== early.url) return fetch(url, options);
   const { answer, controller } = early;
   early = undefined;
-  options?.signal?.addEventListener("abort", () => controller.abort());
+  const signal = options?.signal;
+  signal?.addEventListener("abort", () => controller.abort(signal.reason));
   return answer;
 }
 
