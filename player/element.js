@@ -119,11 +119,11 @@ export class Pd4Player extends HTMLElement {
     /** @param {string} selector */
     const part = (selector) => /** @type {HTMLElement} */ (root.querySelector(selector));
     this._poster = /** @type {HTMLImageElement} */ (part("img"));
-    this._error = /** @type {HTMLElement} */ (part(".error"));
-    this._statusLine = /** @type {HTMLElement} */ (part(".status"));
-    this._bar = /** @type {HTMLElement} */ (part(".bar"));
-    this._levels = /** @type {HTMLElement} */ (part(".levels"));
-    this._clock = /** @type {HTMLElement} */ (part(".clock"));
+    this._error = part(".error");
+    this._statusLine = part(".status");
+    this._bar = part(".bar");
+    this._levels = part(".levels");
+    this._clock = part(".clock");
     this._play = /** @type {HTMLButtonElement} */ (part(".play"));
     this._slider = /** @type {HTMLInputElement} */ (part("input"));
     this._select = /** @type {HTMLSelectElement} */ (part("select"));
@@ -322,7 +322,7 @@ export class Pd4Player extends HTMLElement {
     if (fps > 1) parts.push(`${fps} fps`);
     if (drawn && scale < 1) parts.push(`${Math.round(100 * scale)} %`);
     if (drawn && software) parts.push("no GPU: the CPU draws, fewer pixels while the picture moves");
-    setText(this._statusLine, parts.join(" · "));
+    this._statusLine.textContent = parts.join(" · ");
 
     const whole = ends.filter(({ layer }, i) => layer !== ends[i + 1]?.layer); // of slices the last one
     while (this._levels.children.length < whole.length) this._levels.append(document.createElement("i"));
@@ -361,11 +361,6 @@ export class Pd4Player extends HTMLElement {
     if (document.fullscreenElement) document.exitFullscreen();
     else this.requestFullscreen?.().catch(() => {}); // a page may forbid it
   }
-}
-
-/** @param {HTMLElement} element @param {string} text */
-function setText(element, text) {
-  if (element.textContent !== text) element.textContent = text;
 }
 
 /** @param {number} bytes */

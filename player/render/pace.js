@@ -20,7 +20,7 @@ export class Pace {
     this._draws = 0;
     this._drawMs = 0;
     /** The highest level that keeps up. */
-    this._cap = 2;
+    this.level = 2;
     this._evaluations = 0;
     this._evaluateMs = 0;
     this._retryMs = RETRY_MS[0];
@@ -30,11 +30,6 @@ export class Pace {
   /** Of the picture's sides, while it moves. */
   get scale() {
     return SCALES[this._step];
-  }
-
-  /** The highest level to play. */
-  get level() {
-    return this._cap;
   }
 
   /** Records a draw at the current scale. @param {number} ms from its start to its end on the GPU */
@@ -55,17 +50,17 @@ export class Pace {
    * @param {number} level @param {number} ms @param {number} now milliseconds
    */
   evaluated(level, ms, now) {
-    if (level <= this._cap) {
+    if (level <= this.level) {
       this._evaluateMs = this._evaluations ? this._evaluateMs + WEIGHT * (ms - this._evaluateMs) : ms;
       this._evaluations++;
     }
     if (this._evaluations >= 3 && this._evaluateMs > EVALUATE_MS[level]) {
-      this._cap = level - 1;
+      this.level = level - 1;
       this._evaluations = 0;
       this._retryAt = now + this._retryMs;
       this._retryMs = Math.min(2 * this._retryMs, RETRY_MS[1]);
-    } else if (this._cap < 2 && now > this._retryAt) {
-      this._cap++;
+    } else if (this.level < 2 && now > this._retryAt) {
+      this.level++;
       this._evaluations = 0;
       this._retryAt = now + this._retryMs;
     }

@@ -8,10 +8,7 @@ const sorter = new DepthSort();
 let means = new Float32Array(0);
 
 serve({
-  /** @param {Parameters<typeof listGaussians>} args */
-  list(...args) {
-    return listGaussians(...args);
-  },
+  list: listGaussians,
   /** @param {ArrayLike<number>} row @param {number} near @param {Float32Array | null} next new means */
   sort(row, near, next) {
     means = next ?? means;

@@ -1,5 +1,13 @@
 // What the harnesses share.
 
+/** What a canvas shows, as base64 of its RGBA bytes: in the task that draws it. @param {HTMLCanvasElement} canvas */
+export function pictureOf(canvas) {
+  const picture = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d");
+  if (!picture) throw new Error("no 2D context");
+  picture.drawImage(canvas, 0, 0);
+  return base64(picture.getImageData(0, 0, canvas.width, canvas.height).data);
+}
+
 /** RGBA bytes as base64. @param {Uint8Array | Uint8ClampedArray} data @returns {string} */
 export function base64(data) {
   let text = "";

@@ -3,7 +3,7 @@
 import * as pc from "playcanvas";
 
 import { Pd4 } from "../playcanvas.js";
-import { base64 } from "./pictures.js";
+import { pictureOf } from "./pictures.js";
 
 /** app, camera, script, canvas: while a scene is open. @type {any} */
 const harness = { open, shoot, close };
@@ -63,10 +63,7 @@ async function shoot({ level, seconds, viewmat, K, width, height }) {
     await frame();
   }
   handle.off();
-  const picture = new OffscreenCanvas(width, height).getContext("2d");
-  if (!picture) throw new Error("no 2D context");
-  await new Promise((resolve) => app.once("frameend", () => resolve(picture.drawImage(canvas, 0, 0))));
-  return base64(picture.getImageData(0, 0, width, height).data);
+  return new Promise((resolve) => app.once("frameend", () => resolve(pictureOf(canvas))));
 }
 
 function close() {

@@ -1,7 +1,7 @@
 // What the test of the adapter to Spark calls: `window.harness`. three.js and Spark come from the page's import map.
 
 import { Pd4Splats, SPARK_SETTINGS } from "../spark.js";
-import { base64 } from "./pictures.js";
+import { pictureOf } from "./pictures.js";
 
 /** @param {string} name */
 const load = (name) => import(name); // without a type: TypeScript need not find the package
@@ -47,11 +47,7 @@ async function shoot({ level, seconds, viewmat, K, width, height }) {
   scene.updateMatrixWorld();
   await sparkRenderer.update({ scene, camera }); // also their order, as nothing else asks for an update
   renderer.render(scene, camera);
-  const gl = renderer.getContext();
-  const pixels = new Uint8Array(4 * width * height);
-  gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
-  const row = 4 * width;
-  return base64(Uint8Array.from(pixels, (_, i) => pixels[row * (height - 1 - Math.floor(i / row)) + (i % row)]));
+  return pictureOf(renderer.domElement);
 }
 
 function close() {

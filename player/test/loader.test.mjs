@@ -6,14 +6,14 @@ import { test } from "node:test";
 import "../testing/threads.mjs";
 import { decode } from "../decode/index.js";
 import { startLoader } from "../render/loader.js";
-import { readVector, same } from "../testing/vectors.mjs";
+import { addressOf, readVector, same } from "../testing/vectors.mjs";
 /** @import { News } from "../render/loader-worker.js" */
 
 /** Loads a file. @param {Uint8Array} bytes @param {object} [budget] @param {News[]} [told] gets what is told */
 async function load(bytes, budget = {}, told = []) {
   const loader = startLoader((news) => told.push(news));
   try {
-    await loader.call("open", [`data:;base64,${Buffer.from(bytes).toString("base64")}`]);
+    await loader.call("open", [addressOf(bytes)]);
     return { told, ...(await loader.call("load", [budget])) };
   } finally {
     loader.close();

@@ -7,15 +7,10 @@ import "../testing/threads.mjs";
 import { decode } from "../decode/index.js";
 import { evaluate } from "../render/evaluate.js";
 import { Pd4Splats } from "../spark.js";
-import { readVector } from "../testing/vectors.mjs";
+import { addressOf, readVector } from "../testing/vectors.mjs";
 
 const BYTES = readVector("valid/layers-0-1-2");
 const ADDRESS = addressOf(BYTES);
-
-/** @param {Uint8Array} bytes */
-function addressOf(bytes) {
-  return `data:application/octet-stream;base64,${Buffer.from(bytes).toString("base64")}`;
-}
 
 class Vector {
   x = 0;

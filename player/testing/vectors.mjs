@@ -37,6 +37,9 @@ export function readVector(name) {
   return new Uint8Array(readFileSync(new URL(`${name}.pd4`, FOLDER)));
 }
 
+/** An address of these bytes. @param {Uint8Array} bytes */
+export const addressOf = (bytes) => `data:;base64,${Buffer.from(bytes).toString("base64")}`;
+
 /** Recursively equal, typed arrays by type and content. @param {unknown} a @param {unknown} b @returns {boolean} */
 export function same(a, b) {
   if (ArrayBuffer.isView(a) && ArrayBuffer.isView(b)) {
