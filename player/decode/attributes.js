@@ -8,8 +8,9 @@ import { MAX_CODED } from "./limits.js";
 import {
   activityBounds,
   addRelativeMagnitudes,
-  classesByActivity,
+  channelsOf,
   decodeStage,
+  groupByActivity,
   groupByClass,
   readClassCount,
   readStages,
@@ -49,15 +50,18 @@ export function decodeAttributes(bytes, rows, kind, continuation) {
   const reader = new ByteReader(bytes);
   const form = reader.byte("the form of the attributes");
   const stepClasses = kind.stepClasses ? readStepClasses(reader, rows) : new Int32Array(0);
-  const attributes = new Int32Array(channelCount(kind.widths) * rows);
-  if (form === 0) decodePlain(reader.rest(), stepClasses, rows, attributes, continuation.definitions("plain"));
-  else if (form === 1) {
-    const block = readBlock(reader, kind);
-    decodeStaged(reader, stepClasses, rows, kind.widths, block, true, continuation, attributes);
+  const count = channelCount(kind.widths);
+  const attributes = new Int32Array(count * rows);
+  const channels = channelsOf(attributes, count);
+  if (form === 0) {
+    const groups = stepClasses.length ? groupByClass(stepClasses, STEP_CLASSES) : null;
+    decodeStage(reader.rest(), channels, channels.map(() => groups), continuation.definitions("plain"));
+  } else if (form === 1 || form === 2) {
+    const own = form === 1;
+    const block = own ? readBlock(reader, kind) : continuation.block;
+    if (!block) throw malformed("attributes that continue a block, and the layer has none before");
+    decodeStaged(reader, stepClasses, kind.widths, block, own, continuation, channels);
     continuation.block = block;
-  } else if (form === 2) {
-    if (!continuation.block) throw malformed("attributes that continue a block, and the layer has none before");
-    decodeStaged(reader, stepClasses, rows, kind.widths, continuation.block, false, continuation, attributes);
   } else throw unsupported(`form ${form} of the attributes`);
   return { stepClasses, attributes };
 }
@@ -73,14 +77,6 @@ function readStepClasses(reader, rows) {
   return classes;
 }
 
-/** Form 0. @param {Uint8Array} bytes @param {Int32Array} stepClasses @param {number} rows @param {Int32Array} out
- * @param {import("./channels.js").Prior[]} known */
-function decodePlain(bytes, stepClasses, rows, out, known) {
-  const groups = stepClasses.length ? groupByClass(stepClasses, STEP_CLASSES) : null;
-  const channels = Array.from({ length: out.length / rows }, (_, c) => out.subarray(c * rows, (c + 1) * rows));
-  decodeStage(bytes, channels, channels.map(() => groups), known);
-}
-
 /** 8.6. @param {ByteReader} reader @param {import("./parameters.js").LayerKind} kind @returns {Block} */
 function readBlock(reader, { widths: { feature, slots }, stepClasses }) {
   const predicted = feature + 6;
@@ -93,34 +89,30 @@ function readBlock(reader, { widths: { feature, slots }, stepClasses }) {
   return { terms, classCounts, splits, references: new Map(), bounds: [] };
 }
 
-/** 8.7. @param {ByteReader} reader @param {Int32Array} stepClasses @param {number} rows
- * @param {import("./header.js").Widths} widths @param {Block} block
- * @param {boolean} own whether the block stands in this slice, which then sets its references and bounds
- * @param {import("./slices.js").Continuation} continuation @param {Int32Array} out */
-function decodeStaged(reader, stepClasses, rows, { feature, slots }, block, own, continuation, out) {
+/** 8.7. @param {ByteReader} reader @param {Int32Array} stepClasses @param {import("./header.js").Widths} widths
+ * @param {Block} block @param {boolean} own whether the block stands in this slice, which then sets its references and
+ * bounds @param {import("./slices.js").Continuation} continuation @param {Int32Array[]} all the channels */
+function decodeStaged(reader, stepClasses, { feature, slots }, block, own, continuation, all) {
   const { terms, classCounts, splits, references } = block;
   const predicted = feature + 6; // features and log-scalings are predicted from each other
   const firsts = STAGE_BOUNDS.map((part) => Math.floor((predicted * part) / 38));
   const stages = readStages(reader, STAGES);
-  /** @param {number} c */
-  const channel = (c) => out.subarray(c * rows, (c + 1) * rows);
 
-  const activity = new Float64Array(rows);
+  const activity = new Float64Array(all[0].length);
   if (stepClasses.length) {
     // a row with finer steps has larger symbols
     const fineness = stepClasses.map((c) => 1 << (STEP_CLASSES - 1 - c));
     if (own) references.set("step classes", referenceOf(fineness));
     addRelativeMagnitudes(fineness, activity, references.get("step classes"));
-    for (let p = 0; p < rows; p++) activity[p] *= 4;
+    for (let p = 0; p < activity.length; p++) activity[p] *= 4;
   }
   for (let stage = 0; stage <= X_STAGE; stage++) {
-    const count = classCounts[stage];
-    if (own) block.bounds.push(activityBounds(activity, count));
-    const groups = count > 1 ? groupByClass(classesByActivity(activity, block.bounds[stage]), count) : null;
+    if (own) block.bounds.push(activityBounds(activity, classCounts[stage]));
+    const groups = groupByActivity(activity, block.bounds[stage]);
     const channels = [];
     if (stage === X_STAGE) for (let i = 0; i < slots; i++) channels.push(predicted + 3 * i);
     else for (let c = firsts[stage]; c < firsts[stage + 1]; c++) channels.push(c);
-    const targets = channels.map(channel);
+    const targets = channels.map((c) => all[c]);
     decodeStage(stages[stage], targets, channels.map(() => groups), continuation.definitions(stage));
     if (stage < X_STAGE && classCounts.slice(stage + 1).some((later) => later > 1)) {
       channels.forEach((c, i) => {
@@ -130,17 +122,17 @@ function decodeStaged(reader, stepClasses, rows, { feature, slots }, block, own,
     }
   }
   for (let coordinate = 1; coordinate <= 2; coordinate++) {
-    const targets = splits.map((_, i) => channel(predicted + 3 * i + coordinate));
+    const targets = splits.map((_, i) => all[predicted + 3 * i + coordinate]);
     const groups = splits.map(({ split, a, b }, i) => {
       if (!(split & coordinate)) return null;
-      const x = channel(predicted + 3 * i);
-      const y = coordinate === 2 ? channel(predicted + 3 * i + 1) : null;
+      const x = all[predicted + 3 * i];
+      const y = coordinate === 2 ? all[predicted + 3 * i + 1] : null;
       return groupByClass(classesByDistance(x, a, y, b), DISTANCES[coordinate - 1]);
     });
     const stage = X_STAGE + coordinate;
     decodeStage(stages[stage], targets, groups, continuation.definitions(stage));
   }
-  for (let c = 1; c < predicted; c++) predict(channel(c), terms[c], channel);
+  for (let c = 1; c < predicted; c++) predict(all[c], terms[c], all);
 }
 
 /** Item 1 of 8.6. @param {ByteReader} reader @param {number} c @param {number} predicted @returns {Terms} */
@@ -177,12 +169,12 @@ function classesByDistance(x, a, y, b) {
 }
 
 /** Residuals to symbols by the sum of 8.7, in place. @param {Int32Array} symbols @param {Terms} terms
- * @param {(c: number) => Int32Array} channel */
-function predict(symbols, terms, channel) {
+ * @param {Int32Array[]} all the channels */
+function predict(symbols, terms, all) {
   if (!terms.length) return;
   const sums = new Float64Array(symbols.length).fill(512);
-  for (const { channel: c, weight } of terms) {
-    const known = channel(c);
+  for (const { channel, weight } of terms) {
+    const known = all[channel];
     for (let p = 0; p < sums.length; p++) sums[p] += weight * known[p];
   }
   for (let p = 0; p < sums.length; p++) {

@@ -6,9 +6,9 @@ import { MAX_SYMBOL } from "./limits.js";
 import {
   activityBounds,
   addRelativeMagnitudes,
-  classesByActivity,
+  channelsOf,
   decodeStage,
-  groupByClass,
+  groupByActivity,
   readClassCount,
   readStages,
 } from "./stages.js";
@@ -27,28 +27,16 @@ export function decodePlanes(bytes, shapes) {
   const reader = new ByteReader(bytes);
   const form = reader.byte("the form of the planes");
   const planes = shapes.map(({ channels, height, width }) => new Int32Array(channels * height * width));
-  if (form === 0) decodePlain(reader.rest(), shapes, planes);
-  else if (form === 1) decodeStaged(reader, shapes, planes);
+  const all = planes.map((plane, i) => channelsOf(plane, shapes[i].channels));
+  if (form === 0) decodeStage(reader.rest(), all.flat(), all.flat().map(() => null));
+  else if (form === 1) decodeStaged(reader, shapes, all);
   else throw unsupported(`form ${form} of the planes`);
   planes.forEach((plane, i) => restore(plane, shapes[i]));
   return planes;
 }
 
-/** @param {Uint8Array} bytes @param {PlaneShape[]} shapes @param {Int32Array[]} planes */
-function decodePlain(bytes, shapes, planes) {
-  const targets = shapes.flatMap(({ channels }, i) => channelsOf(planes[i], channels, 0, channels));
-  decodeStage(bytes, targets, new Array(targets.length).fill(null));
-}
-
-/** Plane channels from..end - 1. @param {Int32Array} plane @param {number} channels @param {number} from
- * @param {number} end */
-function channelsOf(plane, channels, from, end) {
-  const cells = plane.length / channels;
-  return Array.from({ length: end - from }, (_, i) => plane.subarray((from + i) * cells, (from + i + 1) * cells));
-}
-
-/** @param {ByteReader} reader @param {PlaneShape[]} shapes @param {Int32Array[]} planes */
-function decodeStaged(reader, shapes, planes) {
+/** @param {ByteReader} reader @param {PlaneShape[]} shapes @param {Int32Array[][]} all the channels of each plane */
+function decodeStaged(reader, shapes, all) {
   const { channels } = shapes[0];
   const count = Math.max(1, 32 - Math.clz32(channels - 1));
   const classCounts = [1];
@@ -65,17 +53,16 @@ function decodeStaged(reader, shapes, planes) {
     const groups = [];
     shapes.forEach(({ height, width }, i) => {
       const activity = classCount > 1 ? sumOfNine(magnitudes[i], height, width) : null;
-      const classes = activity && classesByActivity(activity, activityBounds(activity, classCount));
-      const own = classes && groupByClass(classes, classCount);
-      for (const target of channelsOf(planes[i], channels, first, end)) {
+      const own = activity && groupByActivity(activity, activityBounds(activity, classCount));
+      for (const target of all[i].slice(first, end)) {
         targets.push(target);
         groups.push(own);
       }
     });
     decodeStage(stages[stage], targets, groups);
     if (!classCounts.slice(stage + 1).some((later) => later > 1)) continue;
-    planes.forEach((plane, i) => {
-      for (const residuals of channelsOf(plane, channels, first, end)) addRelativeMagnitudes(residuals, magnitudes[i]);
+    all.forEach((plane, i) => {
+      for (const residuals of plane.slice(first, end)) addRelativeMagnitudes(residuals, magnitudes[i]);
     });
   }
 }

@@ -258,7 +258,6 @@ export class LayerReader {
     const header = this.header;
     if (!header || !this._layers.length) throw new TypeError("no layer has been read");
     const [first, ...later] = this._layers;
-    const networks = networksOf(first);
     const [feature, scalingLog, offset] = header.steps;
     /** @type {Steps} */
     const steps = { feature, scalingLog, offset, weightsScaffold: first.steps[0] };
@@ -285,7 +284,7 @@ export class LayerReader {
       scalingLog: columns.scalingLog.values,
       offset: columns.offset.values,
       mask: masks,
-      networks: { opacity: networks.opacity, covariance: networks.covariance, color: networks.color },
+      networks: /** @type {Scene["networks"]} */ (networksOf(first)),
       globalDeformation: deformations[0],
       localDeformation: deformations[1],
     };

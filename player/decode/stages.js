@@ -84,23 +84,24 @@ export function activityBounds(activity, count) {
 }
 
 /**
- * The class of each place by its activity: the number of bounds that are at most its activity.
- *
- * @param {Float64Array} activity @param {number[]} bounds
- * @returns {Uint8Array}
- */
-export function classesByActivity(activity, bounds) {
-  const n = activity.length;
-  const classes = new Uint8Array(n);
-  for (const bound of bounds) for (let p = 0; p < n; p++) if (activity[p] >= bound) classes[p]++;
-  return classes;
-}
-
-/**
  * The places in the order in which a split channel holds them: class by class, in each as they come.
  *
  * @typedef {{order: Int32Array, sizes: Int32Array}} Groups sizes: places per class
  */
+
+/**
+ * Groups places by the number of bounds that are at most their activity.
+ *
+ * @param {Float64Array} activity @param {number[]} bounds
+ * @returns {Groups | null} null without bounds
+ */
+export function groupByActivity(activity, bounds) {
+  if (!bounds.length) return null;
+  const n = activity.length;
+  const classes = new Uint8Array(n);
+  for (const bound of bounds) for (let p = 0; p < n; p++) if (activity[p] >= bound) classes[p]++;
+  return groupByClass(classes, bounds.length + 1);
+}
 
 /** @param {Uint8Array | Int32Array} classes @param {number} count of classes @returns {Groups} */
 export function groupByClass(classes, count) {
@@ -111,6 +112,12 @@ export function groupByClass(classes, count) {
   const order = new Int32Array(classes.length);
   for (let p = 0; p < classes.length; p++) order[next[classes[p]]++] = p;
   return { order, sizes };
+}
+
+/** Views of the channels, one behind the other. @param {Int32Array} values @param {number} count of channels */
+export function channelsOf(values, count) {
+  const places = values.length / count;
+  return Array.from({ length: count }, (_, c) => values.subarray(c * places, (c + 1) * places));
 }
 
 /**

@@ -1,4 +1,4 @@
-// A hash table of voxels that hold an anchor.
+// Clause 12.1: a hash table of voxels that hold an anchor.
 
 /** Random, so that no file can be made whose voxels all collide. */
 const SEEDS = Int32Array.from({ length: 3 }, () => (Math.random() * 2 ** 32) | 1);
