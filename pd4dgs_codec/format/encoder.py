@@ -1,6 +1,7 @@
 """Scene -> bytes of a `.pd4` file, with a report of where the bits went."""
 
 import hashlib
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -182,8 +183,10 @@ def _write_layers(
 def _write_slices(layer: LayerSymbols, options: EncodeOptions, utility: np.ndarray) -> list[_Slice]:
     """The slices of a layer, in order, of about options.slices bytes at most.
 
-    utility: float [n], of the layer's anchors; the highest come first. A first slice that planes and networks alone
-    make larger has no anchors, except in layer 0, where a picture needs some.
+    utility: float [n], of the layer's anchors; the highest come first. The first slice of layer 0 is full, for the
+    sake of the first picture, that of a later layer of several slices at most half full, so that its motion shows
+    early, and all others are equal. A first slice that planes and networks alone make larger has no anchors, except in
+    layer 0, where a picture needs some.
     """
     rows = np.argsort(-utility, kind="stable")
     costs = np.cumsum(layer.bits_per_row()[rows]) / 8
@@ -194,8 +197,14 @@ def _write_slices(layer: LayerSymbols, options: EncodeOptions, utility: np.ndarr
         least = 1 if found or layer.kind.layer == 0 else 0
         before = costs[done - 1] if done else 0.0
         fixed = 0 if found else len(write_layer(sliced(layer, rows[:0], True), options)[0])
-        if not found and layer.kind.layer == 0:
+        left = (costs[-1] - before) * scale + fixed if len(rows) else fixed
+        if found:
+            number = math.ceil(left / (room * SLACK))
+            room = left / number / SLACK if number > 1 else room
+        elif layer.kind.layer == 0:
             room = max(room, 2 * fixed)
+        elif left > room:
+            room /= 2
         tries: list[tuple[bool, int, _Slice, Past[Fitted]]] = []  # fits, anchors, slice, state for the next slice
         for _ in range(TRIES):
             expected = (costs[done:] - before) * scale + fixed

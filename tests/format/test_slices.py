@@ -115,6 +115,15 @@ def test_slices_take_what_was_asked_and_the_report_says_so():
     assert "anchors" not in info(data[: ends[1]])["layers"][0]
 
 
+def test_motion_shows_early_and_no_slice_is_a_small_rest():
+    """A later layer of several slices begins with half a slice; the slices behind the first of a layer are alike."""
+    _, report = encode_with_report(make_scene(3, anchors=3000), effort=1, slices=4000)
+    for layer in report.layers:
+        first, *others = (row.bytes for row in layer.slices)
+        assert len(others) > 3 and max(others) <= 4000 and min(others) > 0.75 * max(others)
+        assert first <= (2000 if layer.layer else 4000)
+
+
 def test_slices_that_cannot_be_are_refused(monkeypatch):
     with pytest.raises(EncodeError, match="slices of 5 bytes, expected 0 or 1000 and more"):
         encode(scene(), slices=5)
