@@ -57,7 +57,7 @@ def parser() -> options.Parser:
     p = options.Parser("batch", "MANIFEST --op OP -o URI", "Run a command on every scene of a library.", DETAILS)
     add = p.add_argument
     add("input", metavar="MANIFEST", help="file of JSON lines, see below")
-    add("-o", "--output", required=True, metavar="URI", help="folder or URI to write below")
+    add("-o", "--output", required=True, type=options.named, metavar="URI", help="folder or URI to write below")
     add("--op", required=True, choices=VERBS, help="the command: pd4dgs-OP")
     add("--on", choices=ENGINES, default="local", help="engine that runs it (default: local)")
     what = "scenes at a time (default: one per core; ray: as the cluster allows; 0: one by one in this process)"

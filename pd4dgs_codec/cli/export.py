@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.cli import common, options
-from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError
+from pd4dgs_codec.cli.common import OK, Console, UsageError
 from pd4dgs_codec.cli.progress import progress_bar
 from pd4dgs_codec.errors import DataError, required
 from pd4dgs_codec.io import check_path, whole_files
@@ -53,7 +53,9 @@ FPS, STEPS, MAX_FRAMES = 30.0, 300, 100_000
 def parser() -> options.Parser:
     p = options.Parser("export", "FILE -o OUT --to KIND", "Write a scene as Gaussians for other viewers.", DETAILS)
     p.add_argument("input", metavar="FILE", help=".pd4 file; - reads it from stdin")
-    p.add_argument("-o", "--output", required=True, metavar="OUT", help="file to write; with ply-seq a folder")
+    p.add_argument(
+        "-o", "--output", required=True, type=options.named, metavar="OUT", help="file to write; with ply-seq a folder"
+    )
     p.add_argument("--to", required=True, choices=KINDS, help="file format, see below")
     what = "time of ply, spz and glb, 0..1 of the file's time range (default: 0)"
     p.add_argument("--time", type=options.share, metavar="T", help=what)
@@ -108,8 +110,6 @@ def _check_usage(args: argparse.Namespace) -> None:
         raise UsageError(f"found --time with --to {args.to}, expected it with ply, spz or glb")
     if args.to not in SEQUENCES and args.fps is not None:
         raise UsageError(f"found --fps with --to {args.to}, expected it with ply-seq or 4dgs")
-    if args.output == STDIO:
-        raise UsageError("found -o -, expected the name of a file or folder")
 
 
 def _check_folder(path: str, overwrite: bool) -> None:

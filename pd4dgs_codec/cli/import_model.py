@@ -4,7 +4,7 @@ import argparse
 from pathlib import Path
 
 from pd4dgs_codec.cli import options
-from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError, check_output, command, write_checkpoint
+from pd4dgs_codec.cli.common import OK, Console, check_output, command, write_checkpoint
 
 DETAILS = """\
 FOLDER is a Scaffold-GS checkpoint: the folder of the run, or its point_cloud/iteration_N with point_cloud.ply and
@@ -23,7 +23,7 @@ examples:
 def parser() -> options.Parser:
     p = options.Parser("import", "FOLDER -o model.pt", "Import a Scaffold-GS model.", DETAILS)
     p.add_argument("input", metavar="FOLDER", help="the checkpoint")
-    p.add_argument("-o", "--output", required=True, metavar="model.pt", help="checkpoint to write")
+    p.add_argument("-o", "--output", required=True, type=options.named, metavar="model.pt", help="checkpoint to write")
     what = "use the appearance embedding of image I, if colours depend on one"
     p.add_argument("--appearance", type=options.count, metavar="I", help=what)
     what = "voxel size of the anchors' grid in scene units (default: from cfg_args, else from the anchors)"
@@ -34,8 +34,6 @@ def parser() -> options.Parser:
 
 
 def _import(args: argparse.Namespace, console: Console) -> int:
-    if args.output == STDIO:
-        raise UsageError("found -o -, expected the name of a checkpoint to write")
     check_output(args.output, args.overwrite)
     from pd4dgs_codec.interchange.scaffold_gs import Choices, read_scaffold_gs
 

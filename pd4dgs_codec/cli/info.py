@@ -11,8 +11,7 @@ from pd4dgs_codec.errors import DataError
 DETAILS = """\
 Times to the first frame are 8 * (bytes to the end of the first slice) / rate: transfer alone, without latency.
 From a URL (http, https) only the header is fetched, unless --check, --bytes or --hashes need the whole file.
-Error bounds are declared by the encoder: the largest difference of a decoded value from the value it was given. --check
-compares them with the bounds of rounding to the nearest symbol, which follow from the file.
+Error bounds are declared by the encoder: the largest difference of a decoded value from the value it was given.
 
 examples:
   pd4dgs-info scene.pd4

@@ -139,6 +139,7 @@ non_negative_float = checked(float, lambda value: 0 <= value < math.inf, "a numb
 share = checked(float, lambda value: 0 <= value <= 1, "a number from 0 to 1")
 #: Frames a second that GIF and ffmpeg can tell.
 fps = checked(float, lambda value: 0.01 <= value <= 1000, "a number from 0.01 to 1000")
+named = checked(str, lambda text: text not in ("", "-"), "the name of a file or folder")
 line = checked(str, str.isprintable, "one line of printable text")
 finite_float = checked(float, math.isfinite, "a number")
 

@@ -48,7 +48,9 @@ def parser() -> options.Parser:
     summary = "Make a folder for web servers: a page that plays the scene, DASH, HLS."
     p = options.Parser("package", "scene.pd4 -o DIR", summary, DETAILS)
     p.add_argument("input", metavar="scene.pd4", help="file to package (- reads stdin), or a folder of packages")
-    p.add_argument("-o", "--output", required=True, metavar="DIR", help="folder to write, made if missing")
+    p.add_argument(
+        "-o", "--output", required=True, type=options.named, metavar="DIR", help="folder to write, made if missing"
+    )
     p.add_argument("--immutable", action="store_true", help="put digests into file names, for long-lived caches")
     p.add_argument("--no-video", action="store_true", help="leave out the 2D video")
     what = "frame rate of the 2D video (default: 20)"

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from pd4dgs_codec.cli import options
-from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError, command
+from pd4dgs_codec.cli.common import OK, Console, command
 from pd4dgs_codec.cli.progress import progress_bar
 from pd4dgs_codec.errors import DataError
 
@@ -28,8 +28,8 @@ examples:
 def parser() -> options.Parser:
     p = options.Parser("prepare", "INPUT -o FOLDER", "Estimate the camera poses of a recording.", DETAILS)
     add = p.add_argument
-    add("input", metavar="INPUT", help="a video, or a folder of frames")
-    add("-o", "--output", required=True, metavar="FOLDER", help="folder to make")
+    add("input", type=options.named, metavar="INPUT", help="a video, or a folder of frames")
+    add("-o", "--output", required=True, type=options.named, metavar="FOLDER", help="folder to make")
     add("--frames", type=options.count, default=120, metavar="N", help="use at most N frames (default: 120; 0: all)")
     what = "frame rate of a folder of frames (default: 30)"
     add("--fps", type=options.positive_float, default=30.0, metavar="F", help=what)
@@ -40,8 +40,6 @@ def parser() -> options.Parser:
 
 
 def _prepare(args: argparse.Namespace, console: Console) -> int:
-    if STDIO in (args.input, args.output):
-        raise UsageError("found -, expected the names of a recording and of a folder to make")
     from pd4dgs_codec.prepare.stages import Choices, prepare
 
     choices = Choices(args.frames, args.fps, args.downscale, args.camera, args.threads or -1)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.cli import options
-from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError, check_output, command, number, table, write_bytes
+from pd4dgs_codec.cli.common import OK, Console, UsageError, check_output, command, number, table, write_bytes
 from pd4dgs_codec.cli.progress import TrainingProgress
 from pd4dgs_codec.errors import RenderError, TrainError
 from pd4dgs_codec.io import remove_leftovers
@@ -54,15 +54,20 @@ def parser() -> options.Parser:
     p = options.Parser("train", "SOURCE -o FILE.pt", "Train a layered dynamic Gaussian scene from images.", DETAILS)
     add = p.add_argument
     add("source", metavar="SOURCE", help="dataset to train on, see below")
-    add("-o", "--output", required=True, metavar="FILE.pt", help="checkpoint to write")
+    add("-o", "--output", required=True, type=options.named, metavar="FILE.pt", help="checkpoint to write")
     options.add_reading(p, defaults=False)
     options.add_background(p, "that of the data, white behind pictures with alpha")
     what = "0 (small files) to 100 (high quality), see below (default: 50)"
     add("--quality", type=options.checked(float, lambda q: 0 <= q <= 100, "0 to 100"), metavar="Q", help=what)
     _add_fields(p)
     add("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to train (default: auto)")
-    add("--resume", metavar="FILE.pt", help="continue from this checkpoint with the settings stored in it")
-    add("--log", metavar="FILE.jsonl", help="write one JSON object per step")
+    add(
+        "--resume",
+        type=options.named,
+        metavar="FILE.pt",
+        help="continue from this checkpoint with the settings stored in it",
+    )
+    add("--log", type=options.named, metavar="FILE.jsonl", help="write one JSON object per step")
     what = f"show the scene in the browser while it trains, at this port (default: {VIEW_PORT}; needs viser)"
     add("--view", type=options.port, nargs="?", const=VIEW_PORT, metavar="PORT", help=what)
     what = f"turn off a part of the method, see below; may be repeated: {', '.join(ABLATIONS)}"
@@ -137,8 +142,6 @@ main = command(parser, _train)
 
 
 def _check_usage(args: argparse.Namespace) -> None:
-    if STDIO in (args.output, args.resume, args.log):
-        raise UsageError("found -, expected named files: training does not use stdin or stdout")
     if args.rate_scale and "rate" in args.without:
         raise UsageError(f"found --rate-scale {args.rate_scale:g} and --without rate, expected one of them")
     if args.log and os.path.realpath(args.log) == os.path.realpath(args.output):

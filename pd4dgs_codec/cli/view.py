@@ -29,7 +29,13 @@ PACKING_EFFORT = 1
 def parser() -> options.Parser:
     p = options.Parser("view", "SCENE", "Show a scene in the browser.", DETAILS)
     p.add_argument("input", metavar="SCENE", help=".pd4 file, .pt checkpoint or URL of a .pd4; - reads stdin")
-    p.add_argument("-o", "--output", metavar="FILE", help="write one HTML file that shows the scene, and do not serve")
+    p.add_argument(
+        "-o",
+        "--output",
+        type=options.named,
+        metavar="FILE",
+        help="write one HTML file that shows the scene, and do not serve",
+    )
     what = "port to listen on; 0: any free one (default: 0)"
     p.add_argument("--port", type=options.port, default=0, metavar="N", help=what)
     p.add_argument("--no-browser", action="store_true", help="print the address without opening a browser")

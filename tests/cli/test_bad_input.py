@@ -34,7 +34,14 @@ CASES = [
     (2, "train synthetic:local -o m.pt --quality 101", "0 to 100"),
     (2, "train synthetic:local -o m.pt --seed 9223372036854775807", "--seed"),
     (2, "train synthetic:local -o m.pt --feature-width 65", "from 1 to 64"),
-    (2, "train synthetic:local -o -", "named files"),
+    *(
+        (2, f"{command} -o {name}", "the name of a file or folder")
+        for command in (
+            "batch m.jsonl --op encode", "export SCENE --to ply", "import set", "package SCENE", "prepare set",
+            "train synthetic:local", "view SCENE",
+        )
+        for name in ("-", "''")
+    ),
     (2, "train synthetic:local -o m.pt --log m.pt", "two files"),
     (2, "train synthetic:local -o m.pt --without rate --rate-scale 0.5", "--without rate"),
     (2, "encode m.pt", "-o"),
