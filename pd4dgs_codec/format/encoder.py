@@ -189,15 +189,14 @@ def _write_slices(layer: LayerSymbols, options: EncodeOptions, utility: np.ndarr
     layer 0, where a picture needs some.
     """
     rows = np.argsort(-utility, kind="stable")
-    costs = np.cumsum(layer.bits_per_row()[rows]) / 8
+    costs = np.cumsum([0.0, *layer.bits_per_row()[rows]]) / 8  # of the first 0, 1, .. rows
     done, found, past = 0, list[_Slice](), Past[Fitted]()
     scale = 1.0  # bytes that a slice takes per byte expected
     while done < len(rows) or not found:
-        room = options.slices - CHUNK_OVERHEAD - (0 if found else HEADER)
+        room = float(options.slices - CHUNK_OVERHEAD - (0 if found else HEADER))
         least = 1 if found or layer.kind.layer == 0 else 0
-        before = costs[done - 1] if done else 0.0
         fixed = 0 if found else len(write_layer(sliced(layer, rows[:0], True), options)[0])
-        left = (costs[-1] - before) * scale + fixed if len(rows) else fixed
+        left = (costs[-1] - costs[done]) * scale + fixed
         if found:
             number = math.ceil(left / (room * SLACK))
             room = left / number / SLACK if number > 1 else room
@@ -207,7 +206,7 @@ def _write_slices(layer: LayerSymbols, options: EncodeOptions, utility: np.ndarr
             room /= 2
         tries: list[tuple[bool, int, _Slice, Past[Fitted]]] = []  # fits, anchors, slice, state for the next slice
         for _ in range(TRIES):
-            expected = (costs[done:] - before) * scale + fixed
+            expected = (costs[done + 1 :] - costs[done]) * scale + fixed
             likely = int(np.searchsorted(expected, room * SLACK, side="right"))
             count = min(max(likely, least), len(rows) - done)
             trial = past.copy()
