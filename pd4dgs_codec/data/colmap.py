@@ -46,14 +46,14 @@ def read_colmap(folder: Path, downscale: int, holdout: int, background: Color | 
     """Reads a folder with a COLMAP model (see `dataset.load`). Of videos the first camera is held out."""
     places = ((folder / place, kind) for place in COLMAP for kind in (".bin", ".txt"))
     model, kind = next((p, k) for p, k in places if all((p / f"{n}{k}").exists() for n in ("cameras", "images")))
-    cameras, points, colors = _registered(model, kind)
+    cameras, points = _registered(model, kind)
     if videos := _videos(folder):
         files = [_video_of(model, camera, videos) for camera in cameras]
         twice = [video.stem for video, count in Counter(files).items() if count > 1]
         if twice:
             raise DataError(f"{model}: two pictures are of the video {twice[0]}, expected one per camera")
         rig = [_with_video(model, *pair, i) for i, pair in enumerate(zip(cameras, files, strict=True))]
-        return synchronised_dataset(folder, rig, points, colors, downscale, holdout)
+        return synchronised_dataset(folder, rig, points, downscale, holdout)
     pictures = folder / "images" if (folder / "images").is_dir() else folder
     times = _times(folder, [camera.name for camera in cameras])
     frames = []
@@ -64,7 +64,7 @@ def read_colmap(folder: Path, downscale: int, holdout: int, background: Color | 
                 frames.append(replace(camera, name=camera.image.stem, time=time, image=path))
                 continue
         raise DataError(f"{model / f'images{kind}'}: {camera.name}: there is no such picture in {pictures}")
-    return posed_dataset(folder, *held_out(frames, holdout), points, colors, downscale, background=background)
+    return posed_dataset(folder, *held_out(frames, holdout), points, downscale, background=background)
 
 
 def _videos(folder: Path) -> dict[str, Path]:
@@ -93,9 +93,9 @@ def _with_video(model: Path, camera: UnreadView, video: Path, i: int) -> UnreadV
     return replace(camera, name=video.stem, camera_id=i, image=video)
 
 
-def _registered(model: Path, kind: str) -> tuple[list[UnreadView], np.ndarray | None, np.ndarray | None]:
-    """The pictures of a model by name, each with its name in the model as `image` and time 0; points float32 [M, 3]
-    and colours uint8 [M, 3], or None."""
+def _registered(model: Path, kind: str) -> tuple[list[UnreadView], np.ndarray | None]:
+    """The pictures of a model by name, each with its name in the model as `image` and time 0; points float32 [M, 3], or
+    None."""
     read = _Binary if kind == ".bin" else _Text
     lenses = dict(read(model / f"cameras{kind}").cameras())
     images = sorted(read(model / f"images{kind}").images())
@@ -111,11 +111,9 @@ def _registered(model: Path, kind: str) -> tuple[list[UnreadView], np.ndarray | 
         viewmat = world_to_camera(rotation, -rotation.T @ pose[4:])
         frames.append(UnreadView(name, camera, 0.0, viewmat, lenses[camera], Path(name)))
     if not (model / f"points3D{kind}").is_file():
-        return frames, None, None
-    table = np.array(list(read(model / f"points3D{kind}").points()), np.float64).reshape(-1, 6)
-    table = table[(np.abs(table[:, :3]) <= LARGEST).all(axis=1)]  # also false of NaN
-    colors = np.clip(np.nan_to_num(table[:, 3:]), 0, 255).astype(np.uint8)
-    return frames, table[:, :3].astype(np.float32), colors
+        return frames, None
+    points = np.array(list(read(model / f"points3D{kind}").points()), np.float64).reshape(-1, 3)
+    return frames, points[(np.abs(points) <= LARGEST).all(axis=1)].astype(np.float32)  # also false of NaN
 
 
 def _times(folder: Path, names: list[str]) -> list[float]:
@@ -179,11 +177,11 @@ class _Binary:
             yield name, camera, pose
 
     def points(self) -> Iterator[tuple[float, ...]]:
-        """Rows x y z r g b."""
+        """Rows x y z."""
         for _ in range(self._take("Q")[0]):
-            _, *row, _, track = self._take("Q3d3BdQ")
+            _, x, y, z, *_, track = self._take("Q3d3BdQ")
             self._skip(8 * track)
-            yield tuple(row)
+            yield x, y, z
 
     def _take(self, layout: str) -> tuple[Any, ...]:
         """The next values of a little-endian layout."""
@@ -232,7 +230,7 @@ class _Text:
             yield words[9], self._whole(i, values[8]), values[1:8]
 
     def points(self) -> Iterator[tuple[float, ...]]:
-        return (tuple(self._values(i, line.split()[1:7], 6)) for i, line in self.lines if line)
+        return (tuple(self._values(i, line.split()[1:7], 6)[:3]) for i, line in self.lines if line)
 
     def _whole(self, i: int, value: float) -> int:
         return whole_number(value, f"{self.path}: line {i}", low=-MAX_NUMBER, largest=MAX_NUMBER)

@@ -399,18 +399,14 @@ def read_vertices(path: Path, raw: bytes | None = None) -> np.ndarray:
     return _body(path, raw[start:], kind, count, dtype)
 
 
-def read_only_ply(folder: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """`read_ply` of the PLY file of a folder that holds exactly one, else (None, None)."""
+def read_only_ply(folder: Path) -> np.ndarray | None:
+    """`read_ply` of the PLY file of a folder that holds exactly one, else None."""
     found = list(folder.glob("*.ply"))
-    return read_ply(found[0]) if len(found) == 1 else (None, None)
+    return read_ply(found[0]) if len(found) == 1 else None
 
 
-def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Points float32 [M, 3] and colours uint8 [M, 3] (None if absent), without points that are not finite or beyond
-    LARGEST."""
+def read_ply(path: Path) -> np.ndarray:
+    """Points float32 [M, 3], without those that are not finite or beyond LARGEST."""
     vertices = read_vertices(path)
     points = np.stack([vertices[c] for c in "xyz"], axis=1)
-    keep = (np.abs(points) <= LARGEST).all(axis=1)  # also false of NaN
-    names = vertices.dtype.names or ()
-    rgb = [vertices[c] for c in ("red", "green", "blue") if c in names and vertices.dtype[c] == np.uint8]
-    return points[keep].astype(np.float32), np.stack(rgb, axis=1)[keep] if len(rgb) == 3 else None
+    return np.asarray(points[(np.abs(points) <= LARGEST).all(axis=1)], np.float32)  # without NaN, too

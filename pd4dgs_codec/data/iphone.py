@@ -150,7 +150,7 @@ def read_iphone(folder: Path, downscale: int, holdout: int, background: Color | 
     where, (start, stop) = f"{folder / 'extra.json'}: ", (pick(f.time for f in frames) for pick in (min, max))
     r, g, b = array(files.extra.get("background", [0.0] * 3), (3,), f"{where}background").tolist()
     dataset = posed_dataset(
-        folder, files.train, files.test, files.points, None, downscale, depth, (r, g, b), box, composite=False
+        folder, files.train, files.test, files.points, downscale, depth, (r, g, b), box, composite=False
     )
     test, covisible = dataset.test, folder / "covisible" / f"{files.factor}x" / "val"
     masked = bool(test) and covisible.is_dir()
@@ -225,7 +225,7 @@ def read_record3d(folder: Path, downscale: int, holdout: int, background: Color 
         rotation = checked_rotation(pose[[3, 0, 1, 2]], f"{path}: pose {i}")
         viewmat = world_to_camera(OPENGL_TO_OPENCV @ rotation.T, pose[4:])
         frames.append(UnreadView(str(i), 0, time, viewmat, lens, find_image(pictures, str(i))))
-    return posed_dataset(folder, *held_out(frames, holdout), None, None, downscale, background=background)
+    return posed_dataset(folder, *held_out(frames, holdout), None, downscale, background=background)
 
 
 def _record3d_lenses(meta: dict[str, object], size: tuple[int, int], count: int, path: Path) -> list[Lens]:

@@ -42,7 +42,6 @@ def posed_dataset(
     train: Sequence[UnreadView],
     test: Sequence[UnreadView],
     points: np.ndarray | None,
-    colors: np.ndarray | None,
     downscale: int,
     depth: tuple[float, float] | None = None,
     background: Color | None = None,
@@ -52,7 +51,7 @@ def posed_dataset(
 ) -> Dataset:
     """The dataset of these frames.
 
-    points: float32 [M, 3] and colors uint8 [M, 3], or None. depth: near and far, box: float32 [2, 3], if known.
+    points: float32 [M, 3], or None. depth: near and far, box: float32 [2, 3], if known.
     background: what lies behind pictures with alpha, None for white; without alpha it is the colour of the images'
     border. composite: False drops alpha (photographs), and `background` is the scene's, None for the border's colour.
     """
@@ -72,24 +71,23 @@ def posed_dataset(
         test=tuple(views[len(train) :]),
         background=behind or border_color(views[: len(train)]),
         time_range=seconds_range(start, stop),
-        **geometry(frames, points, colors, depth, box),
+        **geometry(frames, points, depth, box),
     )
 
 
 def geometry(
     frames: Sequence[UnreadView],
     points: np.ndarray | None,
-    colors: np.ndarray | None,
     depth: tuple[float, float] | None,
     box: np.ndarray | None = None,
 ) -> dict[str, Any]:
     """The fields of a Dataset that follow from its frames and points (see `posed_dataset`), without unit and masks."""
     if points is not None and not len(points):
-        points, colors = None, None
+        points = None
     if box is None:
         box = cameras_box(frames, depth) if points is None else points_box(points)
     near, far = depth or depth_range([f.viewmat for f in frames], box, points)
-    found = {"points": points, "point_colors": colors, "box": box, "near": near, "far": far, "up": mean_up(frames)}
+    found = {"points": points, "box": box, "near": near, "far": far, "up": mean_up(frames)}
     return found | {"unit": 0.0, "masked": False}
 
 

@@ -46,7 +46,7 @@ def read_neu3d(folder: Path, downscale: int, holdout: int, background: Color | N
     pairs = enumerate(zip(videos, poses, strict=True))
     cameras = [_neu3d_camera(row, i, video_size(video), video) for i, (video, row) in pairs]
     near, far = 0.5 * float(poses[:, 15].min()), float(poses[:, 16].max())
-    return synchronised_dataset(folder, cameras, *read_only_ply(folder), downscale, holdout, (near, far))
+    return synchronised_dataset(folder, cameras, read_only_ply(folder), downscale, holdout, (near, far))
 
 
 def _poses(path: Path) -> np.ndarray:
@@ -91,7 +91,7 @@ def read_panoptic(folder: Path, downscale: int, holdout: int, background: Color 
         test = _panoptic_frames(folder, folder / TEST_META)
     else:
         train, test = without_first_camera(folder, train, holdout)
-    return posed_dataset(folder, train, test, *_panoptic_points(folder / POINTS), downscale, background=background)
+    return posed_dataset(folder, train, test, _panoptic_points(folder / POINTS), downscale, background=background)
 
 
 def _panoptic_frames(folder: Path, path: Path) -> list[UnreadView]:
@@ -124,10 +124,10 @@ def _panoptic_lens(k: Any, size: tuple[int, int], where: str) -> Lens:
     return Lens(*size, K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1])
 
 
-def _panoptic_points(path: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Points float32 [M, 3] and colours uint8 [M, 3] of the archive, or None. Large archives are not unpacked whole."""
+def _panoptic_points(path: Path) -> np.ndarray | None:
+    """Points float32 [M, 3] of the archive, or None. Large archives are not unpacked whole."""
     if not path.is_file():
-        return None, None
+        return None
     raw = read_file(path)
     most = FREE_BYTES + INFLATES * len(raw)
     try:
@@ -146,6 +146,4 @@ def _panoptic_points(path: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
     table = read_npy(held, f"{path}: data")
     if table.ndim != 2 or table.shape[1] < 6:
         raise DataError(f"{path}: data has shape {table.shape}, expected numbers [M, 6] or wider")
-    table = table[(np.abs(table[:, :6]) <= LARGEST).all(axis=1)]  # without NaN, too
-    colors = np.clip(table[:, 3:6].astype(np.float64) * 255 + 0.5, 0, 255).astype(np.uint8)
-    return table[:, :3].astype(np.float32), colors
+    return np.asarray(table[(np.abs(table[:, :6]) <= LARGEST).all(axis=1), :3], np.float32)  # without NaN, too

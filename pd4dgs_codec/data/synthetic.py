@@ -242,11 +242,11 @@ def _covisible(bodies: list[Body], eyes: list[Eye], viewmat: np.ndarray, t: floa
 
 def _initial_points(
     bodies: list[Body], viewmats: list[np.ndarray], lens: Lens, box: np.ndarray, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+) -> np.ndarray:
     """Points as structure from motion finds them at time 0: visible surface points with noise, 2 % of them stray."""
     placed = place(bodies, 0.0)
     per_view = -(-POINTS // len(viewmats)) * 5 // 4  # some rays meet only the sky
-    points, colors = [], []
+    points = []
     for viewmat in viewmats:
         eye = Eye(placed, viewmat)
         xs, ys = _grid(lens)
@@ -256,13 +256,12 @@ def _initial_points(
             mine = index[row, col] == i
             r, c = row[mine], col[mine]
             world = eye.world(xs[c], ys[r], depth[r, c])
-            colors.append(shade(placed, i, world, 0.0).T)
             points.append(world.T + rng.normal(size=(len(r), 3)) * 0.004 * depth[r, c][:, None])
     chosen = rng.permutation(sum(map(len, points)))[:POINTS]
-    xyz, rgb = np.concatenate(points)[chosen], np.concatenate(colors)[chosen]
+    xyz = np.concatenate(points)[chosen]
     stray = rng.uniform(size=len(xyz)) < 0.02
     xyz[stray] = rng.uniform(box[0], box[1], (int(stray.sum()), 3))
-    return xyz.astype(np.float32), (rgb * 255 + 0.5).astype(np.uint8)
+    return xyz.astype(np.float32)
 
 
 @lru_cache(maxsize=4)
@@ -279,11 +278,11 @@ def _dataset(take: Take) -> Dataset:
     train = tuple(view(v, 0, i) for i, v in enumerate(viewmats))
     instants = range(2, take.frames, max(1, take.frames // stage.instants)) if stage.instants else range(take.frames)
     test = tuple(view(v, camera, i) for camera, v in enumerate(stage.fixed, start=1) for i in instants)
-    points, colors = None, None
+    points = None
     if stage.capture:
-        points, colors = _initial_points(scene, viewmats, lens, stage.box, np.random.default_rng([take.seed, 1]))
+        points = _initial_points(scene, viewmats, lens, stage.box, np.random.default_rng([take.seed, 1]))
     fields = stage.background, (0.0, SECONDS), (0.0, 0.0, 1.0), 0.0, stage.capture
-    return Dataset(f"synthetic-{take.name}", train, test, points, colors, stage.box, NEAR, FAR, *fields)
+    return Dataset(f"synthetic-{take.name}", train, test, points, stage.box, NEAR, FAR, *fields)
 
 
 def read_synthetic(source: str, downscale: int = 1) -> Dataset:

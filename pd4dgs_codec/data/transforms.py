@@ -144,5 +144,5 @@ def read_transforms(folder: Path, downscale: int, holdout: int, background: Colo
     frames, file = _frames(folder, train_file)
     train, test = held_out(frames, holdout) if test_file is None else (frames, _frames(folder, test_file)[0])
     named = file.get("ply_file_path")
-    points, colors = read_ply(inside(folder, named)) if isinstance(named, str) else read_only_ply(folder)
-    return posed_dataset(folder, train, test, points, colors, downscale, _stored_depth(folder, file), background)
+    points = read_ply(inside(folder, named)) if isinstance(named, str) else read_only_ply(folder)
+    return posed_dataset(folder, train, test, points, downscale, _stored_depth(folder, file), background)

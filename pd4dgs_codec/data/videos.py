@@ -285,7 +285,6 @@ def synchronised_dataset(
     folder: Path,
     cameras: Sequence[UnreadView],
     points: np.ndarray | None,
-    colors: np.ndarray | None,
     downscale: int,
     holdout: int,
     depth: tuple[float, float] | None = None,
@@ -314,7 +313,7 @@ def synchronised_dataset(
         test=tuple(test),
         background=(0.0, 0.0, 0.0),
         time_range=(0.0, (count - 1) / fps if count > 1 else 1.0),
-        **geometry(cameras, points, colors, depth),
+        **geometry(cameras, points, depth),
     )
 
 

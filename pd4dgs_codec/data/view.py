@@ -42,7 +42,7 @@ class View:
 class Dataset:
     """A scene's images, split into training and test views, with its geometry.
 
-    points: float32 [M, 3], scene units, or None; point_colors: uint8 [M, 3] or None.
+    points: float32 [M, 3], scene units, or None.
     box: float32 [2, 3], lower and upper corner of the content: normalisation box of the HexPlanes and the
         volume of random initial points.
     near, far: scene units along the optical axis. background: 0..1 per channel. time_range: seconds at normalised
@@ -55,7 +55,6 @@ class Dataset:
     train: tuple[View, ...]
     test: tuple[View, ...]
     points: np.ndarray | None
-    point_colors: np.ndarray | None
     box: np.ndarray
     near: float
     far: float

@@ -90,7 +90,7 @@ def _like(source: str, teacher: Teacher, data: Dataset) -> Dataset:
     """The dataset with the teacher's pictures as training pictures; its held-out ones stay."""
     poses = [(view.camera, view.time) for view in data.train]
     train = _pictures(teacher, poses, data.background, data.near)
-    return replace(data, name=source, train=tuple(train), **_points(teacher, _solid(source, teacher, MIDDLE)))
+    return replace(data, name=source, train=tuple(train), points=_points(teacher, _solid(source, teacher, MIDDLE)))
 
 
 def _around(source: str, place: Path, teacher: Teacher, options: Options, downscale: int, holdout: int) -> Dataset:
@@ -111,7 +111,7 @@ def _around(source: str, place: Path, teacher: Teacher, options: Options, downsc
         name=source, train=tuple(train), test=tuple(test),
         box=box, near=near, far=far, background=background,
         time_range=seconds_range(*normalised_times((0.0, teacher.seconds), source)[1:]), up=up, unit=0.0, masked=False,
-        **_points(teacher, solid),
+        points=_points(teacher, solid),
     )  # fmt: skip
 
 
@@ -123,11 +123,10 @@ def _solid(source: str, teacher: Teacher, t: float) -> np.ndarray:
     return rows
 
 
-def _points(teacher: Teacher, solid: np.ndarray) -> dict[str, Any]:
-    """The fields of a Dataset on its points: at most POINTS of these rows."""
+def _points(teacher: Teacher, solid: np.ndarray) -> np.ndarray:
+    """float32 [M, 3]: the means of at most POINTS of these rows."""
     rows = solid if len(solid) <= POINTS else solid[np.random.default_rng(0).permutation(len(solid))[:POINTS]]
-    splats = teacher.splats(teacher.nearest(MIDDLE)).taken(rows)
-    return {"points": splats.means, "point_colors": np.rint(splats.base_colors * 255).astype(np.uint8)}
+    return teacher.splats(teacher.nearest(MIDDLE)).taken(rows).means
 
 
 def _pictures(teacher: Teacher, poses: Sequence[tuple[Camera, float]], background: Triple, near: float) -> list[View]:

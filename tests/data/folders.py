@@ -168,7 +168,7 @@ def write_panoptic(scene: Dataset, folder: Path) -> Path:
         "cam_id": [list(range(CAMERAS))] * INSTANTS,
     }  # fmt: skip
     save(folder / "train_meta.json", meta)
-    rows = np.concatenate([scene.points[:POINTS], scene.point_colors[:POINTS] / 255, np.ones((POINTS, 1))], axis=1)
+    rows = np.concatenate([scene.points[:POINTS], np.full((POINTS, 4), 0.5)], axis=1)
     np.savez(folder / "init_pt_cld.npz", data=rows)
     return folder
 
@@ -198,8 +198,8 @@ def write_colmap(
         (w, x, y, z), shift = quaternion(eye(view)[0]), view.viewmat[:3, 3].astype(float)
         pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([x, y, z, w])), shift)
         model.add_image_with_trivial_frame(image, pose)
-    for point, color in zip(scene.points[:POINTS].astype(float), scene.point_colors, strict=False):
-        model.add_point3D(point, pycolmap.Track(), color)
+    for point in scene.points[:POINTS].astype(float):
+        model.add_point3D(point, pycolmap.Track(), np.array([0, 128, 255], np.uint8))
     place = folder / "sparse" / "0"
     place.mkdir(parents=True)
     getattr(model, f"write_{form}")(str(place))

@@ -69,7 +69,7 @@ def tiny(test_times=(1 / 3,)) -> Dataset:
     train = tuple(view(i, t, 0) for i, t in enumerate((0.0, 1 / 3, 1.0)))
     test = tuple(view(i, t, 1) for i, t in enumerate(test_times, 1))
     box = np.array([[-1, -1, -1], [1, 1, 1]], np.float32)
-    return Dataset("tiny", train, test, None, None, box, 0.1, 9.0, (0, 0, 0), (0, 1), (0, 1, 0), 0, False)
+    return Dataset("tiny", train, test, None, box, 0.1, 9.0, (0, 0, 0), (0, 1), (0, 1, 0), 0, False)
 
 
 @pytest.fixture
@@ -175,7 +175,6 @@ def test_panoptic_is_read_back(scene, tmp_path):
         assert_same(found, scene.train[round(found.time * (INSTANTS - 1)) * CAMERAS + found.camera_id])
     assert {view.camera_id for view in data.test} == {0}
     np.testing.assert_allclose(data.points, scene.points[:POINTS], atol=1e-6)
-    np.testing.assert_array_equal(data.point_colors, scene.point_colors[:POINTS])
     assert not load(tmp_path / "set", holdout=0).test
     (tmp_path / "set" / "test_meta.json").write_text((tmp_path / "set" / "train_meta.json").read_text())
     assert len(load(tmp_path / "set").test) == INSTANTS * CAMERAS
@@ -230,7 +229,6 @@ def test_colmap_is_read_back(scene, tmp_path, form):
     assert data.time_range == (0.0, 22.0)
     order = np.lexsort(data.points.T), np.lexsort(scene.points[:POINTS].T)
     np.testing.assert_allclose(data.points[order[0]], scene.points[:POINTS][order[1]], atol=1e-6)
-    np.testing.assert_array_equal(data.point_colors[order[0]], scene.point_colors[:POINTS][order[1]])
 
 
 def test_times_come_from_times_txt(scene, tmp_path):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from pd4dgs_codec.data import synthetic as syn
-from pd4dgs_codec.data.bodies import MOTIONS, NO_BODY, THINGS, Eye, bodies, enter, place
+from pd4dgs_codec.data.bodies import MOTIONS, NO_BODY, THINGS, Eye, bodies, enter, place, shade
 from pd4dgs_codec.data.dataset import load
 
 LENS, SWEEPS = syn.ROOM.lens, syn.PATHS["sweeps"]
@@ -90,7 +90,7 @@ def test_shapes_and_split(local):
     assert {w.camera_id for w in local.test} == {1, 2} and {w.camera_id for w in local.train} == {0}
     assert {w.time for w in local.test} <= {w.time for w in local.train}
     assert local.train[0].time == 0 and local.train[-1].time == 1
-    assert local.points.shape == (5000, 3) and local.point_colors.dtype == np.uint8
+    assert local.points.shape == (5000, 3) and local.points.dtype == np.float32
     assert ((local.points >= local.box[0] - 0.1) & (local.points <= local.box[1] + 0.1)).all()
 
 
@@ -117,22 +117,27 @@ def test_camera_goes_back_and_forth_on_an_arc(local):
 
 
 def test_points_lie_on_visible_surfaces(local):
-    """Points project onto pixels of their own colour in the first frame, where nothing hides them."""
+    """Points project onto pixels of the colour of the surface there, in the first frame, where nothing hides them."""
     v = local.train[0]
     placed = place(bodies("local", 0), 0.0)
     eye = Eye(placed, v.viewmat.astype(np.float64))
     c = v.viewmat[:3, :3] @ local.points.T + v.viewmat[:3, 3:]
     u, w = c[0] / c[2] * LENS.fx + LENS.cx, c[1] / c[2] * LENS.fy + LENS.cy
     ok = (c[2] > 0) & (u > 1) & (w > 1) & (u < 159) & (w < 119)
-    depth, _ = eye.first_hits(*syn._grid(LENS))
+    depth, index = eye.first_hits(*syn._grid(LENS))
     ok[ok] = np.abs(depth[w[ok].astype(int), u[ok].astype(int)] - c[2][ok]) < 0.08
     assert ok.sum() > 1500
-    error = np.abs(v.image[w[ok].astype(int), u[ok].astype(int)].astype(float) - local.point_colors[ok])
-    assert np.median(error) < 12
+    line, column = w[ok].astype(int), u[ok].astype(int)
+    points, body, errors = local.points[ok].astype(float), index[line, column], []
+    for i in np.unique(body):
+        mine = body == i
+        seen = v.image[line[mine], column[mine]].astype(float)
+        errors.append(np.abs(seen - 255 * shade(placed, i, points[mine].T, 0.0).T))
+    assert np.median(np.concatenate(errors)) < 12
 
 
 def digest(d) -> str:
-    h = hashlib.sha256(d.points.tobytes() + d.point_colors.tobytes())
+    h = hashlib.sha256(d.points.tobytes())
     for v in (*d.train, *d.test):
         h.update(v.image.tobytes() + v.viewmat.tobytes() + (b"" if v.mask is None else v.mask.tobytes()))
     return h.hexdigest()
