@@ -80,6 +80,8 @@ def _render(args: argparse.Namespace, console: Console) -> int:
     )
     console.detail(f"{args.input}: levels " + ", ".join(f"{row.level} ({row.anchors} anchors)" for row in levels))
     frames = _frames(args, levels[-1])
+    if kind in VIDEOS and len({(frame.camera.width, frame.camera.height) for frame in frames}) > 1:
+        raise DataError(f"{args.data}: has views of several sizes, a video takes one; expected -o such as out/%04d.png")
     milliseconds: list[float] = []
     with progress_bar(len(frames), "frames", "rendering") as step:
         outputs = _write(args, kind, _pictures(frames, levels, args.side_by_side, milliseconds, step), len(frames))

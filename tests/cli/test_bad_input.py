@@ -15,6 +15,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 from tiny import write_views
 
 from pd4dgs_codec import encode
@@ -91,6 +92,7 @@ CASES = [
     (1, "render flipped.pd4 -o a.gif", "flipped.pd4"),
     (1, "eval flipped.pd4 DATA", "flipped.pd4"),
     (1, "render blind.pd4 -o a.gif", "--data"),
+    *((1, f"render SCENE -o a.{kind} --data sizes --split train", "several sizes") for kind in ("gif", "mp4")),
     *(
         (1, command.format(source), source)
         for source in ("missing", "empty", "notes", "synthetic:nothing")
@@ -150,6 +152,10 @@ def bad_files(tmp_path_factory, model_pt, scene_pd4, scene):
     for name in ("kept.npz", "kept.gif", "notes"):
         (folder / name).write_text("precious")
     (folder / "empty").mkdir()
+    views = json.loads((write_views(folder / "sizes") / "transforms.json").read_text())
+    views["frames"][1] |= {"w": 8, "h": 6}
+    (folder / "sizes" / "transforms.json").write_text(json.dumps(views))
+    Image.new("RGB", (8, 6)).save(folder / "sizes" / "001.png")
     (write_views(folder / "hole") / "001.png").unlink()
     return folder
 
