@@ -62,7 +62,7 @@ def disc(held_out: tuple[float, ...] = (0.5,)) -> Dataset:
     return Dataset(
         name="disc", train=tuple(view(t) for t in np.linspace(0, 1, 6)), test=tuple(view(t) for t in held_out),
         points=None, box=np.array([[-1.5, -1.2, -1], [1.5, 1.2, 1]], np.float32), near=0.1,
-        far=10.0, background=(0.0, 0.0, 0.0), time_range=(0.0, 1.0), up=(0.0, -1.0, 0.0), unit=0.0, masked=False,
+        far=10.0, background=(0.0, 0.0, 0.0), time_range=(0.0, 1.0), up=(0.0, -1.0, 0.0), masked=False,
     )  # fmt: skip
 
 

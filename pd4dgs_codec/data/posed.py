@@ -81,14 +81,13 @@ def geometry(
     depth: tuple[float, float] | None,
     box: np.ndarray | None = None,
 ) -> dict[str, Any]:
-    """The fields of a Dataset that follow from its frames and points (see `posed_dataset`), without unit and masks."""
+    """The fields of a Dataset that follow from its frames and points, see `posed_dataset`; none is masked."""
     if points is not None and not len(points):
         points = None
     if box is None:
         box = cameras_box(frames, depth) if points is None else points_box(points)
     near, far = depth or depth_range([f.viewmat for f in frames], box, points)
-    found = {"points": points, "box": box, "near": near, "far": far, "up": mean_up(frames)}
-    return found | {"unit": 0.0, "masked": False}
+    return {"points": points, "box": box, "near": near, "far": far, "up": mean_up(frames), "masked": False}
 
 
 def border_color(views: Sequence[View]) -> tuple[float, float, float]:

@@ -281,7 +281,7 @@ def _dataset(take: Take) -> Dataset:
     points = None
     if stage.capture:
         points = _initial_points(scene, viewmats, lens, stage.box, np.random.default_rng([take.seed, 1]))
-    fields = stage.background, (0.0, SECONDS), (0.0, 0.0, 1.0), 0.0, stage.capture
+    fields = stage.background, (0.0, SECONDS), (0.0, 0.0, 1.0), stage.capture
     return Dataset(f"synthetic-{take.name}", train, test, points, stage.box, NEAR, FAR, *fields)
 
 

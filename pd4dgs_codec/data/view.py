@@ -46,7 +46,7 @@ class Dataset:
     box: float32 [2, 3], lower and upper corner of the content: normalisation box of the HexPlanes and the
         volume of random initial points.
     near, far: scene units along the optical axis. background: 0..1 per channel. time_range: seconds at normalised
-        time 0 and 1, (0, 1) if unknown. up: unit vector, world. unit: metres per scene unit, 0 if unknown.
+        time 0 and 1, (0, 1) if unknown. up: unit vector, world.
     masked: True if the test masks are covisibility masks. left_out: names of views in neither split, as their masks
         hold no valid pixel.
     """
@@ -61,7 +61,6 @@ class Dataset:
     background: tuple[float, float, float]
     time_range: tuple[float, float]
     up: tuple[float, float, float]
-    unit: float
     masked: bool
     left_out: tuple[str, ...] = ()
 

@@ -191,7 +191,7 @@ def decode_joined(payload: bytes | memoryview, counts: Sequence[int], known: lis
             found += defined[-1].window.n
             if found > most:
                 raise LimitExceeded(f"tables of {found} entries in one section, limit {most}")
-        elif heads and head[0] == heads[-1][0] and (longer := _joined(heads[-1], head, defined)):
+        elif heads and head[0] == heads[-1][0] and (longer := _joined(heads[-1], head)):
             heads[-1] = longer
             continue
         heads.append(head)
@@ -219,7 +219,7 @@ def _complete(defined: list[Prior], first: int, stream: AnsDecoder) -> None:
 _Head = tuple[int, int, _Exceptions | None]
 
 
-def _joined(one: _Head, next: _Head, defined: list[Prior]) -> _Head | None:
+def _joined(one: _Head, next: _Head) -> _Head | None:
     """One head for two channels of one prior, if their symbols follow each other under its table."""
     (index, some, exceptions), (_, more, others) = one, next
     apart = exceptions or others or some + more > MAX_COUNT

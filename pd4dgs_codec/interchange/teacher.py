@@ -110,7 +110,7 @@ def _around(source: str, place: Path, teacher: Teacher, options: Options, downsc
     return Dataset(
         name=source, train=tuple(train), test=tuple(test),
         box=box, near=near, far=far, background=background,
-        time_range=seconds_range(*normalised_times((0.0, teacher.seconds), source)[1:]), up=up, unit=0.0, masked=False,
+        time_range=seconds_range(*normalised_times((0.0, teacher.seconds), source)[1:]), up=up, masked=False,
         points=_points(teacher, solid),
     )  # fmt: skip
 

@@ -94,7 +94,7 @@ def scene_info(dataset: Dataset) -> SceneInfo:
         near=_binary32(dataset.near),
         far=_binary32(dataset.far),
         up=tuple(_binary32(v) for v in dataset.up),  # type: ignore[arg-type]
-        unit=_binary32(dataset.unit),
+        unit=0.0,  # no reader knows it
         camera=dataset.camera,
     )
 

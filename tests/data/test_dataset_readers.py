@@ -69,7 +69,7 @@ def tiny(test_times=(1 / 3,)) -> Dataset:
     train = tuple(view(i, t, 0) for i, t in enumerate((0.0, 1 / 3, 1.0)))
     test = tuple(view(i, t, 1) for i, t in enumerate(test_times, 1))
     box = np.array([[-1, -1, -1], [1, 1, 1]], np.float32)
-    return Dataset("tiny", train, test, None, box, 0.1, 9.0, (0, 0, 0), (0, 1), (0, 1, 0), 0, False)
+    return Dataset("tiny", train, test, None, box, 0.1, 9.0, (0, 0, 0), (0, 1), (0, 1, 0), False)
 
 
 @pytest.fixture
