@@ -16,7 +16,6 @@ export class Real {
  *
  * @typedef {number | boolean | string | Real | Uint8Array | Value[] | Map<number, any>} Value
  */
-/** @typedef {{value: Value, firstEntryEnd: number}} Unpacked */
 
 const UTF8 = /* @__PURE__ */ new TextDecoder("utf-8", { fatal: true, ignoreBOM: true });
 
@@ -25,7 +24,7 @@ const UTF8 = /* @__PURE__ */ new TextDecoder("utf-8", { fatal: true, ignoreBOM: 
  * none.
  *
  * @param {Uint8Array} bytes @param {string} where names the value in messages
- * @returns {Unpacked}
+ * @returns {{value: Value, firstEntryEnd: number}}
  */
 export function unpack(bytes, where) {
   const reader = new Reader(bytes, where);

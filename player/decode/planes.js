@@ -31,7 +31,7 @@ export function decodePlanes(bytes, shapes) {
   if (form === 0) decodeStage(reader.rest(), all.flat(), all.flat().map(() => null));
   else if (form === 1) decodeStaged(reader, shapes, all);
   else throw unsupported(`form ${form} of the planes`);
-  planes.forEach((plane, i) => restore(plane, shapes[i]));
+  all.forEach((channels, i) => channels.forEach((channel) => restore(channel, shapes[i])));
   return planes;
 }
 
@@ -85,33 +85,28 @@ function sumOfNine(values, height, width) {
   return sums;
 }
 
-/** 11.3, in place: residuals become samples. @param {Int32Array} plane @param {PlaneShape} shape */
-function restore(plane, { channels, height, width, predictor }) {
-  const cells = height * width;
-  for (let from = 0; from < channels * cells; from += cells) {
-    if (predictor) restoreChannel(plane, from, from + cells, width, predictor);
-    else for (let at = from; at < from + cells; at++) check(plane[at]);
+/** 11.3, in place: residuals of a channel become samples. Each is checked before others are predicted from it, so that a
+ * sum stays small. @param {Int32Array} samples @param {PlaneShape} shape */
+function restore(samples, { width, predictor }) {
+  if (!predictor) {
+    for (let at = 0; at < samples.length; at++) check(samples[at]);
+    return;
   }
-}
-
-/** Each sample is checked before others are predicted from it, so that a sum stays small. @param {Int32Array} plane
- * @param {number} from @param {number} end @param {number} width @param {number} predictor 1..3 */
-function restoreChannel(plane, from, end, width, predictor) {
-  check(plane[from]);
+  check(samples[0]);
   // every predictor gives W in row 0 and N in column 0
-  for (let at = from + 1; at < from + width; at++) check((plane[at] += plane[at - 1]));
-  for (let row = from + width; row < end; row += width) {
-    check((plane[row] += plane[row - width]));
-    let w = plane[row];
-    let nw = plane[row - width];
+  for (let at = 1; at < width; at++) check((samples[at] += samples[at - 1]));
+  for (let row = width; row < samples.length; row += width) {
+    check((samples[row] += samples[row - width]));
+    let w = samples[row];
+    let nw = samples[row - width];
     for (let at = row + 1; at < row + width; at++) {
-      const n = plane[at - width];
-      let k = plane[at];
+      const n = samples[at - width];
+      let k = samples[at];
       if (predictor === 1) k += w;
       else if (predictor === 2) k += n;
       else k += median(w, n, w + n - nw);
       check(k);
-      plane[at] = w = k;
+      samples[at] = w = k;
       nw = n;
     }
   }

@@ -119,8 +119,7 @@ ${repeat(some, (i) => `out${i} = h${i};`)}}`,
     this._linears.forEach((linear, i) => {
       const last = i === this._linears.length - 1;
       const to = last ? out : this._room((i + 1) % 2, points.width, rows);
-      if (last) runLinear(gpu, linear, from, to, row, rows, -row, false);
-      else runLinear(gpu, linear, from, to, 0, rows, 0, true);
+      runLinear(gpu, linear, from, to, last ? row : 0, rows, !last);
       from = to;
     });
   }
@@ -179,25 +178,24 @@ ${repeat(blocks, (c) => {
 }
 
 /**
- * One linear layer from field to field.
+ * One linear layer from the first rows of a field to rows of another.
  *
  * @param {Gpu} gpu @param {Linear} linear @param {Field} from @param {Field} to
- * @param {number} row @param {number} rows of texels, in `to` @param {number} shift from there to the rows of `from`
- * @param {boolean} relu
+ * @param {number} row @param {number} rows of texels, in `to` @param {boolean} relu
  */
-function runLinear(gpu, linear, from, to, row, rows, shift, relu) {
+function runLinear(gpu, linear, from, to, row, rows, relu) {
   const program = gpu.program(
     linear.declare() +
       `uniform sampler2DArray source;
-uniform int shift;
+uniform int row;
 void main() {
-ivec2 p = ivec2(gl_FragCoord.xy) + ivec2(0, shift);
+ivec2 p = ivec2(gl_FragCoord.xy) - ivec2(0, row);
 ${repeat(linear.inputBlocks, (k) => `vec4 x${k} = texelFetch(source, ivec3(p, ${k}), 0);`)}
 ${linear.apply(relu)}
 ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i};`)}}`,
   );
   gpu.use(program, { source: from });
-  gpu.gl.uniform1i(program.uniform("shift"), shift);
+  gpu.gl.uniform1i(program.uniform("row"), row);
   linear.cover(to, row, rows);
 }
 

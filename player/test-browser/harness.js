@@ -8,11 +8,6 @@ import { Gpu } from "../render/gl.js";
 import { ANCHOR_BITS, listGaussians, NO_ENTRY } from "../render/sort.js";
 import { base64 } from "./pictures.js";
 
-/** @param {string} url */
-async function sceneOf(url) {
-  return decode(await (await fetch(url)).arrayBuffer());
-}
-
 /** Columns of a Gaussian's record. */
 const QUANTITIES = { mean: [0, 1, 2], opacity: [3], scale: [4, 5, 6], quaternion: [8, 9, 10, 11], color: [12, 13, 14] };
 
@@ -24,7 +19,7 @@ const QUANTITIES = { mean: [0, 1, 2], opacity: [3], scale: [4, 5, 6], quaternion
  * @param {string} url @param {{level: number, t: number, eye: number[]}[]} cases @param {number} bandPoints
  */
 async function compare(url, cases, bandPoints) {
-  const scene = await sceneOf(url);
+  const scene = decode(await (await fetch(url)).arrayBuffer());
   const canvas = document.createElement("canvas");
   const gl = /** @type {WebGL2RenderingContext} */ (canvas.getContext("webgl2"));
   const gpu = new Gpu(gl);
