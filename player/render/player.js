@@ -145,11 +145,8 @@ export class Player extends Clip {
     this._scene = null;
     this._shownLevel = null;
     this._camera = null;
-    if (this._front) {
-      this._gpu?.free(this._spare?.field);
-      this._spare = this._front.splats;
-      this._front = null;
-    }
+    this._gpu?.free(this._front?.splats.field, this._spare?.field);
+    this._front = this._spare = null;
     this._time = this._options.time ?? null;
     this._status = { bytes: 0, total: null, loading: true, ends: [] };
     this._started = performance.now();
@@ -317,10 +314,10 @@ export class Player extends Clip {
     this._gpu = this._painter = this._evaluator = this._front = this._spare = null;
   }
 
-  /** Whether what fails on a GPU does so because its context is lost; work restarts when that is restored.
-   * @param {Gpu} gpu */
-  _hasLost(gpu) {
-    return this.closed || gpu !== this._gpu || gpu.gl.isContextLost();
+  /** Whether another scene was opened, or the GPU's context lost, since a step began: it then has no result, and its
+   * fault is none. @param {Gpu} gpu @param {number} opened `_started` when it began */
+  _isStale(gpu, opened) {
+    return this.closed || gpu !== this._gpu || opened !== this._started || gpu.gl.isContextLost();
   }
 
   // --- the loop
@@ -415,6 +412,7 @@ export class Player extends Clip {
   /** Evaluates the Gaussians of the state to show. */
   async _evaluate() {
     const gpu = /** @type {Gpu} */ (this._gpu);
+    const opened = this._started;
     const state = this._state();
     const playing = this._playing;
     const started = performance.now();
@@ -423,16 +421,17 @@ export class Player extends Clip {
       const spare = this._spare;
       this._spare = null;
       const { splats, means } = await this._gaussians(gpu, state, spare);
-      this._spare = splats;
-      if (gpu !== this._gpu) return;
-      if ((means || !this._isSorted()) && !(await this._order(state.scene, means))) return;
+      if (gpu === this._gpu) this._spare = splats;
+      if (this._isStale(gpu, opened)) return;
+      if (means || !this._isSorted()) await this._order(state.scene, means);
+      if (this._isStale(gpu, opened)) return;
       this._spare = this._front?.splats ?? null;
       this._front = { splats, state };
       this.counts.evaluated++;
       this._dirty = true;
       if (playing) this._pace.evaluated(state.level, performance.now() - started, performance.now());
     } catch (error) {
-      if (this._hasLost(gpu)) return;
+      if (this._isStale(gpu, opened)) return;
       if (this._onCpu(gpu, state.scene)) {
         this._fail(error);
         this._scene = null;
@@ -524,6 +523,7 @@ export class Player extends Clip {
       this.canvas.width = width;
       this.canvas.height = height;
     }
+    const opened = this._started;
     const started = performance.now();
     const alone = !this._evaluating;
     const moving = this._moving(started);
@@ -533,14 +533,14 @@ export class Player extends Clip {
       const { state } = /** @type {{state: State}} */ (this._front);
       this._draw();
       await gpu.finished();
-      if (gpu !== this._gpu) return;
+      if (this._isStale(gpu, opened)) return;
       const now = performance.now();
       this._draws.push(now);
       this.counts.drawn++;
       if (alone && moving) this._pace.drew(now - started);
       this._shown(state, now);
     } catch (error) {
-      if (!this._hasLost(gpu)) this._fail(error);
+      if (!this._isStale(gpu, opened)) this._fail(error);
     } finally {
       this._drawing = false;
       this._wake();

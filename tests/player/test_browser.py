@@ -591,6 +591,37 @@ def test_a_scene_that_replaces_another_while_it_loads(harness, server):
     assert "error" not in seen and harness.evaluate("harness.player.status.level") == 2
 
 
+def test_an_evaluation_that_ends_after_its_scene_was_replaced_is_not_shown(harness, server):
+    opened(harness, server.url_of("scene.pd4"))
+    levels = call(
+        harness,
+        """async (url) => {
+          const { player } = harness;
+          await player.settled();
+          const evaluated = player._gaussians;
+          let release = () => {};
+          const held = new Promise((resolve) => (release = resolve));
+          const begun = new Promise((resolve) => {
+            player._gaussians = async (...args) => {
+              player._gaussians = evaluated;
+              resolve();
+              const result = await player._gaussians(...args);
+              await held;
+              return result;
+            };
+          });
+          player.seek(2.5);
+          await begun;
+          await player.load(url);
+          release();
+          await player.settled();
+          return harness.events.filter(([name]) => name === "firstpicture").map(([, { level }]) => level);
+        }""",
+        server.url_of("scene.pd4"),
+    )
+    assert levels == [0, 0]
+
+
 # -- element -----------------------------------------------------------------------------------------------------------
 
 
