@@ -591,11 +591,12 @@ def test_a_scene_that_replaces_another_while_it_loads(harness, server):
     assert "error" not in seen and harness.evaluate("harness.player.status.level") == 2
 
 
-def test_an_evaluation_that_ends_after_its_scene_was_replaced_is_not_shown(harness, server):
+@pytest.mark.parametrize("arrived", [False, True])
+def test_an_evaluation_that_ends_after_its_scene_was_replaced_is_not_shown(harness, server, arrived):
     opened(harness, server.url_of("scene.pd4"))
-    levels = call(
+    events = call(
         harness,
-        """async (url) => {
+        """async (url, arrived) => {
           const { player } = harness;
           await player.settled();
           const evaluated = player._gaussians;
@@ -612,14 +613,18 @@ def test_an_evaluation_that_ends_after_its_scene_was_replaced_is_not_shown(harne
           });
           player.seek(2.5);
           await begun;
-          await player.load(url);
+          const loading = player.load(url);
+          if (arrived) await loading;
           release();
+          await loading;
           await player.settled();
-          return harness.events.filter(([name]) => name === "firstpicture").map(([, { level }]) => level);
+          return harness.events;
         }""",
         server.url_of("scene.pd4"),
+        arrived,
     )
-    assert levels == [0, 0]
+    assert [detail["level"] for name, detail in events if name == "firstpicture"] == [0, 0]
+    assert "error" not in dict(events)
 
 
 # -- element -----------------------------------------------------------------------------------------------------------
