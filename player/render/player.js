@@ -480,7 +480,7 @@ export class Player extends Clip {
     if (!this._front || this._sorting || this._isSorted()) return;
     this._sorting = true;
     try {
-      if (await this._order(this._front.state.scene, null)) this._dirty = true;
+      await this._order(this._front.state.scene, null);
     } catch (error) {
       if (!this.closed) this._fail(error);
     } finally {
@@ -493,16 +493,16 @@ export class Player extends Clip {
    * Sorts Gaussians for the camera: others than before, or the sorter's. It answers calls in their order, so that an
    * order on its way is for the Gaussians that are on show when it arrives.
    *
-   * @param {Scene} scene @param {Float32Array | null} means @returns whether the GPU is still there
+   * @param {Scene} scene @param {Float32Array | null} means
    */
   async _order({ info }, means) {
     const gpu = this._gpu;
     const row = this._row();
     const order = await this._sorter.call("sort", [row, info.near, means], means ? [means.buffer] : []);
-    if (gpu !== this._gpu) return false;
+    if (gpu !== this._gpu) return;
     this._painter?.setOrder(order);
     this._sortedRow = row;
-    return true;
+    this._dirty = true;
   }
 
   /** Width and height to draw, pixels. @param {number} now @returns {[number, number]} */
