@@ -144,8 +144,9 @@ main = command(parser, _train)
 def _check_usage(args: argparse.Namespace) -> None:
     if args.rate_scale and "rate" in args.without:
         raise UsageError(f"found --rate-scale {args.rate_scale:g} and --without rate, expected one of them")
-    if args.log and os.path.realpath(args.log) == os.path.realpath(args.output):
-        raise UsageError(f"--log and -o both name {args.output}; expected two files")
+    for option, name in (("-o", args.output), ("--resume", args.resume)):
+        if args.log and name and os.path.realpath(args.log) == os.path.realpath(name):
+            raise UsageError(f"--log and {option} both name {name}; expected two files")
 
 
 # -- configuration -----------------------------------------------------------------------------------------------------

@@ -54,8 +54,8 @@ BOX_TIMES = 5  #: times that the box covers
 #: Times of cameras without any advance by this share, so that each stretch of cameras covers the whole time.
 GOLDEN = (5**0.5 - 1) / 2
 EXAMPLES = {
-    "cameras": "cameras=FOLDER", "views": "views=200", "size": "size=400x400", "fps": "fps=30", "up": "up=0,-1,0",
-    "background": "background=white or background=0.5,0.5,0.5",
+    "cameras": "cameras=FOLDER", "views": "views=200, 2 to 100000", "size": "size=400x400, each 8 to 8192",
+    "fps": "fps=30", "up": "up=0,-1,0", "background": "background=white or background=0.5,0.5,0.5",
 }  # fmt: skip
 #: Of a stream in a .4dgs file: four bytes, channels, elements, bytes that follow.
 STREAM = struct.Struct("<4xBIQ")

@@ -44,6 +44,7 @@ CASES = [
         for name in ("-", "''")
     ),
     (2, "train synthetic:local -o m.pt --log m.pt", "two files"),
+    (2, "train synthetic:local -o m.pt -f --resume old.pt --log ./old.pt", "--log and --resume both name old.pt"),
     (2, "train synthetic:local -o m.pt --without rate --rate-scale 0.5", "--without rate"),
     (2, "encode m.pt", "-o"),
     (2, "encode m.pt -o s.pd4 --effort 10", "--effort"),
