@@ -229,8 +229,8 @@ def _cost(args: argparse.Namespace, export: Export) -> dict[str, Any]:
 
 
 def _text(result: dict[str, Any]) -> str:
-    frames = f"{result['frames']} frames, " if result["to"] in SEQUENCES else ""
-    text = f"{result['output']}: {frames}{result['gaussians']:,} Gaussians, {result['bytes']:,} bytes"
+    what = f"level {result['level']}, " + (f"{result['frames']} frames, " if result["to"] in SEQUENCES else "")
+    text = f"{result['output']}: {what}{result['gaussians']:,} Gaussians, {result['bytes']:,} bytes"
     if "cost" in result:
         c = result["cost"]
         text += (

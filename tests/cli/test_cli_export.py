@@ -37,6 +37,13 @@ def test_gaussians_whose_colours_alone_depend_on_the_view_are_not_refined(cli, s
     assert result.json["refine"] == 0 and result.json["gaussians"] > 20
 
 
+def test_a_level_that_the_file_lacks_is_told(cli, scene, tmp_path):
+    file = tmp_path / "still.pd4"
+    file.write_bytes(encode(scene.prefix(0), effort=1))
+    done = cli("export", file, "-o", tmp_path / "a.ply", "--to", "ply", "--refine", 0, "--sh", 0, "--level", 2)
+    assert done.code == 0 and "a.ply: level 0, " in done.err
+
+
 def test_the_whole_time_as_a_folder_of_plys(cli, scene_pd4, tmp_path):
     out = tmp_path / "frames"
     command = ("export", scene_pd4, "-o", out, "--to", "ply-seq", "--sh", 1, "--refine", 0, "--json")
