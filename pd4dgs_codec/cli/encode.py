@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -127,6 +128,8 @@ def _load(args: argparse.Namespace) -> tuple[Scene, Metadata | None]:
         from pd4dgs_codec.format.info import metadata_of
 
         return decode(data), _metadata(args, metadata_of(data))
+    if args.output != STDIO and os.path.realpath(args.input) == os.path.realpath(args.output):
+        raise UsageError(f"-o names the checkpoint {args.input}, which would be lost; expected another name")
     return common.checkpoint_scene(args.input, data), _metadata(args, None)
 
 
