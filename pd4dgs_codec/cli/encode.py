@@ -24,7 +24,7 @@ A .pd4 file holds layer 0 (static scene), layer 1 (global motion) and layer 2 (l
 that ends with a layer can be shown. Parts without visible effect are left out, and the report lists them with reasons.
 
 --target-size makes layers fit a link with the least loss of quality: 425k for layer 0 takes 1.7 s at 2 Mbps. It takes a
-minute or more. Without --data only views of the file's own camera count.
+minute or more. Without --data only views of the file's own camera count. --slices adds some per cent to these sizes.
 
 --slices 50k lets the first frame appear after 50 kB and improve with each further slice. The anchors that matter most
 in renderings come first; without target sizes others pass to a higher layer, so that motion need not wait for them. It
