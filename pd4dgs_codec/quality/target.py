@@ -22,7 +22,7 @@ from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.payload import write_layer
-from pd4dgs_codec.format.plan import LeftOut, Plan, passed, plan
+from pd4dgs_codec.format.plan import LeftOut, Plan, in_file_order, passed, plan
 from pd4dgs_codec.format.registry import LAYER_KINDS
 from pd4dgs_codec.scene import Scene
 
@@ -211,8 +211,11 @@ def fit(
         fits.append(fitted.describe(found, target))
         dropped += fits[-1].moved if fits[-1].to_layer is None else 0
         scene = fitted.apply(found)
+    if not dropped:
+        return scene, [], fits
+    scene, _ = in_file_order(scene, scene.layers)  # without them, else a plan would report them as well
     why = "the least error in the pictures, left out for the target size"
-    return scene, [LeftOut(f"{dropped} anchors", why, anchors=dropped)] if dropped else [], fits
+    return scene, [LeftOut(f"{dropped} anchors", why, anchors=dropped)], fits
 
 
 class _Layer:

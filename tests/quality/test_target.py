@@ -157,9 +157,10 @@ def test_anchors_of_least_harm_move_to_the_next_layer_and_out_of_the_highest(sce
 
     alone = plan(scene, EncodeOptions(layers=0)).scene
     fitted, left_out, (row,) = fit(alone, {0: round(0.8 * whole[0])}, lambda decoded: 0.0, harm, EncodeOptions(**FAST))
-    assert row.to_layer is None and row.moved and (fitted.mask[0] == 0).sum() == row.moved
+    assert row.to_layer is None and row.moved == len(alone.anchor_q) - len(fitted.anchor_q) > 0
     report = encode_with_report(fitted, **FAST, left_out=left_out)[1]
-    assert "target size" in report.left_out[0]["why"] and report.left_out[0]["what"] == f"{row.moved} anchors"
+    assert [told["what"] for told in report.left_out] == [f"{row.moved} anchors"]
+    assert "target size" in report.left_out[0]["why"]
 
 
 def test_a_target_out_of_reach_says_what_could_be_reached(scene):
