@@ -3,7 +3,7 @@
     python benchmarks/run.py                       # everything; benchmarks/README.md has the times
     python benchmarks/run.py --only quality speed  # these sections; the others stay as they are
     python benchmarks/run.py --quick               # a tiny scene, to see that all of it works; docs/ stays as it is
-    python benchmarks/run.py --check               # names the sections that are older than what they measure
+    python benchmarks/run.py --check               # names the sections whose measured code has changed since
 
 Writes docs/results.md, docs/figures/results.json and docs/img/ after each section, the most important first. Trainings
 and files stay below -o: the same command with --resume continues an interrupted run. Real scenes are read from the
@@ -14,6 +14,7 @@ out. Stops at the first benchmark that fails.
 from __future__ import annotations
 
 import argparse
+import ast
 import datetime
 import json
 import os
@@ -52,6 +53,8 @@ ALL = (
 )
 #: The scene of the animation.
 ANIMATED = "shelf-hand"
+#: What a docstring can begin.
+DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def section(benchmark: Benchmark, run: Run, names: Sequence[str], made: Row) -> Row:
@@ -78,14 +81,38 @@ def section(benchmark: Benchmark, run: Run, names: Sequence[str], made: Row) -> 
 
 
 def aged(sections: Sequence[Row]) -> list[str]:
-    """A line for every section that was made before the last change of what it measures."""
+    """A line for every section whose measured code has changed since it was made."""
     lines, measured = [], {benchmark.name: benchmark.measured for benchmark in ALL}
-    for found in sections:
-        made = found["commit"].partition(",")[0]
-        newer = git("log", "-1", "--format=%h, %s", f"{made}..HEAD", "--", *measured[found["name"]])
-        if newer or not git("cat-file", "-t", made):
-            lines.append(f"{found['name']}: made at {found['commit']}, before {newer or 'the history that is here'}")
+    known: dict[tuple[str, ...], list[str]] = {}
+    for name, made in ((found["name"], found["commit"]) for found in sections):
+        key = made.partition(",")[0], *measured[name]
+        if key not in known:
+            known[key] = changed(*key)
+        if known[key]:
+            path, *others = known[key]
+            more = f" and {len(others)} other files" if others else ""
+            lines.append(f"{name}: made at {made}, before changes of {path}{more}")
     return lines
+
+
+def changed(commit: str, *folders: str) -> list[str]:
+    """The files that do something else than at a commit; all if the commit is not in the history."""
+    if not git("cat-file", "-t", commit):
+        return git("ls-files", *folders).splitlines()
+    paths = git("diff", "--name-only", commit, "HEAD", "--", *folders).splitlines()
+    return [path for path in paths if code(commit, path) != code("HEAD", path)]
+
+
+def code(commit: str, path: str) -> str:
+    """The syntax tree of a Python file without its docstrings; the text of another file."""
+    text = git("show", f"{commit}:{path}")
+    if not path.endswith(".py"):
+        return text
+    tree = ast.parse(text)
+    for node in ast.walk(tree):
+        if isinstance(node, DOCUMENTED) and ast.get_docstring(node):
+            del node.body[0]
+    return ast.dump(tree)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -98,7 +125,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--quick", action="store_true", help="a tiny scene; without the player unless --only names it")
     parser.add_argument("--resume", action="store_true", help="keep the sections that were made at this commit")
     parser.add_argument("--render", action="store_true", help="make the page from its figures and measure nothing")
-    parser.add_argument("--check", action="store_true", help="name sections older than the package; exit code 1 if any")
+    what = "name sections whose measured code, comments apart, has changed since; exit code 1 if any"
+    parser.add_argument("--check", action="store_true", help=what)
     parser.add_argument("-o", "--out", type=Path, default=ROOT / "out" / "benchmarks", help="trainings and files")
     parser.add_argument("--docs", type=Path, help="folder of the page (docs; with --quick OUT/docs)")
     args = parser.parse_args(argv)
@@ -115,7 +143,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     kept = {found["name"]: found for found in json.loads(stored.read_text())["sections"]} if stored.is_file() else {}
     if args.check:
         lines = aged(list(kept.values()))
-        print("\n".join(lines or ["no section is older than what it measures"]))
+        print("\n".join(lines or ["the code that each section measures is as it was"]))
         return bool(lines)
     run.images.mkdir(parents=True, exist_ok=True)
     scenes = args.scenes or [name for name, scene in SCENES.items() if scene.usual]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -156,19 +157,30 @@ def test_trainings_side_by_side_are_those_that_are_measured(tmp_path, monkeypatc
     assert here.trained(QUICK)[1]["finished"] and len(ran) == 2
 
 
-def test_sections_older_than_what_they_measure_are_named(monkeypatch):
-    """Of the player the one that opens it."""
+def test_sections_whose_code_has_changed_are_named(tmp_path, monkeypatch):
+    """Docstrings and comments do not count; of the player's code only the section that opens it depends."""
+    monkeypatch.setattr(common, "ROOT", tmp_path)
 
-    def git(verb, *words):
-        if verb == "cat-file":
-            return "commit" * (words[1] != "gone")
-        return {"b2": "c3, Package: change", "d4": "e5, Player: change" * ("player" in words)}.get(words[2][:-6], "")
+    def commit(name: str, text: str) -> str:
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text(text)
+        git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
+        for words in (["init", "-q"], ["add", "-A"], ["commit", "-q", "-m", name]):
+            subprocess.run([*git, *words], check=True)
+        return common.git("rev-parse", "--short=7", "HEAD")
 
-    monkeypatch.setattr(run, "git", git)
-    made = {"quality": "a1", "slices": "b2", "paper": "gone", "dial": "a1, changed", "speed": "d4", "player": "d4"}
-    lines = run.aged([{"name": name, "commit": commit} for name, commit in made.items()])
-    assert [line.partition(":")[0] for line in lines] == ["slices", "paper", "player"]
-    assert "c3, Package: change" in lines[0] and "e5, Player: change" in lines[2]
+    def named(section: str, commit: str) -> str:
+        return "".join(run.aged([{"name": section, "commit": commit}]))
+
+    first = commit("pd4dgs_codec/x.py", '"""Adds."""\na = 1\n')
+    code = commit("pd4dgs_codec/x.py", '"""Adds."""\na = 2\n')
+    words = commit("pd4dgs_codec/x.py", '"""Adds one."""\na = 2  # two\n')
+    commit("player/x.js", "1;")
+    for section in ("quality", "player"):
+        assert named(section, first).startswith(f"{section}: made at {first}, before changes of pd4dgs_codec/x.py")
+        assert named(section, "abcdef1").startswith(f"{section}: made at abcdef1, before changes of")
+    assert named("quality", f"{code}, changed") == named("quality", words) == ""
+    assert named("player", words) == f"player: made at {words}, before changes of player/x.js"
 
 
 def test_several_seeds_are_shown_with_their_spread():
