@@ -323,7 +323,7 @@ def read_chunk_list(rows):
     need(layers == sorted(layers), f"layers {layers}")
 
 
-# 3.3 Scene identity: "the header from the end of its chunk list (the value of key 1, its first entry) to its own end"
+# 3.3 Scene identity: "the header from the end of its chunk list (the value of key 1, the first entry of the map)"
 def behind_chunk_list(header):
     reader = Reader(header)
     msgpack_head(reader)
@@ -333,7 +333,7 @@ def behind_chunk_list(header):
 
 
 # 3.2 Chunks: "Type and length MUST equal those in the chunk list. Checks come in this order: L against its limit, L
-# against the list, the bytes that are there, CRC-32, reserved flags, type, scene id, flag bit 0 against the type"
+# against the list, presence of the whole chunk, CRC-32, reserved flags, type, scene id, flag bit 0 against the type"
 def read_chunk(data, at, kind, size, scene_id):
     need(len(data) >= at + 16, "the file ends in a chunk's head", "Truncated")
     found_kind, flags, found_size, found_id = struct.unpack_from("<HHI8s", data, at)
