@@ -242,7 +242,7 @@ def read_preamble(data):
 
 # 5.1 Header map: "The time at 1 MUST NOT precede the time at 0, the background MUST lie in 0..1, 0 ≤ near < far and
 # unit ≥ 0 MUST hold." "coding mode: 0 ans, 1 lzma; others UnsupportedFeature"
-# 5.2 Chunk list: "In mode lzma each occurs at most once."
+# 5.2 Chunk list: "In mode lzma each of them occurs at most once."
 # 5.5 Digest: "The first 16 bytes of the SHA-256 of the payloads of all critical chunks that were encoded together"
 def read_header(data):
     header = fields(unpack(data), range(1, 16), (1, 2, *range(4, 12), 13, 14, 15), "header")
@@ -407,8 +407,8 @@ def read_layer(payload, number, later, before, below, header, past):
     return layer
 
 
-# 6.2 Layer parameters: "In its first slice, layer 0 has keys 3 and 5 and neither 4 nor 6. Layers 1 and 2 have keys 3, 4
-# and 5, and MAY have key 6, if the layer has a deformation, else none of them. No later slice has any of the four."
+# 6.2 Layer parameters: "The first slice of layer 0 MUST have keys 3 and 5 and neither 4 nor 6." "keys 3, 4 and 5 if the
+# layer has a deformation, and MAY then have key 6; otherwise it has none of the four." "Later slices have none"
 def read_parameters(layer, value):
     parameters = fields(value, range(1, 7), (1, 2), "layer parameters")
     layer.rows = limited(parameters[1], (1 << 24) - layer.rows_before, "own rows")
@@ -428,7 +428,7 @@ def read_parameters(layer, value):
     check_bounded(layer)
 
 
-# 5.4 Error bounds: "4 and 5 if layer 1 has a deformation, 6 and 7 if layer 2 has one, else the layer is Malformed."
+# 5.4 Error bounds: "A layer with a deformation is Malformed without its keys: 4 and 5 for layer 1, 6 and 7 for layer 2"
 def check_bounded(layer):
     classes = {2 + 2 * layer.number, 3 + 2 * layer.number} if layer.deformed else set()
     need(classes <= set(layer.header[13]), "no error bound for a deformation")
@@ -449,8 +449,8 @@ def read_scales(rows, below):
     return rows
 
 
-# 6.3 Planes and networks: "Ids ascend." "The last width MUST be the number of outputs in this table." "Layer 0 has all
-# three networks. A deformation has its trunk and at least one head."
+# 6.3 Planes and networks: "Ids ascend, each occurs once." "The last width o_m MUST be the number of outputs in this
+# table" "Layer 0 MUST have all three networks, a deformation its trunk and at least one head."
 def read_networks(number, header, rows):
     networks, last, known = {}, -1, network_outputs(number, header)
     for row in a_list(rows, "networks"):
@@ -482,7 +482,7 @@ def plane_shapes(layer):
 
 # 6.3 Planes and networks: "Linear layer i is a weight [o_i, o_{i−1}] and a bias [o_i]; o_0 is the network's input
 # width." "The input width is D in layer 0, but D + 3 (feature D, view direction 3) for network i if bit i of V is set.
-# A trunk reads the scales of its own layer behind those of the layers before it in the file"
+# A trunk reads the scales of the layers before it in the file, then those of its own layer"
 def weight_shapes(layer):
     shapes, (feature, _, viewing) = [], layer.header[15]
     for key, widths in layer.networks.items():
@@ -509,8 +509,8 @@ def check_sizes(layer, payload_bytes, before):
     need(symbols <= (1 << 22) + 256 * size, f"{symbols} symbols", "LimitExceeded")
 
 
-# 6.4 Sections: "A section is present if and only if it has at least one symbol to code. Mode ans uses 0..4, mode lzma 0
-# and 5."
+# 6.4 Sections: "A section MUST be present if and only if it has at least one symbol to code. Mode ans uses sections
+# 0..4, mode lzma 0 and 5."
 def read_sections(layer, parts):
     def part(section, count):
         need(section in parts or not count, f"section {section} is missing")
