@@ -695,9 +695,9 @@ def read_normal(reader, n):
     return mu8, (v >> 1) - 640, v & 1
 
 
-# 8.2 Priors: "without differences the symbols are the heights, of a table of top + 1 symbols with mu8 = 16·m; with
-# differences symbol r adds r − top to the height before (0 before the first), of a table of 2·top + 1 symbols with mu8
-# = 256·top."
+# 8.2 Priors: "Without differences the table has top + 1 symbols and mu8 = 16·m, and each symbol is a height. With
+# differences it has 2·top + 1 symbols and mu8 = 256·top, and symbol r gives the previous height (0 before the first)
+# plus r − top."
 def read_histogram(reader, prior):
     mode = reader.bits(3)
     step, differences = 8 << (mode & 3), mode >> 2
@@ -710,7 +710,7 @@ def read_histogram(reader, prior):
 
 
 # 8.2 Priors: "A height outside 0..top, or all heights 0, is Malformed."
-# 8.4 Symbols: "The ANS stream holds the heights of each hist prior in the order of definition"
+# 8.4 Symbols: "The ANS stream holds the heights of each hist prior that the section defines, in the order"
 def take_heights(stream, prior):
     step, top, differences, cum = prior.heights
     heights, last = [], 0
@@ -740,10 +740,10 @@ def read_exceptions(reader, count, prior):
 
 # 8.1 Parameter block: "For each non-empty channel in order: a varint token, at most 2·(2^26 + 8); the parameters of a
 # new prior (8.2), if any; its exceptions (8.3), if bit 0 of the token is set."
-# 8 Coded channels: "tokens ≥ 8 refer to priors of the same section, or stage, only, and the definitions of the slices
-# of the same layer before count, in their order."
-# 14 Limits: "entries of all windows that a section of coded channels defines" "one per symbol of its channels, and
-# 2^18, or 2^10 where slices before it defined some"
+# 8 Coded channels: "A section of coded channels has a prior list: the priors that it has defined so far, in their
+# order."
+# 14 Limits: "entries of all windows that a section of coded channels defines" "one per symbol of its channels, plus
+# 2^10 if its prior list begins with priors of earlier slices (8), else plus 2^18"
 def decode_channels(data, counts, known=None):
     """known: the priors of the slices before, to which those defined here are added."""
     reader, defined, heads = Reader(data), [] if known is None else known, []
@@ -779,12 +779,12 @@ def take_channel(stream, count, prior, exceptions):
     return [exceptions[at] if at in exceptions else next(inside) for at in range(count)]
 
 
-# 8.5 The attributes section: "Section 2 is a u8, the form" "the prediction block (8.6), then eight sections of coded
-# channels, the stages 0..7 (8.7)" "the lengths (8.9) of stages 0..6, then the stages 0..7, under the block of the
-# latest slice of form 1 before; Malformed if the layer has none"
-# 8.7 Stages of the attributes: "The activity of a row is the relative magnitude (8.9) of the residuals named, the
-# places being the n rows." "In form 2 places, sums and bounds are those of the slice that the block stands in"
-# 8.7 Stages of the attributes: "The bounds are b_s = (P·a_s) // 38, a_1 .. a_5 being 6, 12, 20, 29 and 38"
+# 8.5 The attributes section: "Section 2 begins with a u8, the form." "the prediction block (8.6), then eight sections
+# of coded channels, the stages 0..7 (8.7)" "the lengths (8.9) of stages 0..6, then the stages 0..7, with the prediction
+# block of the latest earlier slice of form 1; Malformed if the layer has none"
+# 8.7 Stages of the attributes: "The activity of a row is the relative magnitude (8.9) of the residuals named, with the
+# n rows as places." "Form 2 takes N, the sums s_c (also that of the step classes) and the bounds (8.9) from the slice"
+# 8.7 Stages of the attributes: "With b_s = (P·a_s) // 38, where a_1 .. a_5 are 6, 12, 20, 29 and 38"
 def decode_attributes(data, feature, slots, n, past, graded):
     reader, p = Reader(data), feature + 6
     form = read_form(reader, 3)
@@ -813,14 +813,14 @@ def decode_attributes(data, feature, slots, n, past, graded):
     return grades + add_predictions(residuals, terms) + [channel for offset in zip(x, y, z) for channel in offset]
 
 
-# 8.5 The attributes section: "the step classes of the rows: a varint, the length in bytes of what follows, at most the
-# bytes left in the section, the varint's own included; then a section of coded channels with one channel of n symbols"
+# 8.5 The attributes section: "a varint, the length in bytes of their section of coded channels, at most the bytes left
+# in section 2, the varint's own included; then this section, with one channel of n symbols."
 def decode_grades(reader, n):
     (grades,) = decode_channels(reader.take(reader.varint(reader.left)), [n])
     return step_classes(grades)
 
 
-# 8.5 The attributes section: "each MUST lie in 0..6, else Malformed"
+# 8.5 The attributes section: "Each symbol MUST lie in 0..6, else Malformed."
 def step_classes(symbols):
     need(all(0 <= c <= 6 for c in symbols), "a step class over 6")
     return symbols
@@ -855,8 +855,8 @@ def read_terms(reader, p, c):
     return terms
 
 
-# 8.6 Prediction block: "a varint f ≤ 3. Bit 0: y_i is split, by x_i. Bit 1: z_i is split, by x_i and y_i. If f > 0
-# follows a zigzag centre a_i of x_i; if bit 1 is set, then a zigzag centre b_i of y_i; |a_i| and |b_i| ≤ K"
+# 8.6 Prediction block: "a varint f ≤ 3. Bit 0: y_i is split, by x_i. Bit 1: z_i is split, by x_i and y_i. If f >
+# 0, a zigzag centre a_i of x_i follows; if bit 1 is set, then a zigzag centre b_i of y_i; |a_i| and |b_i| ≤ K"
 def read_split(reader):
     """(y is split, z is split, a, b) of a Gaussian."""
     f = reader.varint(3)
@@ -877,8 +877,8 @@ def z_classes(split, x, y):
     return [is_split * min(abs(v - a) + abs(w - b), 6) for v, w in zip(x, y)]
 
 
-# 8.7 Stages of the attributes: "A channel that is split stands in its stage as its classes 0, 1, .. in order, each a
-# channel of its own that holds, in row order, the symbols of the rows of that class"
+# 8.7 Stages of the attributes: "A channel that is split is coded as one channel per class 0, 1, .. in order, each with
+# the symbols of the rows of that class, in row order."
 # 8 Coded channels: "Channels of length 0 leave no trace."
 def decode_classes(data, classes, class_count, known=None):
     """The channels of a stage, given the class of each place of each; a channel that is not split is all class 0."""
@@ -902,9 +902,9 @@ def add_predictions(residuals, terms):
     return k
 
 
-# 8.8 The planes section: "Stage 0 holds the plane channels 0 and 1, stage s ≥ 1 the plane channels 2^s .. 2^(s+1) − 1,
-# as far as there are such. Within a stage come the planes in the order of the plain form, in each its plane channels,
-# ascending, in each its classes."
+# 8.8 The planes section: "Stage 0 codes the plane channels 0 and 1, stage s ≥ 1 the plane channels 2^s .. 2^(s+1) − 1,
+# as far as they exist. A stage codes plane by plane in the order of the plain form, in each plane its plane channels,
+# ascending, in each plane channel its classes, ascending."
 def decode_planes(data, shapes):
     """The residuals, channel by channel in the order of the plain form; shapes: (channels, height, width) of each."""
     reader, channels = Reader(data), shapes[0][0]
@@ -923,9 +923,9 @@ def decode_planes(data, shapes):
     return [channel for e in planes for channel in e]
 
 
-# 8.8 The planes section: "The activity of cell (i, j) is the sum, over the nine cells (clip(i + a, 0, H − 1), clip(j +
-# b, 0, W − 1)) with a and b in −1..1, of their relative magnitudes (8.9) in the residuals of the plane's channels in
-# the stages before, the places being the plane's cells."
+# 8.8 The planes section: "The activity of cell (i, j), row i and column j, is the sum, over the nine cells (clip(i + a,
+# 0, H − 1), clip(j + b, 0, W − 1)) with a and b in −1..1, of their relative magnitudes (8.9) in the residuals of the
+# plane's channels in the stages before, with the plane's cells as places."
 def cell_activity(channels, h, w):
     magnitude = relative_magnitude(channels, h * w)
     rows = [[min(max(i + a, 0), h - 1) for a in (-1, 0, 1)] for i in range(h)]
@@ -940,9 +940,9 @@ def read_class_count(reader):
     return count
 
 
-# 8.9 Classes by activity: "Lengths are varints, the bytes of a stage each, at most the bytes left in the section, the
-# varint's own included; their sum MUST NOT exceed the bytes that follow the last of them, else Malformed. The last
-# stage takes the rest, to the section's end."
+# 8.9 Classes by activity: "Lengths are varints, each the number of bytes of a stage, at most the bytes left in the
+# section, the varint's own included; their sum MUST NOT exceed the bytes that follow the last length, else Malformed.
+# The last stage takes the rest, to the section's end."
 def take_stages(reader, number):
     sizes = [reader.varint(reader.left) for _ in range(number - 1)]
     return [reader.take(size) for size in sizes] + [reader.take(reader.left)]
