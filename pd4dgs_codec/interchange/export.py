@@ -1,11 +1,11 @@
-"""A level of a scene as explicit Gaussians, and the loss of quality.
+"""Exports a level of a scene as explicit Gaussians, and measures the loss of quality.
 
-The scaffold's networks take the direction from the eye, so opacity, size, rotation and colour of a Gaussian depend on
-it. A bake asks a set of eyes, each with a weight per anchor. The opacity is the weighted mean over the eyes, 0 where an
-eye does not see the Gaussian. The covariance is the mean with weights times opacities. Colours are spherical harmonics
-by least squares over the directions with those weights, with a ridge that keeps unseen directions near the mean.
+The decoders take the view direction, so opacity, size, rotation and colour of a Gaussian depend on it. Baking evaluates
+them from a set of eyes, each with a weight per anchor. Opacity is the weighted mean over the eyes; an eye that does not
+see the Gaussian counts as 0. The weights of covariance and colour are multiplied by opacity. Covariance is a mean;
+colours are harmonics fitted by least squares, with a ridge that keeps unseen directions near the mean colour.
 
-As no eye sees the mean, refinement then fits the Gaussians to the scene's own pictures by gradient descent.
+No eye sees this average, so refinement then fits the Gaussians to pictures of the scene by gradient descent.
 """
 
 from __future__ import annotations
@@ -38,25 +38,25 @@ from pd4dgs_codec.scene import Camera
 
 Step = Callable[[], None]
 UNTURNED = np.eye(3)
-#: Eyes of a bake: more change held-out PSNR by less than 0.01 dB.
+#: Eyes of a bake; more of them change held-out PSNR by less than 0.01 dB.
 EYES = 48
-#: Anchors at a time, to bound memory: EYES times their Gaussians.
+#: Anchors baked at a time, which bounds memory to EYES times their Gaussians.
 CHUNK = 1024
-#: Weight of an eye for an anchor outside of its picture.
+#: Factor of an eye's weight for anchors outside its picture and margin.
 OUTSIDE = 1e-3
-#: The ridge on coefficients of degree l is RIDGE times l (l + 1), in shares of the eyes' weight.
+#: The ridge on coefficients of degree l is RIDGE times l (l + 1), where the eyes' weights sum to 1.
 RIDGE = 1e-4
 PIXELS = 400  #: width and height of the pictures of a file without a camera
-#: Without a dataset's cameras, an eye turned away by the angle a has the weight exp(CONCENTRATION (cos a - 1)).
+#: `eyes_of_scene` weighs an eye at the angle a from the file's camera by exp(CONCENTRATION (cos a - 1)).
 CONCENTRATION = 2.0
-#: Pictures to match have 1/k of the width and height of the eyes' pictures, and at most this many pixels.
+#: Refinement shrinks the eyes' pictures by a whole factor to at most this many pixels.
 TARGET_PIXELS = 1 << 17
-#: A later instant starts from the changes of the one before it and takes this share of the steps.
+#: Later times start from the refinement of the previous time and take this share of the steps.
 LATER = 0.25
-#: Learning rates at the start, which end at LAST of that. Positions: in shares of a Gaussian's size.
+#: Initial learning rates, which decay to LAST of that. The rate of means is relative to a Gaussian's largest scale.
 RATES = {"means": 0.02, "quats": 0.01, "log_scales": 0.02, "logits": 0.05, "sh": 0.01}
 LAST = 0.1
-REST = 0.2  #: of the rate for harmonics of degree 1 and more, as in 3D Gaussian splatting
+REST = 0.2  #: factor of the rate for harmonics of degree 1 and above, which 3D Gaussian splatting lowers as well
 BETAS, EPSILON = (0.9, 0.99), 1e-15
 SMALLEST = np.float32(1e-9)  #: scene units
 FAINTEST, STRONGEST = 1e-3, 1 - 1e-4  #: bounds of opacities before their logits are taken
@@ -78,22 +78,22 @@ class Eyes:
         return np.stack([camera_eye(camera) for camera in self.cameras]).astype(np.float32)
 
     def weigh(self, positions: np.ndarray) -> np.ndarray:
-        """float64 [E, n]: each eye's weight for the anchors at positions [n, 3], times OUTSIDE out of its picture."""
+        """Returns float64 [E, n]: each eye's weight for anchors at `positions` [n, 3], OUTSIDE times it if unseen."""
         inside = np.stack([_inside(camera, positions) for camera in self.cameras])
         return np.asarray(self.weights[:, None] * np.where(inside, 1.0, OUTSIDE))
 
 
 def eyes_of_cameras(cameras: Sequence[Camera]) -> Eyes:
-    """EYES of the cameras, evenly spaced in their order; all of them if there are fewer."""
+    """Picks EYES cameras, evenly spaced in their order, or all if there are fewer. Their weights are equal."""
     chosen = spread(cameras, EYES)
     return Eyes(chosen, np.ones(len(chosen)))
 
 
 def eyes_of_scene(player: Player, count: int = EYES) -> Eyes:
-    """Cameras on a sphere around the median of the anchors in the picture of the file's camera.
+    """Places `count` cameras on a sphere around the median of the anchors that the file's camera sees.
 
-    They have its distance and lens, look at the middle, and weigh more near it. Without a camera in the file: around
-    all active anchors, at twice their reach, with equal weights.
+    They look at the centre with the distance and intrinsics of that camera; the nearer to it, the higher their weight.
+    If the file has no camera, the radius is twice the distance of the farthest active anchor, and weights are equal.
     """
     info, camera = player.info, player.info.camera
     positions = player.positions[player.active].astype(np.float64)
@@ -114,9 +114,9 @@ def eyes_of_scene(player: Player, count: int = EYES) -> Eyes:
 
 
 def bake(player: Player, t: float, eyes: Eyes, degree: int, turn: np.ndarray = UNTURNED) -> tuple[Splats, np.ndarray]:
-    """(Gaussians at normalised time t in 0..1, their slots int64 [N]), without those too faint for any pixel.
+    """Returns (Gaussians at normalised time t in 0..1, their slots int64 [N]), without Gaussians too faint to be drawn.
 
-    degree: of the harmonics, 0 to 3. turn: rotates the world, [3, 3].
+    degree: of the harmonics, 0 to 3. turn: rotation of the world, [3, 3].
     """
     rows, parts, slots = player.active, [], []
     for start in range(0, len(rows), CHUNK):
@@ -133,7 +133,7 @@ def bake(player: Player, t: float, eyes: Eyes, degree: int, turn: np.ndarray = U
 
 
 def _inside(camera: Camera, positions: np.ndarray) -> np.ndarray:
-    """bool [n]: positions [n, 3] in the camera's picture or half its size around it."""
+    """Returns bool [n]: whether positions [n, 3] project into the picture or a margin of half its size."""
     viewmat, K = camera.viewmat.astype(np.float64), camera.K.astype(np.float64)
     x, y, depth = viewmat[:3, :3] @ positions.T.astype(np.float64) + viewmat[:3, 3:]
     z = np.maximum(depth, LEAST_NEAR)
@@ -148,7 +148,7 @@ def _bake(
     count = len(eyes.places)
     means, slots = g.means.reshape(count, -1, 3)[0], g.slots.reshape(count, -1)[0]
     opacities = g.opacities.reshape(count, -1).astype(np.float64)
-    finite = np.isfinite(g.colors).all(axis=1).reshape(count, -1)  # as in pictures: overflowed colours hide
+    finite = np.isfinite(g.colors).all(axis=1).reshape(count, -1)  # as in Player.picture
     opacities = np.where(finite, opacities, 0)
     colors = np.nan_to_num(g.colors).reshape(count, -1, 3)
     prior = eyes.weigh(player.positions[rows])
@@ -175,7 +175,7 @@ def _bake(
 
 
 def _fitted(basis: np.ndarray, colors: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """float64 [K, J, 3]: coefficients of basis [E, K, J] for colors [E, K, 3] - 0.5 by least squares with weights
+    """Fits coefficients float64 [K, J, 3] of basis [E, K, J] to colors [E, K, 3] - 0.5 by least squares with weights
     [E, K], whose sum over the eyes is 1."""
     degrees = np.floor(np.sqrt(np.arange(basis.shape[2])))
     weighted = (basis * weights[..., None]).transpose(1, 2, 0)
@@ -200,7 +200,7 @@ def refine(
     near: float,
     step: Step = lambda: None,
 ) -> Splats:
-    """The Gaussians after steps of Adam (Kingma and Ba 2015) on the squared error of the targets, in `order`."""
+    """Refines Gaussians by Adam (Kingma and Ba 2015) on the squared error; `order` names the target of each step."""
     size = np.maximum(splats.scales.max(axis=1, keepdims=True), SMALLEST)
     values = {
         "means": splats.means / size,
@@ -228,7 +228,7 @@ def refine(
 
 
 def logits(opacities: np.ndarray) -> np.ndarray:
-    """float32 [N] of opacities [N], bounded so that gradients do not vanish."""
+    """Returns the logits float32 [N] of opacities [N], bounded so that gradients do not vanish."""
     p = np.clip(opacities, FAINTEST, STRONGEST).astype(np.float32)
     return np.asarray(np.log(p / (1 - p)))
 
@@ -246,7 +246,7 @@ def _splats(values: dict[str, np.ndarray], size: np.ndarray) -> Splats:
 def _gradients(
     values: dict[str, np.ndarray], size: np.ndarray, camera: Camera, image: np.ndarray, behind: np.ndarray, near: float
 ) -> dict[str, np.ndarray]:
-    """Gradients of the mean squared error of one picture."""
+    """Returns the gradients of one picture's mean squared error by the names of `values`."""
     splats = _splats(values, size)
     basis = harmonics(unit(splats.means - camera_eye(camera).astype(np.float32)), splats.degree)
     raw = np.einsum("nj,njc->nc", basis, splats.sh) + np.float32(0.5)
@@ -281,8 +281,8 @@ class Export:
     def splats(
         self, t: float, turn: np.ndarray = UNTURNED, before: Learnt | None = None, step: Step = lambda: None
     ) -> tuple[Splats, Learnt]:
-        """The Gaussians at normalised time t, and their changes by refinement. turn: rotates the world, [3, 3]. before:
-        the changes at another time, to start from. step: called after each step."""
+        """Returns (Gaussians at normalised time t, their changes by refinement). turn: rotation of the world, [3, 3].
+        before: changes of another time to start from. step: called after each step of refinement."""
         baked, slots = bake(self.player, t, self.eyes, self.degree, turn)
         started = baked if before is None else before.applied(baked, slots)
         steps = self.steps if before is None else int(np.ceil(LATER * self.steps))
@@ -301,15 +301,15 @@ class Export:
 
 @dataclass(frozen=True, eq=False)
 class Learnt:
-    """The changes by refinement at a time: slots int64 [N], and the Gaussians before and after."""
+    """The changes by refinement at one time: slots int64 [N] and their Gaussians before and after it."""
 
     slots: np.ndarray
     baked: Splats
     refined: Splats
 
     def applied(self, splats: Splats, slots: np.ndarray) -> Splats:
-        """Gaussians of another time with the same changes by slot, but for sizes and rotations, whose axes have no
-        fixed order."""
+        """Applies the changes to the Gaussians of another time by slot. Sizes and rotations stay, since the order of
+        their axes differs from time to time."""
         _, here, there = np.intersect1d(slots, self.slots, assume_unique=True, return_indices=True)
         old, new = self.baked.taken(there), self.refined.taken(there)
         parts = {name: values.copy() for name, values in vars(splats).items()}
@@ -321,7 +321,7 @@ class Learnt:
 
 
 def upright(up: Sequence[float]) -> np.ndarray:
-    """float64 [3, 3]: the shortest turn that carries the direction `up` to +y."""
+    """Returns float64 [3, 3]: the smallest rotation that carries the direction `up` to +y."""
     a, b = unit(np.asarray(up, np.float64)), np.array([0.0, 1.0, 0.0])
     cross, cosine = np.cross(a, b), float(a @ b)
     if cosine < -1 + 1e-9:
@@ -332,17 +332,17 @@ def upright(up: Sequence[float]) -> np.ndarray:
 
 
 def turned_camera(camera: Camera, turn: np.ndarray) -> Camera:
-    """The camera that sees the turned world as this one sees the world."""
+    """Rotates a camera together with the world by `turn` [3, 3], so that its picture stays the same."""
     viewmat = camera.viewmat.astype(np.float64)
     viewmat[:3, :3] = viewmat[:3, :3] @ turn.T
     return replace(camera, viewmat=viewmat.astype(np.float32))
 
 
 def cost(export: Export, views: Sequence[View], step: Step = lambda: None) -> dict[str, float]:
-    """The cost of exporting: the time of each view is exported by itself and drawn from the view's camera.
+    """Measures the loss by export: each view's time is exported by itself and drawn from the view's camera.
 
-    views: their number; and means over them, dB: direct_mpsnr and exported_mpsnr, of direct pictures and of exported
-    Gaussians against the truth, and exported_to_direct_psnr, of the second against the first.
+    Returns the number of views and means over them in dB: direct_mpsnr (direct picture against the truth),
+    exported_mpsnr (exported against the truth) and exported_to_direct_psnr (exported against direct).
     """
     rows, info = [], export.player.info
     for view in views:

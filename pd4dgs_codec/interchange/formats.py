@@ -1,6 +1,6 @@
-"""Files of explicit Gaussians: PLY, SPZ and gsplat checkpoints read; PLY, glTF, SPZ and 4dgs written.
+"""Reads explicit Gaussians from PLY, SPZ and gsplat checkpoints, and writes PLY, glTF, SPZ and 4dgs files.
 
-SPZ, compressed PLY and 4dgs go through gaussforge and fourdgs, which are in the extra `interchange`.
+SPZ and compressed PLY need gaussforge, 4dgs needs fourdgs; the extra `interchange` installs both.
 """
 
 import contextlib
@@ -23,10 +23,10 @@ from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, LARGEST, read_file, re
 from pd4dgs_codec.errors import DataError, one_line, required
 from pd4dgs_codec.interchange.splats import MAX_DEGREE, Splats, unit
 
-EXTRA = "interchange"  #: of gaussforge and fourdgs
-#: Coefficients of the harmonics without the constant, by degree.
+EXTRA = "interchange"  #: the extra that installs gaussforge and fourdgs
+#: Number of coefficients of the harmonics without the constant -> degree.
 REST = {(degree + 1) ** 2 - 1: degree for degree in range(MAX_DEGREE + 1)}
-#: PLY files store opacities as logits and scales as logarithms, of values within these bounds.
+#: Bounds of opacities and scales before PLY files take their logits and logarithms.
 LEAST_OPACITY, LEAST_SCALE = 1e-6, 1e-12
 #: KHR_gaussian_splatting: linear scales and opacities, quaternions xyzw.
 #: https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting
@@ -34,19 +34,19 @@ EXTENSION = "KHR_gaussian_splatting"
 FLOAT, POINTS = 5126, 0  #: glTF's numbers of a component type and of a primitive's mode
 TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 JSON, BINARY = 0x4E4F534A, 0x004E4942  #: types of chunks
-#: SPZ rounds positions to SPZ_STEP and holds them up to SPZ_REACH from 0, scene units: 24 bits, 12 of them fractional.
+#: SPZ stores positions in 24 bits, 12 of them fractional: multiples of SPZ_STEP below SPZ_REACH, scene units.
 SPZ_STEP, SPZ_REACH = 1 / 4096, 2048.0
-#: SPZ's first bytes; the most Gaussians, and unpacked bytes of each: 65 with all harmonics, the rest for extensions.
+#: SPZ's first bytes; most Gaussians, and most unpacked bytes of each: 65 with all harmonics, the rest for extensions.
 SPZ_MAGIC, SPZ_MOST, SPZ_BYTES = b"NGSP", 10_000_000, 128
-#: 4dgs files store harmonics but the constant as bytes, from -SH_SPAN to SH_SPAN.
+#: 4dgs files store harmonics from degree 1 on as bytes, for values from -SH_SPAN to SH_SPAN.
 SH_SPAN = 4.0
 
 
 def checked(
     where: str, means: np.ndarray, quats: np.ndarray, scales: np.ndarray, opacities: np.ndarray, sh: np.ndarray
 ) -> Splats:
-    """Splats of these arrays with unit rotations, without those that are not finite or huge. Raises DataError for wrong
-    shapes, and if none is left."""
+    """Returns the arrays as Splats with unit rotations, without Gaussians that are not finite, huge or invalid. Raises
+    DataError for wrong shapes, or if no Gaussian is left."""
     n = len(means) if means.ndim else 0
     harmonics = sh.shape[-2] if sh.ndim == 3 else 1
     shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, harmonics, 3)}
@@ -66,7 +66,7 @@ def checked(
 
 
 def finite_rows(parts: dict[str, np.ndarray]) -> np.ndarray:
-    """bool [n]: the rows of arrays [n, ...] that hold numbers up to LARGEST alone."""
+    """Returns bool [n]: whether a row of all arrays [n, ...] has only numbers of magnitude up to LARGEST."""
     found = [(np.abs(array) <= LARGEST).all(axis=tuple(range(1, array.ndim))) for array in parts.values()]  # not NaN
     return np.asarray(np.logical_and.reduce(found))
 
@@ -84,7 +84,7 @@ def quiet() -> Iterator[None]:
             yield
         finally:
             with contextlib.suppress(TypeError):  # Windows finds no C library by this name
-                ctypes.CDLL(None).fflush(None)  # before C's buffers are written later
+                ctypes.CDLL(None).fflush(None)  # C would write its buffers later, to the restored streams
             for stream, old in zip((1, 2), kept, strict=True):
                 os.dup2(old, stream)
                 os.close(old)
@@ -94,12 +94,13 @@ def quiet() -> Iterator[None]:
 
 
 def read_splats(path: Path) -> Splats:
-    """The Gaussians of a PLY file of 3D Gaussian splatting, a compressed PLY or an SPZ file. Raises DataError."""
+    """Reads a PLY file of 3D Gaussian splatting, a compressed PLY or an SPZ file. Raises DataError."""
     return checked(str(path), **activated(read_parameters(path)))
 
 
 def read_parameters(path: Path) -> dict[str, np.ndarray]:
-    """The numbers of such a file, float32: logarithms of scales, logits of opacities, any quaternions."""
+    """Reads the numbers that `read_splats` activates, float32, by the names of Splats: logarithms of scales, logits of
+    opacities, and quaternions of any length. Raises DataError."""
     compressed = path.name.lower().endswith(".compressed.ply")
     if path.suffix.lower() == ".spz" or compressed:
         rows = read_vertices(path, _unpacked(path, "compressed.ply" if compressed else "spz"))
@@ -116,7 +117,6 @@ def read_parameters(path: Path) -> dict[str, np.ndarray]:
     rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in names)
     if rest % 3 or rest // 3 not in REST:
         raise DataError(f"{path}: has {rest} properties f_rest_*, expected {', '.join(str(3 * n) for n in REST)}")
-    # channel by channel
     sh = [stack(f"f_dc_{c}", *(f"f_rest_{c * rest // 3 + i}" for i in range(rest // 3))) for c in range(3)]
     return {
         "means": stack("x", "y", "z"),
@@ -128,14 +128,14 @@ def read_parameters(path: Path) -> dict[str, np.ndarray]:
 
 
 def activated(parameters: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """With scales and opacities instead of logarithms and logits."""
+    """Returns the parameters with scales and opacities instead of their logarithms and logits."""
     with np.errstate(over="ignore"):
         scales, opacities = np.exp(parameters["scales"]), 1 / (1 + np.exp(-parameters["opacities"]))
     return parameters | {"scales": scales, "opacities": opacities}
 
 
 def _unpacked(path: Path, kind: str) -> bytes:
-    """An SPZ file or a compressed PLY converted to PLY by gaussforge."""
+    """Converts an SPZ file or a compressed PLY to a PLY by gaussforge."""
     forge = required("gaussforge", EXTRA, "SPZ files and compressed PLYs").GaussForge()
     data = read_file(path)
     if kind == "spz":
@@ -149,9 +149,9 @@ def _unpacked(path: Path, kind: str) -> bytes:
 
 
 def _check_spz(path: Path, data: bytes) -> None:
-    """Raises DataError for other files, and for one that unpacks to more than its Gaussians need, as gaussforge has no
-    such limit."""
-    unpacker, zipped = zlib.decompressobj(wbits=31), data[:4] != SPZ_MAGIC  # from version 4 on the header is bare
+    """Raises DataError unless `data` is an SPZ file that unpacks to no more bytes than its Gaussians need. gaussforge
+    has no such limit."""
+    unpacker, zipped = zlib.decompressobj(wbits=31), data[:4] != SPZ_MAGIC  # versions from 4 do not compress it
     try:
         head = unpacker.decompress(data, 20) if zipped else data[:20]
         if head[:4] != SPZ_MAGIC or len(head) < 16:
@@ -175,7 +175,7 @@ def _check_spz(path: Path, data: bytes) -> None:
 
 
 def read_gsplat(path: Path) -> Splats:
-    """A checkpoint of gsplat's trainers: {"splats": state dict}."""
+    """Reads a checkpoint of gsplat's trainers, {"splats": state dict}. Raises DataError."""
     content = read_tensors(read_file(path), str(path))
     state = content.get("splats") if isinstance(content, dict) else None
     wanted = ("means", "quats", "scales", "opacities", "sh0", "shN")
@@ -200,8 +200,8 @@ def properties(degree: int) -> list[str]:
 
 
 def ply_bytes(splats: Splats) -> bytes:
-    """A binary PLY: normals 0, f_rest channel by channel, logits of opacities, logarithms of scales, quaternions
-    wxyz."""
+    """Returns a binary PLY with normals of 0, f_rest channel by channel, logits of opacities, logarithms of scales and
+    quaternions wxyz."""
     n = len(splats.means)
     p = np.clip(splats.opacities.astype(np.float64), LEAST_OPACITY, 1 - LEAST_OPACITY)
     columns = (
@@ -219,7 +219,7 @@ def ply_bytes(splats: Splats) -> bytes:
 
 
 def glb_bytes(splats: Splats) -> bytes:
-    """A binary glTF 2.0 file. Viewers without the extension show coloured points. glTF's +y is up: rotate first."""
+    """Returns a binary glTF 2.0 file; viewers without the extension show points. Rotate first: +y is up in glTF."""
     attributes = {
         "POSITION": splats.means,
         "COLOR_0": np.concatenate([_linear(splats.base_colors), splats.opacities[:, None]], axis=1),
@@ -264,13 +264,13 @@ def glb_bytes(splats: Splats) -> bytes:
 
 
 def _linear(colors: np.ndarray) -> np.ndarray:
-    """Linear values of sRGB values 0..1 (IEC 61966-2-1): COLOR_0 is linear in glTF."""
+    """Converts sRGB values 0..1 (IEC 61966-2-1) to linear values, as glTF's COLOR_0 requires."""
     light: np.ndarray = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
     return light
 
 
 def spz_bytes(splats: Splats) -> bytes:
-    """An SPZ 3 file. Raises DataError for Gaussians beyond the range of its fixed point."""
+    """Returns an SPZ file of version 3. Raises DataError for positions beyond its fixed-point range."""
     reach = float(np.abs(splats.means).max(initial=0))
     if reach >= SPZ_REACH:
         found = f"a Gaussian lies {reach:.4g} units from 0"
@@ -284,7 +284,7 @@ def spz_bytes(splats: Splats) -> bytes:
 
 
 def fourdgs_bytes(frames: Sequence[tuple[float, Splats, np.ndarray]], seconds: float) -> bytes:
-    """A .4dgs file of `seconds` in all. Each Gaussian is shown during its frame and moves towards its slot in the next.
+    """Returns a .4dgs file of `seconds`. A Gaussian is shown during its frame and moves to its slot's next position.
 
     frames: (start in seconds, Gaussians, their slots int64 [N]), ascending from 0.
     """

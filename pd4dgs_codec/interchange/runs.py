@@ -1,4 +1,4 @@
-"""Folders that trainers of Gaussians leave behind: iterations, options, cameras, and tensors of networks, read as data.
+"""Reads output folders of Gaussian trainers as data: iterations, options, cameras and tensors of networks.
 
 A run holds `point_cloud/iteration_N` with a PLY file and perhaps networks, `cfg_args` with the options as Python wrote
 them, and `cameras.json`.
@@ -6,13 +6,13 @@ them, and `cameras.json`.
 In runs of 4DGaussians (Wu et al. 2024) and Deformable-3DGS (Yang et al. 2024) a network moves the Gaussians of
 `point_cloud.ply`: it takes their means and a time.
 
-4DGaussians (`deformation.pth` beside them): at each resolution the product of six planes over pairs of x, y, z and t,
-sampled bilinearly, gives features; those of all resolutions enter a network, whose outputs enter heads that add to
-means, logarithms of scales, quaternions, logits of opacities and harmonics. `cfg_args` says which heads are in use.
+4DGaussians (`deformation.pth` beside the PLY file): six planes over pairs of x, y, z and t, sampled bilinearly and
+multiplied, give features at each resolution. A network takes the features of all resolutions. Its heads add to means,
+logarithms of scales, quaternions, logits of opacities and harmonics; `cfg_args` says which heads are in use.
 
 Deformable-3DGS (`deform/iteration_N/deform.pth`): a network with a skip takes sines and cosines of mean and time. It
-adds to means, or turns and shifts them as a screw (6DoF), to scales and to unit quaternions. The sum stays as it is in
-the formula of the rotation matrix, which then stretches as well: https://github.com/ingra14m/Deformable-3D-Gaussians/issues/18
+adds to scales and unit quaternions, and adds to means or moves them by a screw (6DoF). The sums of quaternions are not
+normalised, so the rotation matrix also scales: https://github.com/ingra14m/Deformable-3D-Gaussians/issues/18
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ from pd4dgs_codec.interchange.splats import Splats, principal_axes, quaternions,
 from pd4dgs_codec.scene import Camera
 
 PLY = "point_cloud.ply"
-#: The most inputs and outputs of a layer: with these, a Gaussian takes a bounded time and memory.
+#: Most inputs or outputs of a layer, which bounds the time and memory of a Gaussian.
 MAX_WIDTH = 1024
 Layer = tuple[np.ndarray, np.ndarray]  #: weight float32 [outputs, inputs], bias float32 [outputs]
 
 
 def iteration(folder: Path, number: int | None = None) -> Path | None:
-    """The folder with point_cloud.ply: `folder` itself, or an iteration below it, the last if `number` is None."""
+    """Finds the folder with point_cloud.ply: `folder` itself, or iteration `number` below it (None: the last)."""
     if (folder / PLY).is_file():
         return folder
     base = folder / "point_cloud" if (folder / "point_cloud").is_dir() else folder
@@ -61,8 +61,8 @@ def run_of(place: Path) -> Path:
 
 
 def network_of(place: Path) -> Path | None:
-    """The file of the network that moves the Gaussians of an iteration: that of 4DGaussians beside them, or that of
-    Deformable-3DGS in a folder of its own. None if they stay; the file need not be there."""
+    """Returns the file, perhaps missing, of the network that moves an iteration's Gaussians, None if they are static.
+    4DGaussians writes it beside the PLY file, Deformable-3DGS into a folder of its own."""
     if any(place.glob("deformation*.pth")):
         return place / "deformation.pth"
     deform = run_of(place) / "deform"
@@ -78,17 +78,17 @@ class Config:
 
     @classmethod
     def of(cls, run: Path) -> Config:
-        """The `cfg_args` of a run."""
+        """Reads the `cfg_args` of a run."""
         path = run / "cfg_args"
         return cls(path, read_file(path).decode("utf-8", "replace") if path.is_file() else "")
 
     def get(self, name: str) -> str | None:
-        """The text of a number, a truth value or a name; None if there is none."""
+        """Returns the text of an option that is a number, a truth value or a name; None for any other."""
         found = re.search(rf"\b{name}=([-+.\w]{{1,40}})\s*[,)]", self.text)
         return found and found[1]
 
     def flag(self, name: str, usual: str | None) -> bool:
-        """A truth value. usual: the text that stands for one that is not there, None to refuse."""
+        """Returns a truth value. usual: its text if the option is missing, None to raise DataError."""
         found = self.get(name) or usual
         if found not in ("True", "False"):
             raise DataError(f"{self.path}: {name} is {found or 'missing'}, expected True or False")
@@ -96,32 +96,32 @@ class Config:
 
     @property
     def background(self) -> Color:
-        """White or black."""
+        """White if `white_background` is True, else black."""
         return WHITE if self.get("white_background") == "True" else (0.0, 0.0, 0.0)
 
 
 def read_torch(path: Path) -> Any:
-    """The content of a file of torch."""
+    """Reads a file of torch as `archives.read_tensors` does."""
     return read_tensors(read_file(path), str(path))
 
 
 @dataclass(frozen=True)
 class State:
-    """The tensors of networks by name, checked when they are taken."""
+    """Tensors of networks by name; its methods check them and raise DataError."""
 
     path: Path
     tensors: Mapping[Any, Any]
 
     @classmethod
     def read(cls, path: Path) -> State:
-        """A state dict."""
+        """Reads a state dict."""
         content = read_torch(path)
         if not isinstance(content, dict):
             raise DataError(f"{path}: holds a {type(content).__name__}, expected a dict of tensors")
         return cls(path, content)
 
     def take(self, name: str, *shape: int | None) -> np.ndarray:
-        """A tensor, float32, of this shape, where None stands for any length but 0."""
+        """Returns a tensor as float32. shape: its lengths, None for any but 0."""
         found = self.tensors.get(name)
         if not isinstance(found, np.ndarray):
             raise DataError(f"{self.path}: has no tensor {name}")
@@ -135,14 +135,14 @@ class State:
         return found.astype(np.float32)
 
     def linear(self, name: str, inputs: int | None = None, outputs: int | None = None) -> Layer:
-        """A linear layer."""
+        """Returns a linear layer. inputs, outputs: None for any number."""
         weight = self.take(f"{name}.weight", outputs, inputs)
         if max(weight.shape) > MAX_WIDTH:
             raise DataError(f"{self.path}: {name}.weight has shape {weight.shape}, expected {MAX_WIDTH} at most")
         return weight, self.take(f"{name}.bias", len(weight))
 
     def chain(self, name: str, places: Iterable[int], inputs: int, outputs: int | None = None) -> list[Layer]:
-        """The linear layers `name.place`, each with as many inputs as the one before has outputs."""
+        """Returns the linear layers `name.place`, each of which takes the outputs of the previous one."""
         layers: list[Layer] = []
         *_, last = places = list(places)
         for place in places:
@@ -152,7 +152,7 @@ class State:
 
 
 def read_cameras(path: Path) -> tuple[list[Camera], tuple[float, float, float]]:
-    """(the cameras, their mean direction up) of a cameras.json as 3D Gaussian splatting writes it."""
+    """Reads (cameras, their mean up direction) from a cameras.json of 3D Gaussian splatting. Raises DataError."""
     try:
         rows = json.loads(read_file(path))
         turns = np.array([row["rotation"] for row in rows], np.float64)
@@ -179,8 +179,7 @@ def read_cameras(path: Path) -> tuple[list[Camera], tuple[float, float, float]]:
 
 ROWS = 1 << 13  #: Gaussians moved at once: the outputs of the widest layer take 32 MiB
 MOST_LAYERS = 16  #: layers of a network, or resolutions of planes
-#: The heads of 4DGaussians by what they change, and the option that switches each off with its value in older runs,
-#: which lack it.
+#: Attribute -> (head of 4DGaussians, option that switches it off, value of the option in older runs without it).
 HEADS = {
     "means": ("pos_deform", "no_dx", "False"),
     "scales": ("scales_deform", "no_ds", None),
@@ -189,8 +188,8 @@ HEADS = {
     "sh": ("shs_deform", "no_dshs", "True"),
 }
 UNREAD = ("no_grid", "empty_voxel", "grid_pe")  #: options of 4DGaussians that no published setting uses
-THINNEST = 1e-6  #: sides of the box that the planes cover, scene units
-#: Frequencies of Deformable-3DGS: of means, of times that a network of their own takes, and of other times.
+THINNEST = 1e-6  #: least side of the box that the planes cover, scene units
+#: Octaves of Deformable-3DGS's encodings of means, of times that enter a network of their own, and of other times.
 MEAN_OCTAVES, NET_OCTAVES, TIME_OCTAVES = 10, 6, 10
 AXIS_BIAS = np.float32(1e-5)  #: added to unit vectors of screws by Deformable-3DGS
 
@@ -199,8 +198,8 @@ Move = Callable[[Parts, float], Parts]
 
 
 def read_deformed(folder: Path) -> tuple[Callable[[float], Splats], Color] | None:
-    """(time 0..1 -> Gaussians, background) of a run's last iteration, or of the iteration at `folder`; None for other
-    folders. Raises DataError."""
+    """Reads a run's last iteration, or the iteration at `folder`, as (function of time 0..1 -> Gaussians, background).
+    Returns None for folders without a network that moves Gaussians. Raises DataError."""
     place = iteration(folder)
     network = network_of(place) if place else None
     if place is None or network is None:
@@ -219,7 +218,7 @@ def read_deformed(folder: Path) -> tuple[Callable[[float], Splats], Color] | Non
 
 
 def _moved(where: str, rest: Parts, move: Move, t: float) -> Splats:
-    """The Gaussians at a time, some rows after the others."""
+    """Moves the Gaussians to time t, ROWS at a time."""
     blocks = []
     with np.errstate(over="ignore", invalid="ignore", divide="ignore", under="ignore"):
         for start in range(0, len(rest["means"]), ROWS):
@@ -230,14 +229,14 @@ def _moved(where: str, rest: Parts, move: Move, t: float) -> Splats:
 
 
 def _through(layers: list[Layer], values: np.ndarray) -> np.ndarray:
-    """Linear layers with a ReLU between them."""
+    """Applies linear layers with a ReLU between them."""
     for i, (weight, bias) in enumerate(layers):
         values = (np.maximum(values, 0) if i else values) @ weight.T + bias
     return values
 
 
 def _places(state: State, name: str) -> list[int]:
-    """Numbers of the linear layers of a sequence, of which every second one is a ReLU."""
+    """Returns the numbers of the linear layers in a sequence where every second layer is a ReLU."""
     return [i for i in range(0, 2 * MOST_LAYERS, 2) if f"{name}.{i}.weight" in state.tensors] or [0]
 
 
@@ -245,7 +244,7 @@ def _places(state: State, name: str) -> list[int]:
 
 
 def _hexplane_move(state: State, config: Config, rest: Parts) -> Move:
-    """The network of 4DGaussians, for Gaussians at rest."""
+    """Reads the network of 4DGaussians. Its Move takes parameters with the shapes of `rest` and activates them."""
     for name in UNREAD:
         if (value := config.get(name)) not in (None, "False", "0"):
             raise DataError(f"{config.path}: has {name}={value}, expected a model without")
@@ -278,7 +277,7 @@ def _hexplane_move(state: State, config: Config, rest: Parts) -> Move:
 
 
 def _field(state: State, name: str) -> tuple[Callable[[np.ndarray, float], np.ndarray], int]:
-    """(means [n, 3] and a time -> features [n, F], those of each resolution side by side; F)."""
+    """Returns (function of means [n, 3] and a time -> features [n, F] of all resolutions side by side, F)."""
     count = sum(f"{name}.grids.{i}.0" in state.tensors for i in range(MOST_LAYERS))
     levels = [_planes(state, f"{name}.grids.{i}") for i in range(max(count, 1))]
     corner, other = state.take(f"{name}.aabb", 2, 3)
@@ -286,7 +285,7 @@ def _field(state: State, name: str) -> tuple[Callable[[np.ndarray, float], np.nd
         raise DataError(f"{state.path}: {name}.aabb is flat, expected sides over {THINNEST:g}")
 
     def field(means: np.ndarray, t: float) -> np.ndarray:
-        # the first corner is at -1; times are 0..1 on an axis from -1 to 1
+        # the first corner is at -1; times 0..1 are not rescaled, so they fill half of their axis
         places = (means - corner) * (2 / (other - corner)) - 1
         axes = [*places.T, np.full(len(means), t, np.float32)]
         features = []
@@ -299,7 +298,7 @@ def _field(state: State, name: str) -> tuple[Callable[[np.ndarray, float], np.nd
 
 
 def _planes(state: State, name: str) -> list[np.ndarray]:
-    """The planes [rows, columns, features] of a resolution, over xy, xz, xt, yz, yt and zt; the first is the column."""
+    """Returns one resolution's planes [rows, columns, features] over xy, xz, xt, yz, yt and zt; columns come first."""
     planes = [state.take(f"{name}.0", 1, None, None, None)]
     features = planes[0].shape[1]
     if features > MAX_WIDTH:
@@ -309,7 +308,7 @@ def _planes(state: State, name: str) -> list[np.ndarray]:
 
 
 def _bilinear(plane: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarray:
-    """A plane [rows, columns, F] at coordinates [n] from -1, its first cell, to 1, its last; beyond, its border."""
+    """Samples a plane [rows, columns, F] at coordinates [n] from -1 (first cell) to 1 (last), clamped to its border."""
     ends = []
     for place, size in ((down, plane.shape[0]), (across, plane.shape[1])):
         cell = np.clip((place + 1) / 2 * (size - 1), 0, size - 1)
@@ -331,7 +330,7 @@ def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def _positional_move(state: State) -> Move:
-    """The network of Deformable-3DGS, for Gaussians at rest with their scales and unit quaternions."""
+    """Reads the network of Deformable-3DGS. Its Move takes activated Gaussians with unit quaternions."""
     has_net = "timenet.0.weight" in state.tensors  # the option is_blender
     octaves = NET_OCTAVES if has_net else TIME_OCTAVES
     timenet = state.chain("timenet", (0, 2), 1 + 2 * octaves) if has_net else []
@@ -365,13 +364,13 @@ def _positional_move(state: State) -> Move:
 
 
 def _waves(values: np.ndarray, octaves: int) -> np.ndarray:
-    """[n, d (1 + 2 octaves)]: values [n, d], and per octave the sines and cosines of values times 1, 2, 4, ..."""
+    """Returns [n, d (1 + 2 octaves)]: values [n, d] and, per octave, sines and cosines of values times 1, 2, 4, ..."""
     waves = [wave(values * np.float32(2**i)) for i in range(octaves) for wave in (np.sin, np.cos)]
     return np.concatenate([values, *waves], axis=1)
 
 
 def _screwed(means: np.ndarray, axis: np.ndarray, way: np.ndarray) -> np.ndarray:
-    """Means [n, 3] turned and shifted by the exponential of a screw, whose angle is the length of `axis` [n, 3]."""
+    """Moves means [n, 3] by the exponential of screws (axis, way), both [n, 3]. The angle is the length of `axis`."""
     angle = np.linalg.norm(axis, axis=1, keepdims=True)
     axis, way = axis / angle + AXIS_BIAS, way / angle + AXIS_BIAS
 

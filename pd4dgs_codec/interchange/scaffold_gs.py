@@ -1,10 +1,10 @@
-"""Checkpoints of Scaffold-GS (Lu et al. 2024) as a scene with layer 0 alone.
+"""Reads a checkpoint of Scaffold-GS (Lu et al. 2024) as a scene with layer 0 only.
 
 A folder `point_cloud/iteration_N` holds the anchors in `point_cloud.ply` and the decoders in `opacity_mlp.pt`,
-`cov_mlp.pt` and `color_mlp.pt` (TorchScript) or in `checkpoints.pth` (a dict of state dicts). Its formulas equal clause
-13.4 if no decoder takes the distance and there is no feature bank. An appearance embedding enters the first layer of
-the colour decoder linearly, so for one picture it is part of the bias. Two folders up, `cfg_args` and `cameras.json`
-give the voxel size, the background and the cameras; they are parsed as text.
+`cov_mlp.pt` and `color_mlp.pt` (TorchScript) or in `checkpoints.pth` (a dict of state dicts). The formulas of
+Scaffold-GS equal clause 13.4 if no decoder takes the distance and there is no feature bank. An appearance embedding
+enters the colour decoder's first layer linearly, so for one picture it is part of the bias. Two folders up, `cfg_args`
+and `cameras.json` give voxel size, background and cameras; both are parsed as text.
 """
 
 import re
@@ -28,12 +28,12 @@ DECODERS = {"opacity": "opacity_mlp", "covariance": "cov_mlp", "color": "color_m
 #: Files and keys of feature banks, which the format cannot hold, and of the appearance embedding.
 BANKS = ("feature_bank_mlp.pt", "mlp_feature_bank", "feature_bank_mlp")
 EMBEDDING = "embedding_appearance.pt"
-#: The near plane of its rasteriser, and the far plane of its cameras.
+#: Near plane of Scaffold-GS's rasteriser and far plane of its cameras, scene units.
 NEAR, FAR = 0.2, 100.0
-UP = (0.0, -1.0, 0.0)  #: of a run without cameras.json
-#: Tolerance of anchors off the grid: this share of a voxel, plus units in the last place of the coordinate.
+UP = (0.0, -1.0, 0.0)  #: up direction of a run without cameras.json
+#: Anchors may lie OFF_GRID voxels plus ULPS units in the last place of the coordinate off the grid.
 OFF_GRID, ULPS = 1e-3, 8
-DEPTH = 4  #: of modules in modules
+DEPTH = 4  #: most levels of nested modules
 #: The layers of each decoder, as TorchScript names them.
 LAYERS = {
     name: ("Linear", "ReLU", "Linear", *end)
@@ -45,8 +45,8 @@ LAYERS = {
 class Choices:
     """Options of the import.
 
-    appearance: the picture with the embedding to use, or None. voxel_size: scene units, None to find it. iteration:
-    None for the last.
+    appearance: index of the picture whose embedding is used, or None. voxel_size: scene units, None to derive it.
+    iteration: None for the last.
     """
 
     appearance: int | None = None
@@ -55,7 +55,7 @@ class Choices:
 
 
 def read_scaffold_gs(folder: Path, choices: Choices) -> Scene:
-    """The scene, unquantised but for its anchors, which lie on the grid. Raises DataError for unsupported models."""
+    """Reads a scene with anchors in voxels and all else unquantised. Raises DataError for unsupported models."""
     place = _iteration(folder, choices.iteration)
     run = run_of(place)
     config = Config.of(run)
@@ -89,7 +89,7 @@ def read_scaffold_gs(folder: Path, choices: Choices) -> Scene:
 
 
 def _iteration(folder: Path, number: int | None) -> Path:
-    """The folder of the iteration."""
+    """Finds the folder of the iteration. Raises DataError unless it holds static Gaussians."""
     if not folder.is_dir():
         raise DataError(f"{folder}: found {'a file' if folder.exists() else 'nothing'}, expected a folder")
     place = iteration(folder, number)
@@ -103,7 +103,7 @@ def _iteration(folder: Path, number: int | None) -> Path:
 
 
 def _voxel_size(config: Config) -> float:
-    """Scene units, 0 if unknown."""
+    """Returns the voxel size in scene units, 0 if unknown."""
     found = config.get("voxel_size") or "0"
     try:
         return float(found)
@@ -112,7 +112,7 @@ def _voxel_size(config: Config) -> float:
 
 
 def _columns(path: Path) -> dict[str, np.ndarray]:
-    """anchor [N, 3], feature [N, F], scaling_log [N, 6], offset [N, K, 3], float32 and finite."""
+    """Reads anchor [N, 3], feature [N, F], scaling_log [N, 6], offset [N, K, 3], float32 and finite."""
     vertices = read_vertices(path)
     names = set(vertices.dtype.names or ())
 
@@ -144,7 +144,7 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
 
 
 def _decoders(place: Path) -> tuple[dict[str, Any], np.ndarray | None]:
-    """(the content of each decoder's file or key, the appearance embedding [pictures, A] or None)."""
+    """Reads (content of each decoder's file or key, appearance embedding [pictures, A] or None)."""
     united = place / "checkpoints.pth"
     if united.is_file():
         content = read_torch(united)
@@ -170,7 +170,7 @@ def _decoders(place: Path) -> tuple[dict[str, Any], np.ndarray | None]:
 
 
 def _tensors(content: Any) -> dict[str, np.ndarray]:
-    """The tensors in nested modules and dicts under dotted names, as in a state dict, down to DEPTH."""
+    """Collects the tensors of modules and dicts nested up to DEPTH deep, under dotted names as in a state dict."""
     found: dict[str, np.ndarray] = {}
     waiting = [("", content)]
     while waiting:
@@ -186,7 +186,7 @@ def _tensors(content: Any) -> dict[str, np.ndarray]:
 def _network(
     name: str, decoder: Any, path: Path, widths: Widths, embedding: np.ndarray | None, choices: Choices
 ) -> Network:
-    """Two linear layers with a ReLU between them, and the embedding of the chosen picture in the first bias."""
+    """Reads a decoder's two linear layers and adds the embedding of the chosen picture to the first bias."""
     if isinstance(decoder, Module):  # state dicts do not name the kinds of layers
         parts = [part for key, part in decoder.members.items() if key.isdigit() and isinstance(part, Module)]
         kinds, usual_kinds = ", ".join(part.kind for part in parts), ", ".join(LAYERS[name])
@@ -214,7 +214,7 @@ def _network(
 
 
 def _grid(anchor: np.ndarray, path: Path) -> float:
-    """The largest voxel size that divides all coordinates."""
+    """Finds the largest voxel size of which all coordinates are multiples."""
     values = np.unique(np.abs(anchor.astype(np.float64)))
     tolerance = ULPS * np.spacing(np.abs(anchor).max()).astype(np.float64)
     gaps = np.diff(np.concatenate([[0.0], values]))
@@ -231,7 +231,7 @@ def _grid(anchor: np.ndarray, path: Path) -> float:
 
 
 def _cells(anchor: np.ndarray, voxel: float, path: Path) -> np.ndarray:
-    """int32 [N, 3]: the anchors in voxels. Raises DataError if they are not multiples of `voxel`."""
+    """Returns the anchors in voxels, int32 [N, 3]. Raises DataError if they are not multiples of `voxel`."""
     exact = anchor.astype(np.float64) / voxel
     cells = np.round(exact)
     if (most := np.abs(cells).max()) > MAX_VOXEL:

@@ -1,8 +1,7 @@
-"""Explicit Gaussians as in 3D Gaussian splatting: only the colour depends on the direction, in spherical harmonics.
+"""Explicit Gaussians as in 3D Gaussian splatting: only colour depends on the view direction, by spherical harmonics.
 
-The real spherical harmonics and their signs are those of the reference implementation of 3D Gaussian splatting (Kerbl
-et al. 2023), which PLY, SPZ and KHR_gaussian_splatting share: a colour is 0.5 + sum c_j Y_j(d), cut off below at 0, d
-the unit vector from the eye to the mean.
+Real harmonics and their signs are those of its reference implementation (Kerbl et al. 2023), as in PLY, SPZ and
+KHR_gaussian_splatting. A colour is max(0, 0.5 + sum c_j Y_j(d)), d the unit vector from the eye to the mean.
 """
 
 from __future__ import annotations
@@ -35,11 +34,11 @@ class Splats:
 
     @property
     def degree(self) -> int:
-        """Of the harmonics, 0 to 3."""
+        """Degree of the harmonics, 0 to 3."""
         return int(np.sqrt(self.sh.shape[1])) - 1
 
     def colors(self, eye: np.ndarray) -> np.ndarray:
-        """float32 [N, 3] >= 0 as an eye at [3], world, sees them."""
+        """Returns the colours float32 [N, 3] >= 0 seen from `eye` [3], world."""
         basis = harmonics(unit(self.means - eye.astype(np.float32)), self.degree)
         return np.asarray(np.maximum(np.einsum("nj,njc->nc", basis, self.sh) + np.float32(0.5), 0))
 
@@ -50,20 +49,20 @@ class Splats:
 
     @property
     def rest(self) -> np.ndarray:
-        """float32 [N, 3 ((degree + 1)^2 - 1)]: the other coefficients, channel by channel, as files have them."""
+        """float32 [N, 3 ((degree + 1)^2 - 1)]: coefficients from degree 1 on, channel by channel as in files."""
         return np.asarray(self.sh[:, 1:].transpose(0, 2, 1).reshape(len(self.sh), 3 * (self.sh.shape[1] - 1)))
 
     def taken(self, rows: np.ndarray) -> Splats:
-        """The Gaussians `rows`."""
+        """Returns the Gaussians `rows`, indices or a mask."""
         return Splats(*(part[rows] for part in vars(self).values()))
 
     def scaled(self, factor: float) -> Splats:
-        """With all lengths times `factor`."""
+        """Returns the Gaussians with all lengths multiplied by `factor`."""
         return replace(self, means=self.means * np.float32(factor), scales=self.scales * np.float32(factor))
 
 
 def picture(splats: Splats, camera: Camera, background: tuple[float, float, float], near: float = 0.01) -> np.ndarray:
-    """float32 [H, W, 3] in 0..1 of the Gaussians by our rasteriser. near: scene units."""
+    """Draws the Gaussians by our rasteriser, float32 [H, W, 3] in 0..1. near: scene units."""
     colors = splats.colors(camera_eye(camera))
     image, _ = draw(
         splats.means, splats.quats, splats.scales, splats.opacities, colors, camera, background, near_plane=near
@@ -72,13 +71,13 @@ def picture(splats: Splats, camera: Camera, background: tuple[float, float, floa
 
 
 def camera_eye(camera: Camera) -> np.ndarray:
-    """float64 [3]: the centre of a camera, world."""
+    """Returns the centre of a camera, float64 [3], world."""
     viewmat = camera.viewmat.astype(np.float64)
     return np.asarray(-viewmat[:3, :3].T @ viewmat[:3, 3])
 
 
 def looking(eye: np.ndarray, ahead: np.ndarray, up: np.ndarray, like: Camera) -> Camera:
-    """The camera `like` at `eye` [3], looking along the unit vector `ahead` [3]."""
+    """Moves the camera `like` to `eye` [3], world, and turns it along the unit vector `ahead` [3], with `up` [3] up."""
     right = np.cross(ahead, up)
     if np.linalg.norm(right) < 1e-6:  # straight up or down: any roll will do
         right = np.cross(ahead, np.roll(ahead, 1) + np.array([1e-3, 0, 0]))
@@ -90,7 +89,7 @@ def looking(eye: np.ndarray, ahead: np.ndarray, up: np.ndarray, like: Camera) ->
 
 
 def spread(items: Sequence[T], count: int) -> tuple[T, ...]:
-    """`count` of the items, evenly spaced in their order; all of them if there are fewer."""
+    """Picks `count` items, evenly spaced in their order, or all if there are fewer."""
     rows = np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int))
     return tuple(items[i] for i in rows)
 
@@ -103,13 +102,13 @@ def sphere(count: int) -> np.ndarray:
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    """Vectors [..., d] divided by their length; a zero stays one."""
+    """Divides vectors [..., d] by their length; zero vectors stay zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return np.asarray(vectors / np.maximum(length, np.finfo(vectors.dtype).tiny))
 
 
 def harmonics(directions: np.ndarray, degree: int) -> np.ndarray:
-    """The first (degree + 1)^2 real harmonics [..., j] at unit vectors [..., 3], degree 0 to 3, of the same dtype."""
+    """Evaluates (degree + 1)^2 real harmonics [..., j], degree 0 to 3, at unit vectors [..., 3] in their dtype."""
     x, y, z = np.moveaxis(directions, -1, 0)
     rows = [np.full_like(x, SH_C0)]
     if degree >= 1:
@@ -133,7 +132,7 @@ def harmonics(directions: np.ndarray, degree: int) -> np.ndarray:
 
 
 def quaternions(matrices: np.ndarray) -> np.ndarray:
-    """Unit quaternions [n, 4] wxyz of rotations [n, 3, 3]: of the four formulas the one that divides by the most."""
+    """Converts rotations [n, 3, 3] to unit quaternions [n, 4] wxyz, dividing by the component of largest magnitude."""
     m = matrices
     trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
     diagonal = np.stack([trace, m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]], axis=1)
@@ -147,7 +146,8 @@ def quaternions(matrices: np.ndarray) -> np.ndarray:
 
 
 def principal_axes(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(standard deviations [n, 3], rotations [n, 3, 3] whose columns are their axes); NaN where there are none."""
+    """Returns (standard deviations [n, 3], NaN for a covariance that is not finite; rotations [n, 3, 3], axes as
+    columns) of covariances [n, 3, 3]."""
     finite = np.isfinite(covariances).all(axis=(1, 2))
     values, axes = np.linalg.eigh(np.where(finite[:, None, None], covariances, np.eye(3)))
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]

@@ -1,13 +1,13 @@
-"""Pictures of other programs' Gaussians over time as a dataset: the source `teacher:PATH[?key=value&...]`.
+"""Renders other programs' Gaussians over time into a dataset: the source `teacher:PATH[?key=value&...]`.
 
 PATH is a folder of PLY or SPZ files, one per frame, in the order of the last number in their names, or one such file; a
 `.4dgs` file; a static gsplat checkpoint (`.pt`, `.ckpt`); a run of 4DGaussians or Deformable-3DGS or one of its
 `point_cloud/iteration_N`; or `module:function`, called with t in 0..1. The function returns means, quats (wxyz),
 scales, opacities and either colors or sh, as a mapping or as attributes, numpy arrays or tensors.
 
-Keys: cameras=SOURCE takes the training cameras of a dataset and their times; otherwise views=N cameras (200) of
-size=WxH (400x400) stand around the Gaussians, or as a `cameras.json` beside them says. fps=F (30) is the frame rate of
-a folder, background=black|white|R,G,B the background (that of a run, else black), up=X,Y,Z (0,-1,0) the direction up.
+Keys: cameras=SOURCE uses the training cameras of a dataset and their times. Otherwise views=N cameras (200) of
+size=WxH pixels (400x400) surround the Gaussians; a `cameras.json` beside them gives at most N cameras instead. fps=F
+(30): frame rate of a folder; background=black|white|R,G,B (a run's, else black); up=X,Y,Z (0,-1,0): up direction.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ from pd4dgs_codec.scene import Camera
 
 PREFIX = "teacher:"
 FRAME_SUFFIXES = (".ply", ".spz")
-#: The results of a function, with colors instead of sh if it has no harmonics.
+#: Keys of a function's result, which has colors instead of sh if there are no harmonics.
 PARTS = ("means", "quats", "scales", "opacities", "sh")
-#: Fainter Gaussians give no anchors, and do not count for the extent of the scene.
+#: Gaussians of lower opacity give no initial anchors and do not count towards the extent of the scene.
 SOLID = 0.1
 POINTS = 100_000  #: most points that the initial anchors are drawn from
 FIELD_OF_VIEW = math.radians(50)
@@ -50,14 +50,14 @@ FIELD_OF_VIEW = math.radians(50)
 #: their elevation.
 DISTANCE, LOWEST = 2.6, -0.35
 MIDDLE = 0.5  #: the time of the initial anchors
-BOX_TIMES = 5  #: times that the box covers
-#: Times of cameras without any advance by this share, so that each stretch of cameras covers the whole time.
+BOX_TIMES = 5  #: number of times whose Gaussians the box encloses
+#: Consecutive cameras without times are this share of the duration apart, so that few cameras cover all of it.
 GOLDEN = (5**0.5 - 1) / 2
 EXAMPLES = {
     "cameras": "cameras=FOLDER", "views": "views=200, 2 to 100000", "size": "size=400x400, each 8 to 8192",
     "fps": "fps=30", "up": "up=0,-1,0", "background": "background=white or background=0.5,0.5,0.5",
 }  # fmt: skip
-#: Of a stream in a .4dgs file: four bytes, channels, elements, bytes that follow.
+#: Header of a stream in a .4dgs file: four bytes, channels, elements, bytes that follow.
 STREAM = struct.Struct("<4xBIQ")
 Triple = tuple[float, float, float]
 
@@ -75,7 +75,7 @@ class Options:
 
 
 def load_source(source: str, *, downscale: int = 1, holdout: int = 8, background: Triple | None = None) -> Dataset:
-    """`data.dataset.load` for every source, including `teacher:`. Raises DataError."""
+    """Loads a `teacher:` source, or any other as `data.dataset.load` does. Raises DataError."""
     if not source.startswith(PREFIX):
         return load(source, downscale=downscale, holdout=holdout, background=background)
     place, options = _parsed(source)
@@ -87,14 +87,14 @@ def load_source(source: str, *, downscale: int = 1, holdout: int = 8, background
 
 
 def _like(source: str, teacher: Teacher, data: Dataset) -> Dataset:
-    """The dataset with the teacher's pictures as training pictures; its held-out ones stay."""
+    """Replaces the training pictures of a dataset by the teacher's; the held-out pictures stay."""
     poses = [(view.camera, view.time) for view in data.train]
     train = _pictures(teacher, poses, data.background, data.near)
     return replace(data, name=source, train=tuple(train), points=_points(teacher, _solid(source, teacher, MIDDLE)))
 
 
 def _around(source: str, place: Path, teacher: Teacher, options: Options, downscale: int, holdout: int) -> Dataset:
-    """Cameras around the teacher, every holdout-th of them held out."""
+    """Returns the teacher's pictures by `_cameras` as a dataset, every holdout-th picture held out."""
     solid = _solid(source, teacher, MIDDLE)
     cameras, up = _cameras(place, teacher.splats(teacher.nearest(MIDDLE)).means[solid], options, downscale)
     still = teacher.times is not None and len(teacher.times) == 1
@@ -116,7 +116,7 @@ def _around(source: str, place: Path, teacher: Teacher, options: Options, downsc
 
 
 def _solid(source: str, teacher: Teacher, t: float) -> np.ndarray:
-    """Rows of the Gaussians at a time that are not faint."""
+    """Returns the rows of the Gaussians at time t whose opacity is at least SOLID."""
     rows = np.flatnonzero(teacher.splats(teacher.nearest(t)).opacities >= SOLID)
     if not len(rows):
         raise DataError(f"{source}: no Gaussian is as opaque as {SOLID:g} at {t:g}, expected one at least")
@@ -124,13 +124,13 @@ def _solid(source: str, teacher: Teacher, t: float) -> np.ndarray:
 
 
 def _points(teacher: Teacher, solid: np.ndarray) -> np.ndarray:
-    """float32 [M, 3]: the means of at most POINTS of these rows."""
+    """Returns the means float32 [M, 3] of at most POINTS of the rows `solid` at time MIDDLE."""
     rows = solid if len(solid) <= POINTS else solid[np.random.default_rng(0).permutation(len(solid))[:POINTS]]
     return teacher.splats(teacher.nearest(MIDDLE)).taken(rows).means
 
 
 def _pictures(teacher: Teacher, poses: Sequence[tuple[Camera, float]], background: Triple, near: float) -> list[View]:
-    """The teacher seen by each camera at the known time next to its own; each time is read once."""
+    """Draws the teacher for each pose at the known time nearest to the pose's, in order of time: each is read once."""
     views: dict[int, View] = {}
     for i in sorted(range(len(poses)), key=lambda i: poses[i][1]):
         camera, t = poses[i][0], teacher.nearest(poses[i][1])
@@ -140,7 +140,7 @@ def _pictures(teacher: Teacher, poses: Sequence[tuple[Camera, float]], backgroun
 
 
 def _parsed(source: str) -> tuple[str, Options]:
-    """The place and the options of `teacher:place?key=value&...`."""
+    """Splits `teacher:place?key=value&...` into place and options."""
     place, values = split_options(source.removeprefix(PREFIX), source, _value, EXAMPLES)
     if not place:
         raise DataError(f"{source}: names no teacher; expected {PREFIX}FOLDER, {PREFIX}FILE or {PREFIX}module:function")
@@ -166,7 +166,7 @@ def _value(key: str, text: str) -> Any:
 
 
 def _cameras(place: Path, points: np.ndarray, options: Options, downscale: int) -> tuple[list[Camera], Triple]:
-    """The cameras of a cameras.json beside the Gaussians, else cameras around them, and the direction up."""
+    """Returns (cameras of a cameras.json beside the Gaussians, else cameras around `points` [n, 3]; up direction)."""
     beside = next((p / "cameras.json" for p in (place, *place.parents[:2]) if (p / "cameras.json").is_file()), None)
     if beside is not None:
         cameras, up = read_cameras(beside)
@@ -192,8 +192,8 @@ def _cameras(place: Path, points: np.ndarray, options: Options, downscale: int) 
 class Teacher:
     """A model that gives Gaussians at a time.
 
-    splats: normalised time -> Gaussians. times: the times that it knows, None for all. seconds: from the first to the
-    last. background: the one that it was trained with.
+    splats: normalised time -> Gaussians. times: the known times, None if it knows all. seconds: from the first time to
+    the last. background: of its training.
     """
 
     splats: Callable[[float], Splats]
@@ -202,12 +202,12 @@ class Teacher:
     background: Triple = (0.0, 0.0, 0.0)
 
     def nearest(self, t: float) -> float:
-        """The known time next to t."""
+        """Returns the known time nearest to t."""
         return t if self.times is None else min(self.times, key=lambda known: abs(known - t))
 
 
 def read_model(place: str, fps: float) -> Teacher:
-    """The teacher at a path, or `module:function`. fps: frames per second of a folder. Raises DataError."""
+    """Reads the teacher at a path or `module:function`. fps: frames per second of a folder. Raises DataError."""
     path = Path(place)
     if path.is_dir():
         run = read_deformed(path)
@@ -225,7 +225,7 @@ def read_model(place: str, fps: float) -> Teacher:
 
 
 def _folder(folder: Path, fps: float) -> Teacher:
-    """One file per frame."""
+    """Reads a folder of one file per frame, in the order of the last number in the names."""
     paths = max(([p for p in folder.iterdir() if p.suffix.lower() == suffix] for suffix in FRAME_SUFFIXES), key=len)
     if not paths:
         raise DataError(f"{folder}: holds no file that ends in {' or '.join(FRAME_SUFFIXES)}, expected one per frame")
@@ -238,14 +238,14 @@ def _folder(folder: Path, fps: float) -> Teacher:
 
 
 def _fourdgs(path: Path) -> Teacher:
-    """A .4dgs file over its whole time."""
+    """Reads a .4dgs file."""
     fourdgs = required("fourdgs", EXTRA, ".4dgs files")
     data = read_file(path)
     most = FREE_BYTES + INFLATES * len(data)
     if _numbers(data, most) > most:
         raise DataError(f"{path}: holds more than {most:,} numbers in {len(data):,} bytes")
     try:
-        with np.errstate(all="ignore"):  # `checked` drops what is not finite
+        with np.errstate(all="ignore"):  # `checked` drops Gaussians that are not finite
             scene = fourdgs.read(data)
     except (fourdgs.FourdgsError, ValueError, MemoryError, OSError) as error:
         raise DataError(f"{path}: fourdgs cannot read it: {one_line(str(error), 160)}") from None
@@ -272,9 +272,9 @@ def _fourdgs(path: Path) -> Teacher:
 
 
 def _numbers(data: bytes, most: int) -> int:
-    """How many numbers a .4dgs file says it holds, up to where it is damaged; beyond `most` perhaps fewer.
+    """Counts the numbers that a .4dgs file declares before any damage. It stops counting once `most` is exceeded.
 
-    A few bytes may say that a number is repeated 2^26 times, in each stream, and fourdgs has no limit for all of them.
+    A few bytes can declare that a number repeats 2^26 times in each stream, and fourdgs does not limit the total.
     """
     names = ("opcode", "records", "serialization", "stream_reader", "exceptions")
     op, records, files, reader, errors = (importlib.import_module(f"fourdgs.{name}") for name in names)
@@ -296,7 +296,7 @@ def _numbers(data: bytes, most: int) -> int:
 
 
 def _function(module: str, name: str) -> Callable[[float], Splats]:
-    """The user's own function. Its module is searched in the working folder first."""
+    """Imports the user's own function; its module is searched in the working folder first."""
     with contextlib.ExitStack() as stack:
         if (here := os.getcwd()) not in sys.path:
             sys.path.insert(0, here)
