@@ -1188,9 +1188,9 @@ def decode_positions(data, count, known=None):
     return cells
 
 
-# 10.2 Counts: "two varints, at most 2^26 each: s, how many of its nodes have one child, and e, how many children there
-# are beyond one or two each" "s ≤ N, e ≤ 6·(N − s) and 2·N − s + e ≤ n MUST hold, and after level 1 there MUST be n
-# nodes, else Malformed."
+# 10.2 Counts: "two varints, at most 2^26 each: s, the number of its nodes with one child, and e, the sum of the numbers
+# of children less 2 over its other nodes" "s ≤ N, e ≤ 6·(N − s) and 2·N − s + e ≤ n MUST hold, and after level 1 there
+# MUST be n nodes, else Malformed."
 def read_levels(reader, depth, count):
     """Per level, from the root's on: (number of nodes, number of nodes with one child)."""
     levels, nodes = [], 1
@@ -1209,8 +1209,8 @@ def read_levels(reader, depth, count):
     return levels
 
 
-# 10.3 Channels: "if N < n, the numbers of children less 1 of the nodes whose parent has one child; then those of the
-# other nodes, of which the root is one" "the child's number of each node with one child"
+# 10.3 Channels: "if N < n, one channel of the numbers of children less 1 of the nodes whose parent has one child, then
+# one channel of the same numbers of the other nodes, the root included" "the child c of each node with one child"
 def channel_lengths(levels, count):
     lengths, only = [], 0
     for nodes, single in levels:
@@ -1219,14 +1219,14 @@ def channel_lengths(levels, count):
     return lengths
 
 
-# 10.3 Channels: "Symbols MUST lie in 0..7, an index within its list, else Malformed."
+# 10.3 Channels: "Symbols of item 1 MUST lie in 0..7, indices within their list, else Malformed."
 def within(channel, size):
     need(all(0 <= k < size for k in channel), f"a symbol of the octree outside 0..{size - 1}")
     return iter(channel)
 
 
-# 10.3 Channels: "The numbers of children MUST be those of 10.2, else Malformed: at each level s of them are 1 and their
-# sum is the next level's number of nodes, and over all levels as many are 2, 3, .. 7 as stated."
+# 10.3 Channels: "The numbers of children MUST agree with 10.2, else Malformed: at each level s of them are 1 and their
+# sum is the number of nodes of the next level, and over all levels as many are 2, 3, .. 7 as stated."
 def grow(levels, channels, count, sizes):
     """The offsets (x, y, z) of the anchors, in Morton order."""
     steps, only_child = [], [False]
