@@ -1,5 +1,5 @@
-"""Scenes to pictures, without torch: numpy arrays in, Gaussians and pictures out, by numba kernels on the CPU.
+"""Draws scenes on the CPU by numba kernels, without torch: numpy arrays in, Gaussians and pictures out.
 
-`player.Player` draws a decoded scene, `rasteriser.draw` any Gaussians. Import `pd4dgs_codec.threads` first where the
-number of threads matters.
+`player.Player` draws a decoded scene, `rasteriser.draw` any Gaussians. `pd4dgs_codec.threads.configure` sets the number
+of threads.
 """

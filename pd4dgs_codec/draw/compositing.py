@@ -1,10 +1,10 @@
-"""Compositing of projected and binned Gaussians: numba kernels.
+"""Numba kernels that composite projected Gaussians, tile by tile.
 
-`composite` draws; `composite_backward` fills one gradient slot per pair of a Gaussian and a tile. There are no atomics:
-results do not depend on the number of threads. Inside a tile the outer loop walks the Gaussians, the inner loop the
-blocks of 8 pixels in a row that the Gaussian's ellipse touches and that are not finished. A tile has 64 blocks, so a
-set of blocks is one 64-bit word, and a small Gaussian costs few lanes. Where vectors have 16 lanes, a block is two
-rows, named by the first; the picture has the same bits.
+`composite` draws. `composite_backward` fills one gradient slot per pair of a Gaussian and a tile, without atomics, so
+that results do not depend on the number of threads. In a tile the outer loop runs over the Gaussians, the inner loop
+over the unfinished blocks of 8 pixels in a row that the Gaussian's ellipse touches, so that a small Gaussian costs few
+lanes. A tile has 64 blocks: one 64-bit word is a set of blocks. With vectors of 16 lanes a block is two rows, named by
+the first; the picture has the same bits.
 """
 
 from typing import Any
@@ -54,23 +54,23 @@ from pd4dgs_codec.draw.simd import wide_splat as splat
 
 T_MIN = 1e-4  #: a pixel is finished when its transmittance would fall to this
 _COLUMNS = TILE_WIDTH // LANES
-_ROWS = WIDE // LANES  #: of pixels in a block
+_ROWS = WIDE // LANES  #: rows of pixels in a block
 _FIRST_ROWS = np.uint64(0xFFFFFFFFFFFFFFFF // (2**_ROWS - 1))  #: a bit for the first row of each block
 _BLOCKS = _COLUMNS * TILE_HEIGHT
 _STATE = 5  #: vectors of state per block
 _F = np.float32
-_ROW, _ROW64 = np.arange(WIDE, dtype=_F), np.arange(WIDE, dtype=np.float64)  #: constants of kernels
+_ROW, _ROW64 = np.arange(WIDE, dtype=_F), np.arange(WIDE, dtype=np.float64)  #: row numbers 0 .. WIDE - 1
 _LANE = _ROW % LANES
-_COLORS = 3  #: channels
+_COLORS = 3  #: colour channels
 
 Bits = Any  #: a uint64 with one bit per block of a tile, at column * TILE_HEIGHT + row
 
 
 @kernel()
 def _coverage(geom: Array, g: int, left: int, top: int) -> Bits:
-    """The blocks of the tile that Gaussian g (an offset into flat geom) may touch.
+    """Returns the blocks of the tile that Gaussian g (an offset into flat geom) may touch.
 
-    From the chord of each pixel row, WIDE rows at a time, slightly too wide to cover float32 rounding.
+    Each pixel row's chord through the ellipse is taken slightly too wide, to cover float32 rounding.
     """
     shear = geom[g + K]
     dy = top + 0.5 - geom[g + Y]
@@ -97,8 +97,8 @@ def _coverage(geom: Array, g: int, left: int, top: int) -> Bits:
 
 @kernel(inline=True)
 def _tabulate(ts: Array, rs: Array, rests: Array, geom: Array, g: int, left: int, top: int) -> None:
-    """Fills, for Gaussian g, float32 ts = t at the first pixel of each block of 8, and per row of the tile rs = r and
-    rests = q - r^2."""
+    """Fills float32 tables of Gaussian g: ts, t at the first pixel of each block of 8; per row of the tile rs, r, and
+    rests, q - r^2."""
     dy, sa, sb = top + 0.5 - geom[g + Y], geom[g + SA], geom[g + SB]
     start, step = splat(sa * (left + 0.5 - geom[g + X] - geom[g + K] * dy)), splat(-sa * geom[g + K])
     for first in range(0, TILE_HEIGHT, WIDE):
@@ -144,8 +144,8 @@ def _composite_tile(
     height: int,
     state: Array,
 ) -> None:
-    """Blends the tile's Gaussians into `state`: per block the transmittance (0 once finished), 3 colours and the last
-    transmittance above T_MIN."""
+    """Blends the tile's Gaussians into `state`, which holds per block the transmittance (0 once finished), 3 colours
+    and the last transmittance above T_MIN."""
     alive = _begin(state, 4, left, top, width, height)
     alive = _begin(state, 0, left, top, width, height)
     one = np.uint64(1)
@@ -172,7 +172,7 @@ def _composite_tile(
             alpha = exp2(select_gt(exponent, low, exponent, low))
             alpha = select_gt(high, alpha, alpha, high)
             alpha = select_gt(faintest, alpha, zero, alpha)
-            p = block * (_STATE * LANES)  # of whole blocks, so that of `_place`
+            p = block * (_STATE * LANES)  # `_place` of the block's first pixel
             before = load(state, p)
             weight = alpha * before
             after = before - weight
@@ -241,8 +241,8 @@ def _composite_tile_backward(
     state: Array,
     slots: Array,
 ) -> None:
-    """Walks the Gaussians front to back again. The state holds per block the transmittance, the part of the gradient
-    that comes from behind the current Gaussian, and dL/d(3 colours)."""
+    """Fills the slots of the tile's Gaussians, front to back. `state` holds per block the transmittance, the part of
+    the gradient that comes from behind the current Gaussian, and dL/d(3 colours)."""
     alive = _begin(state, 0, left, top, width, height)
     one_bit = np.uint64(1)
     zero, one, faintest = splat(_F(0.0)), splat(_F(1.0)), splat(_F(ALPHA_MIN))
@@ -267,7 +267,7 @@ def _composite_tile_backward(
             unclamped = exp2(select_gt(exponent, low, exponent, low))
             alpha = select_gt(high, unclamped, unclamped, high)
             alpha = select_gt(faintest, alpha, zero, alpha)
-            p = block * (_STATE * LANES)  # of whole blocks, so that of `_place`
+            p = block * (_STATE * LANES)  # `_place` of the block's first pixel
             before = load(state, p)
             weight = alpha * before
             after = before - weight
@@ -326,7 +326,7 @@ def composite_backward(
         for y in range(top, min(top + TILE_HEIGHT, height)):
             for x in range(left, min(left + TILE_WIDTH, width)):
                 p = _place(x - left, y - top)
-                # What lies behind contributes v.C and, through alpha = 1 - T, -g_alpha T.
+                # Everything behind contributes v.C and, through alpha = 1 - T, -g_alpha T.
                 behind = -transmittance[y, x] * g_alpha[y, x]
                 for c in range(_COLORS):
                     v = g_picture[y, x, c]

@@ -1,6 +1,6 @@
-"""A decoded deformation's residuals at a time, without torch.
+"""Evaluates a decoded deformation without torch.
 
-Another kind of deformation is another body of `Field`, behind the same two methods.
+Another kind of deformation needs only another `Field` with the same two methods.
 """
 
 from itertools import accumulate
@@ -15,14 +15,14 @@ from pd4dgs_codec.scene import LENGTH_HEADS, PLANES, TRUNK, Deformation, Network
 
 
 class Field:
-    """A deformation: adds the residuals of its heads to rows, whose columns are all heads of the registry."""
+    """Adds a deformation's residuals to rows of anchors, whose columns are all heads of the registry."""
 
     def __init__(self, deformation: Deformation, box: np.ndarray, widths: dict[str, int]):
-        """box: float32 [2, 3], see SceneInfo. widths: of all heads of the registry, in the order of the columns."""
+        """box: float32 [2, 3], see SceneInfo. widths: the width of each head of the registry, in column order."""
         self._box = np.ascontiguousarray(box, np.float32)
         self._layout = PlaneLayout.build([plane_sides(scale) for scale in deformation.planes])
         channels = deformation.planes[0]["xy"].shape[0]
-        self._channels = -(-channels // LANES) * LANES  # the padding is 0, and so are its products
+        self._channels = -(-channels // LANES) * LANES  # padded channels and their products are 0
         self._grid = np.zeros((self._layout.n_cells, self._channels), np.float32)
         for views, scale in zip(self._layout.views(self._grid), deformation.planes, strict=True):
             for name, _, _ in PLANES:
@@ -41,8 +41,8 @@ class Field:
             self._heads = [(slice(ends[n] - widths[n], ends[n]), Layers(network)) for n, network in heads.items()]
 
     def rest(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """The rows to which `move` adds, in place of `values`, its arguments: without F(x, t*) if there is a key
-        instant, which does not depend on the time."""
+        """Returns values - F(x, t*) if there is a key instant t*, else `values`: the rows to which `move` adds F(x, t)
+        at any time t. Arguments as for `move`."""
         if self._key is None:
             return values
         still = np.zeros_like(values)
@@ -72,7 +72,7 @@ class Field:
 
 
 def _with_padded_inputs(network: Network, channels: int, padded: int) -> Network:
-    """The network for features of `padded` channels per scale, of which the first `channels` count."""
+    """Returns the network for features that are padded from `channels` to `padded` channels per scale."""
     (weight, bias), *rest = network
     scales = weight.shape[1] // channels
     wide = np.zeros((len(weight), scales, padded), np.float32)
@@ -81,7 +81,7 @@ def _with_padded_inputs(network: Network, channels: int, padded: int) -> Network
 
 
 def _side_by_side(heads: dict[str, Network], widths: dict[str, int], inputs: int) -> tuple[np.ndarray, np.ndarray]:
-    """One layer for all heads, each of one layer; 0 for those that are not there."""
+    """Joins heads of one layer each into one layer; the outputs of absent heads are 0."""
     weight, bias = np.zeros((sum(widths.values()), inputs), np.float32), np.zeros(sum(widths.values()), np.float32)
     first = 0
     for name, width in widths.items():
@@ -92,17 +92,17 @@ def _side_by_side(heads: dict[str, Network], widths: dict[str, int], inputs: int
 
 
 def _scaled(network: Network, unit: np.float32) -> Network:
-    """The network with its outputs times `unit`."""
+    """Returns the network with its outputs multiplied by `unit`."""
     *rest, (weight, bias) = network
     return (*rest, (weight * unit, bias * unit))
 
 
 def still(head: str, width: int) -> Deformation:
-    """The smallest deformation that the kernels take, with one head of that width; its residuals are 0."""
+    """Returns the smallest deformation that the kernels take, with one head of `width` residuals, all 0."""
     planes = {name: np.ones((LANES, 2, 2), np.float32) for name, _, _ in PLANES}
     return Deformation((planes,), {TRUNK: constant_network(LANES, LANES), head: constant_network(LANES, width)})
 
 
 def constant_network(inputs: int, outputs: int, value: float = 0.0) -> Network:
-    """One layer whose outputs are all `value`."""
+    """Returns a network of one layer whose outputs are all `value`."""
     return ((np.zeros((outputs, inputs), np.float32), np.full(outputs, value, np.float32)),)

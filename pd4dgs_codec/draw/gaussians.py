@@ -1,14 +1,14 @@
-"""From anchors to the Gaussians that a camera meets: what is evaluated, the scaffold's networks, and their kernels.
+"""Makes Gaussians of anchors for a camera: frustum culling, the scaffold's networks, and their numba kernels.
 
-Playback and training on the CPU call the same functions here; `model.reference` has the plain torch form. An anchor has
-G slots, one Gaussian each, of which about one in six is drawn; only the kept slots are evaluated past their opacity.
+Playback and training on the CPU share these functions; `model.reference` has the plain torch form. An anchor has G
+slots of one Gaussian each. About one in six is drawn, so all networks but opacity are evaluated for kept slots only.
 
-Arguments everywhere, floats of one dtype: keep int64 [K], ascending, anchor * G + offset of each kept Gaussian; anchors
-[n, 9 + D + 3 G], a row of position, feature [D], offsets [G, 3] and log scalings [6]; gaussians [K, 14], a row of mean,
-scales, quaternion, opacity and colour; hidden [n, columns], of which H from `column` on belong to a layer, H a multiple
-of LANES. The columns of both rows are the heads of the global and the local deformation in the registry's order. The
-backward passes split the Gaussians over threads at anchors, and each part owns its rows of the result; sums over all
-Gaussians are kept per part and added in order, so that results are bitwise reproducible for a fixed number of parts.
+Common arguments, floats of one dtype: keep int64 [K], ascending, anchor * G + offset of each kept Gaussian; anchors
+[n, 9 + D + 3 G], per row position, feature [D], offsets [G, 3] and log scalings [6], the residual heads in the
+registry's order; gaussians [K, 14], per row mean, scales, quaternion, opacity and colour; hidden [n, columns], H of
+them, a multiple of LANES, from `column` on for a layer. Backward passes split the Gaussians over threads between
+anchors, so that each part owns its rows of the result. Sums over all Gaussians are kept per part and added in order:
+results are bitwise reproducible for a fixed number of parts.
 """
 
 import math
@@ -45,13 +45,12 @@ from pd4dgs_codec.threads import kernel_threads
 
 #: A Gaussian fainter than the rasteriser's threshold never reaches a pixel, so its networks are not evaluated.
 MIN_OPACITY = ALPHA_MIN
-#: How far an anchor's Gaussians are taken to lie from it, in its largest extent: in trained scenes one anchor in 7,000
-#: has one farther away.
+#: Assumed distance of an anchor's Gaussians from it, in multiples of its largest extent; in trained scenes one anchor
+#: in 7,000 has a Gaussian farther away.
 OFFSET_REACH = 2.0
-#: How far a Gaussian of opacity 1 reaches, in its largest standard deviation: to where alpha is ALPHA_MIN, at
-#: sqrt(2 ln 255) = 3.3290.
+#: Standard deviations from its mean at which a Gaussian of opacity 1 has alpha ALPHA_MIN: sqrt(2 ln 255) = 3.3290.
 SIGMA_REACH = 3.33
-#: Anchors farther outside the image than this share of its size (plus the reach of their Gaussians) are not evaluated.
+#: Anchors farther outside the image than this share of its longer side plus their Gaussians' reach are not evaluated.
 FRUSTUM_MARGIN = 0.15
 #: Least distance of the near plane, scene units: the rasteriser divides by depths.
 LEAST_NEAR = 1e-6
@@ -61,23 +60,23 @@ MIN_NORM = 1e-12
 SCALE, QUAT, OPACITY, COLOR = 3, 6, 10, 11
 GAUSSIAN_WIDTH = COLOR + 3
 KEPT = 1024  #: Gaussians that share scratch memory
-SCALING = slice(-SCALING_DIM, None)  #: columns of an anchor's row
+SCALING = slice(-SCALING_DIM, None)  #: columns of the log scalings in an anchor's row
 
 
 def near_plane(info: SceneInfo) -> float:
-    """The near plane of a scene's pictures, scene units."""
+    """Returns the distance of the near plane, scene units, at least LEAST_NEAR."""
     return max(float(info.near), LEAST_NEAR)
 
 
 def check_time(t: float) -> None:
-    """Raises RenderError unless a normalised time is a number; outside 0..1 a scene stands as at its ends."""
+    """Raises RenderError unless a normalised time is finite; the planes clamp it to 0..1."""
     if not math.isfinite(t):
         raise RenderError(f"time is {t}, expected a number from 0 to 1")
 
 
 def in_view(camera: Camera, viewmat: Any, position: Any, radius: Any, near: float) -> Any:
-    """bool [N]: anchors at position [N, 3], world, whose Gaussians, within radius [N], may reach the image. Arrays and
-    viewmat [4, 4], that of the camera, are all float32 numpy arrays or all torch tensors."""
+    """Returns bool [N]: whether Gaussians within radius [N] of position [N, 3], world, may reach the image. viewmat
+    [4, 4] is the camera's. All arrays are float32, either numpy arrays or torch tensors."""
     across, down, depth = viewmat[:3, :3] @ position.T + viewmat[:3, 3:]
     fx, fy, cx, cy = (float(camera.K[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
     z = depth.clip(min=float(near))
@@ -101,7 +100,7 @@ class Gaussians:
 
 
 class Functions(NamedTuple):
-    """The activations, array to array. Training passes torch's, which differ in the last bit."""
+    """Activation functions of arrays. Training passes torch's, which differ in the last bit."""
 
     tanh: Callable[[Array], Array]
     sigmoid: Callable[[Array], Array]
@@ -112,16 +111,16 @@ NUMPY = Functions(np.tanh, lambda x: 1 / (1 + np.exp(-x)), np.exp)
 
 
 class Look(NamedTuple):
-    """Anchors as an eye sees them: of n anchors the opacities of all slots, and what the other networks go on from."""
+    """The opacities of n anchors seen from an eye, and the activations that the other networks continue from."""
 
     inputs: Array  #: [n, D + 3], features and directions from the eye
     distance: Array  #: [n] from the eye
     opacity: Array  #: [n, G], before the gate
-    hidden: tuple[tuple[Array, int], ...]  #: of covariance and colour: hidden activations and their first column
+    hidden: tuple[tuple[Array, int], ...]  #: covariance, colour: hidden activations, their first column
 
 
 class Made(NamedTuple):
-    """The kept Gaussians before the local deformation, and what their gradient takes."""
+    """The kept Gaussians before the gates multiply them, and the values that `Decoders.backward` needs."""
 
     gaussians: Array  #: [K, 14]
     gates: Array  #: [K]
@@ -131,16 +130,16 @@ class Made(NamedTuple):
 
 
 def fusible(networks: Sequence[Sequence[tuple[Any, Any]]]) -> bool:
-    """Whether one product evaluates the first layers of all networks, as `Decoders.backward` needs."""
+    """Whether one matrix product can evaluate the first layers of all networks; `Decoders.backward` requires it."""
     return all(len(layers) == 2 and len(layers[0][1]) % LANES == 0 for layers in networks)
 
 
 class Decoders:
-    """The scaffold's networks, opacity, covariance and colour, packed for the kernels. One that does not take the
-    direction has weights of 0 for it here."""
+    """The scaffold's opacity, covariance and colour networks, packed for the kernels. A network that does not take the
+    view direction has weights of 0 for it here."""
 
     def __init__(self, given: Sequence[Network | Sequence[Layer]], features: int, functions: Functions = NUMPY):
-        """features: D, numbers of an anchor's feature."""
+        """features: D, the width of an anchor's feature."""
         networks = [_viewing(network, features) for network in given]
         self.slots = len(networks[0][-1][1])  #: Gaussians of an anchor
         self._features, self._functions = features, functions
@@ -155,7 +154,7 @@ class Decoders:
             self._opacity = Layers(networks[0])
 
     def look(self, anchors: Array, eye: Array) -> Look:
-        """The anchors as an eye at [3], world, sees them."""
+        """Evaluates the opacities of anchors seen from `eye` [3], world."""
         x, distance = _seen_from(anchors, eye, self._features)
         opacity = np.zeros((len(anchors), self.slots), anchors.dtype)
         hidden = self._opacity.add(opacity, x, keep=self._fused)
@@ -166,7 +165,7 @@ class Decoders:
         return Look(x, distance, self._functions.tanh(opacity), tuple(parts))
 
     def make(self, anchors: Array, mask: Array, look: Look, keep: Array) -> Made:
-        """The Gaussians of the kept slots of anchors under mask [n]."""
+        """Evaluates the Gaussians of the kept slots; mask [n] gates the anchors."""
         shape, color = (head(keep, *hidden) for head, hidden in zip(self._heads, look.hidden, strict=True))
         _, sigmoid, exp = self._functions
         relative, extent = sigmoid(shape), exp(np.ascontiguousarray(anchors[:, SCALING]))
@@ -175,8 +174,7 @@ class Decoders:
         return Made(gaussians, gates, shape, relative, extent)
 
     def colors(self, anchors: Array, eye: Array, keep: Array) -> Array:
-        """[K, 3] of the kept slots of anchors, as an eye at [3], world, sees them; for Gaussians of which nothing else
-        depends on it."""
+        """Returns the colours [K, 3] of the kept slots seen from `eye` [3], world."""
         x, _ = _seen_from(anchors, eye, self._features)
         color = self._heads[-1]
         return self._functions.sigmoid(color(keep, color.hidden(x)))
@@ -184,8 +182,8 @@ class Decoders:
     def backward(
         self, anchors: Array, look: Look, keep: Array, made: Made, g: Array, g_gates: Array
     ) -> tuple[Array, Array, list[Layer]]:
-        """The gradients by anchors, by mask [n] and by each layer of each network, from those by the Gaussians and
-        their gates. Of fused networks alone."""
+        """Returns the gradients by anchors, by mask [n] and by each layer of each network, from the gradients g by the
+        Gaussians and g_gates by their gates. The networks must be `fusible`."""
         parts = kernel_threads()
         g_anchors, g_opacity, g_mask = np.zeros_like(anchors), np.zeros_like(look.opacity), np.zeros_like(look.distance)
         g_shape, g_color = np.empty_like(made.shape), np.empty((len(g), 3), g.dtype)
@@ -209,7 +207,7 @@ class Decoders:
 
 
 class SlotHead:
-    """A network of G w outputs, w LANES at most, of which those of the kept slots alone are evaluated."""
+    """A network of w outputs per slot, w at most LANES, that is evaluated for the kept slots only."""
 
     def __init__(self, network: Sequence[Layer], slots: int):
         self.last, self._before, self._slots = network[-1], network[:-1], slots
@@ -217,11 +215,11 @@ class SlotHead:
 
     @cached_property
     def _packed(self) -> Layers:
-        """The layers before the last. Networks that are fused need none, and training makes heads anew at each step."""
+        """The layers before the last, packed on demand: training makes heads at each step, and fused ones need none."""
         return Layers(self._before, relu_last=True)
 
     def hidden(self, x: Array) -> Array:
-        """The inputs of the last layer for x [n, inputs], in as many columns as `linear` takes; the padding is 0."""
+        """Returns the inputs of the last layer for x [n, inputs], padded with zeros to the width of `linear`."""
         width = self._table[0].shape[1]
         if self._before:
             return self._packed(x, width)
@@ -230,34 +228,34 @@ class SlotHead:
         return out
 
     def __call__(self, keep: Array, hidden: Array, column: int = 0) -> Array:
-        """[K, w]: the outputs."""
+        """Returns the outputs of the kept slots, [K, w]."""
         out = np.empty((len(keep), len(self.last[1]) // self._slots), hidden.dtype)
         linear(out, keep, hidden, column, *self._table)
         return out
 
 
 def _viewing(network: Sequence[Layer], features: int) -> list[Layer]:
-    """The network with weights of 0 for the view direction if it does not take it."""
+    """Adds weights of 0 for the view direction to a network that does not take it."""
     (weight, bias), *rest = network
     return [(np.pad(weight, ((0, 0), (0, features + VIEW_DIM - weight.shape[1]))), bias), *rest]
 
 
 def _seen_from(anchors: Array, eye: Array, features: int) -> tuple[Array, Array]:
-    """(x, distance) of `inputs`."""
+    """Returns (out, distance) of `inputs`."""
     x, distance = np.empty((len(anchors), features + VIEW_DIM), anchors.dtype), np.empty(len(anchors), anchors.dtype)
     inputs(x, distance, anchors, eye)
     return x, distance
 
 
 def seen(opacity: Array, mask: Array, faintest: float) -> Array:
-    """int64 [K]: the slots whose opacity [n, G], gated by mask [n], is `faintest` at least."""
-    keep = np.empty(opacity.size + 1, np.int64)  # a place past the last, which is always written
+    """Returns int64 [K]: the slots whose opacity [n, G] times mask [n] is at least `faintest`."""
+    keep = np.empty(opacity.size + 1, np.int64)
     found: Array = keep[: _seen(keep, opacity, mask, faintest)].copy()
     return found
 
 
 def finished(gaussians: Array, gates: Array) -> tuple[Array, ...]:
-    """means, quats, scales, opacities and colors of gaussians [K, 14] under gates [K]."""
+    """Returns means, quats, scales, opacities and colors of gaussians [K, 14]; gates multiply scales and opacities."""
     parts = np.split(gaussians, (SCALE, QUAT, OPACITY, COLOR), axis=1)
     means, scales, quats, opacities, colors = map(np.ascontiguousarray, parts)
     return means, quats, scales * gates[:, None], opacities[:, 0] * gates, colors
@@ -268,7 +266,7 @@ def finished(gaussians: Array, gates: Array) -> tuple[Array, ...]:
 
 @kernel(inline=True)
 def _part(keep: Array, slots: int, part: int, parts: int) -> tuple[int, int]:
-    """The range of `keep` of one part: no anchor is in two parts."""
+    """Returns the range of `keep` of one part; no anchor is in two parts."""
     begin, end = len(keep) * part // parts, len(keep) * (part + 1) // parts
     while 0 < begin < len(keep) and keep[begin] // slots == keep[begin - 1] // slots:
         begin += 1
@@ -290,8 +288,9 @@ def pick(
     spacing: Array,
     centre: Array,
 ) -> None:
-    """Fills the columns of `out` from `column` on with values [N, w] at rows int64 [n]. rounding: to centre [w] plus
-    multiples of `step` times spacing [N]; else noise [n, w], in those steps, is added; noise [0, w] is none."""
+    """Fills the columns of `out` from `column` on with values [N, w] at rows int64 [n]. The quantisation step of anchor
+    i is step * spacing[i]. rounding: rounds to centre [w] plus multiples of it; else adds noise [n, w] in steps, or
+    nothing if noise has no rows."""
     real, width = values.dtype.type, values.shape[1]
     for i in range(tasks[0], tasks[1]):
         size = real(step) * spacing[rows[i]]
@@ -308,7 +307,7 @@ def pick(
 
 @parallel(lambda grad, g, column, rows: len(rows))
 def pick_backward(tasks: Tasks, grad: Array, g: Array, column: int, rows: Array) -> None:
-    """The transpose of `pick`: fills grad [N, w], given zeroed, at `rows`, of which none comes twice."""
+    """The transpose of `pick`: copies g to the rows `rows`, none twice, of grad [N, w], given zeroed."""
     width = grad.shape[1]
     for i in range(tasks[0], tasks[1]):
         copy(grad, rows[i] * width, g, i * g.shape[1] + column, width)
@@ -316,8 +315,8 @@ def pick_backward(tasks: Tasks, grad: Array, g: Array, column: int, rows: Array)
 
 @parallel(lambda out, *_: len(out))
 def inputs(tasks: Tasks, out: Array, distance: Array, anchors: Array, centre: Array) -> None:
-    """out [n, D + 3] = the features and the direction from centre [3] of anchors; distance [n] from it, MIN_NORM at
-    least."""
+    """Fills out [n, D + 3], the features of anchors and their directions from centre [3], and distance [n] from centre,
+    at least MIN_NORM."""
     width = out.shape[1] - 3
     for n in range(tasks[0], tasks[1]):
         x, y, z = anchors[n, 0] - centre[0], anchors[n, 1] - centre[1], anchors[n, 2] - centre[2]
@@ -331,7 +330,7 @@ def inputs(tasks: Tasks, out: Array, distance: Array, anchors: Array, centre: Ar
 
 @parallel(lambda g_anchors, *_: len(g_anchors))
 def inputs_backward(tasks: Tasks, g_anchors: Array, g: Array, out: Array, distance: Array) -> None:
-    """The transpose of `inputs`, whose results are `out` and `distance`: adds to g_anchors."""
+    """The transpose of `inputs`, given its results `out` and `distance`: adds to g_anchors."""
     width = g.shape[1] - 3
     for n in range(tasks[0], tasks[1]):
         for c in range(width):
@@ -346,7 +345,7 @@ def inputs_backward(tasks: Tasks, g_anchors: Array, g: Array, out: Array, distan
 
 @kernel()
 def _seen(keep: Array, opacity: Array, mask: Array, faintest: float) -> int:
-    """Writes to `keep` the slots whose opacity [n, G] times mask [n] is `faintest` at least; returns how many."""
+    """Writes to `keep` the slots whose opacity [n, G] times mask [n] is at least `faintest`; returns their number."""
     count, slots = 0, opacity.shape[1]
     for n in range(len(mask)):
         for o in range(slots):
@@ -356,8 +355,8 @@ def _seen(keep: Array, opacity: Array, mask: Array, faintest: float) -> int:
 
 
 def by_slot(weight: Array, bias: Array, slots: int) -> tuple[Array, Array]:
-    """(weight [G, H, LANES], bias [G, LANES]) for `linear` of a layer (weight [G w, any], bias [G w]), w LANES at most;
-    H is a multiple of LANES."""
+    """Packs a layer (weight [G w, any], bias [G w], w at most LANES) for `linear`. Returns weight [G, H, LANES], H a
+    multiple of LANES, and bias [G, LANES]."""
     width, inputs = len(bias) // slots, weight.shape[1]
     table = np.zeros((slots, whole(inputs, LANES), LANES), weight.dtype)
     start = np.zeros((slots, LANES), bias.dtype)
@@ -368,7 +367,7 @@ def by_slot(weight: Array, bias: Array, slots: int) -> tuple[Array, Array]:
 
 @parallel(lambda out, *_: -(-len(out) // KEPT))
 def linear(tasks: Tasks, out: Array, keep: Array, hidden: Array, column: int, weight: Array, bias: Array) -> None:
-    """Fills out [K, w] with the outputs of a linear layer, packed by `by_slot`, that belong to the kept slots."""
+    """Fills out [K, w] with the outputs for the kept slots of a linear layer, packed by `by_slot`."""
     slots, inputs, width = weight.shape[0], weight.shape[1], out.shape[1]
     zero, step = wide_splat(hidden.dtype.type(0)), WIDE // LANES
     outputs = aligned(LANES, hidden.dtype.type)
@@ -397,8 +396,8 @@ def linear_backward(
     column: int,
     weight: Array,
 ) -> None:
-    """The transpose of `linear`; weight [G w, H in whole vectors]. Fills, given zeroed, grad_hidden (as hidden) and per
-    part grad_weight [parts, G w, H] and grad_bias [parts, G w]."""
+    """The transpose of `linear`, with weight [G w, H padded to whole vectors]. Fills grad_hidden, shaped as hidden, and
+    per part grad_weight [parts, G w, H] and grad_bias [parts, G w]; all are given zeroed."""
     width, inputs, parts, slots = g.shape[1], grad_weight.shape[2], len(grad_weight), len(weight) // g.shape[1]
     columns, rows, most, real = weight.shape[1], up(width, PRODUCT_ROWS), up(KEPT, PRODUCT_ROWS), hidden.dtype.type
     for part in range(tasks[0], tasks[1]):
@@ -484,7 +483,7 @@ def _norm(shape: Array, k: int) -> Any:
 
 @kernel(inline=True)
 def _unit_backward(g_shape: Array, shape: Array, g: Array, k: int) -> None:
-    """Stores to row k of g_shape the gradient by the quaternion of shape, from that by the unit quaternion, in g."""
+    """Stores to row k of g_shape the gradient by the quaternion in shape, from g, the gradient by the unit one."""
     norm = _norm(shape, k)
     along = shape.dtype.type(0)
     if norm > shape.dtype.type(MIN_NORM):
@@ -513,8 +512,8 @@ def assemble_backward(
     g_gates: Array,
     parts: int,
 ) -> None:
-    """The transpose of `assemble`: fills g_anchors, g_opacity and g_mask, given zeroed, and g_shape and g_color: the
-    gradients before the tanh of opacities and the sigmoids of sizes and colours, and by log scalings."""
+    """The transpose of `assemble`: fills g_shape, g_color and, given zeroed, g_anchors, g_opacity and g_mask. Gradients
+    of opacities, sizes and colours are by the values before tanh and sigmoid, those of scalings by the logarithms."""
     slots, scaling = g_opacity.shape[1], anchors.shape[1] - SCALING_DIM
     offset = scaling - 3 * slots
     for part in range(tasks[0], tasks[1]):
