@@ -1,12 +1,12 @@
-"""HexPlanes: the layout of planes in one table, and numba kernels that sample them at one time for all points.
+"""HexPlanes: the layout of all planes in one table, and numba kernels that sample them at one time for all points.
 
 At one time t each time plane is a single row, the blend of two of its rows, so a point costs three bilinear and three
-linear lookups per scale. Channels lie innermost and are walked `LANES` at a time. The backward pass splits scales over
-threads first and points second; each part owns its gradient buffers, which the caller adds in order. Results are
-bitwise reproducible for a fixed number of parts, and with one part for any number of threads.
+linear lookups per scale. Channels are the last axis and are processed `LANES` at a time. The backward pass splits
+scales over threads first and points second; each part owns its gradient buffers, which the caller adds in order.
+Results are bitwise reproducible for a fixed number of parts, and with one part for any number of threads.
 
-Arguments of the kernels, all floats of one dtype: grid [cells, C] (only the spatial planes are read), C a multiple of
-LANES; rows [n_rows, C], the time planes at the time wanted; reso [S, 4], start [S, 6], row_start [S, 3] of
+Arguments of the kernels, all floats of one dtype: grid [cells, C], C a multiple of LANES (sampling reads only its
+spatial planes); rows [n_rows, C], the time planes at time t; reso [S, 4], start [S, 6], row_start [S, 3] of
 `PlaneLayout`; points [N, 3] and box [2, 3] in scene units.
 """
 
@@ -30,13 +30,13 @@ TEMPORAL = tuple(p for p in PLANES if TIME_AXIS in p[1:])
 class PlaneLayout:
     """Where each plane lies in one table [cells, C]: the spatial planes of all scales, then the time planes.
 
-    The optimiser, the rounding and the kernels make one pass over one table instead of twelve.
+    With one table the optimiser, the rounding and the kernels make one pass instead of one per plane.
 
     reso: int64 [S, 4] cells along x, y, z, t.
     start: int64 [S, 6] first cell of each plane, in the order of `PLANES`; cell (j, i) of plane (a, b) is
     start + j * reso[a] + i.
     rows: int64 [S, 3] first row of xt, yt, zt in the [n_rows, C] table of the time planes at one time.
-    lines: int64 [R, 5], each row of each plane: first cell of the plane, height, width, row, 1 if spatial.
+    lines: int64 [R, 5], for each row of each plane: the plane's first cell, height and width, the row, 1 if spatial.
     """
 
     reso: Array
@@ -49,7 +49,7 @@ class PlaneLayout:
 
     @classmethod
     def build(cls, resolutions: Sequence[Sequence[int]]) -> PlaneLayout:
-        """resolutions: per scale, cells along x, y, z, t."""
+        """Lays out planes of the given resolutions: per scale, cells along x, y, z, t."""
         reso = np.array(resolutions, np.int64)
         start = np.zeros((len(reso), len(PLANES)), np.int64)
         lines = []
@@ -67,7 +67,7 @@ class PlaneLayout:
         return cls(reso, start, rows, np.array(lines, np.int64), n_spatial, cell, int(reso[:, :3].sum()))
 
     def views(self, grid: Any) -> tuple[dict[str, Any], ...]:
-        """Per scale, plane name -> view [reso[b], reso[a], C] of `grid` [cells, C], an array or a tensor."""
+        """Returns per scale: plane name -> view [reso[b], reso[a], C] of `grid` [cells, C], an array or a tensor."""
         return tuple(
             {
                 name: grid[first : first + r[a] * r[b]].reshape(r[b], r[a], -1)
@@ -85,7 +85,7 @@ Three = tuple[float, float, float]
 
 @kernel(inline=True)
 def _locate(p: float, lower: float, upper: float, n: int) -> tuple[int, float, float]:
-    """First cell, fraction and slope d(cell coordinate)/dp of p on an axis of n cells; slope 0 where clamped."""
+    """Returns first cell, fraction and slope d(cell coordinate)/dp of p on an axis of n cells; slope 0 if clamped."""
     unit = (np.float64(p) - lower) / (np.float64(upper) - lower)
     if not (unit > 0):  # NaN too
         return 0, 0.0, 0.0
@@ -99,7 +99,7 @@ def _locate(p: float, lower: float, upper: float, n: int) -> tuple[int, float, f
 
 @kernel(inline=True)
 def _linear(table: Array, i: int, step: int, f: Vector) -> tuple[Vector, Vector]:
-    """(sample, d sample / df) of the lanes at flat offset i and its neighbour `step` further."""
+    """Returns (sample, d sample / df) between the lanes at flat offset i and the lanes `step` further."""
     a = load(table, i)
     d = load(table, i + step) - a
     return fma(d, f, a), d
@@ -131,10 +131,10 @@ def _add_bilinear(table: Array, i: int, step_u: int, step_v: int, fu: Vector, fv
 def _address(
     s: int, point: Array, reso: Array, start: Array, row_start: Array, box: Array, channels: int
 ) -> tuple[Six, Six, Three, Three]:
-    """The flat offsets of one point's six lookups at one scale, the steps to its neighbours, fractions and slopes.
+    """Returns flat offsets of one point's six lookups at one scale, steps to the next cells, fractions and slopes.
 
-    Offsets: xy, xz, yz in the grid and x, y, z in the rows. Steps: to the next cell along x, y, z (0 on an axis of one
-    cell) where it is the inner axis, then as the outer axis of xy, xz, yz.
+    Offsets: xy, xz, yz in the grid, then x, y, z in the rows. Steps: along x, y, z as an inner axis (0 on an axis of
+    one cell), then along the outer axes of xy, xz, yz.
     """
     nx, ny, nz = reso[s, 0], reso[s, 1], reso[s, 2]
     x, fx, sx = _locate(point[0], box[0, 0], box[1, 0], nx)
@@ -192,7 +192,7 @@ def _point_gradient(
     out: Array,
     out_offset: int,
 ) -> None:
-    """Adds one point's gradient at one scale to `grad` and `grad_rows`; stores that by the point to flat `out`."""
+    """Adds one point's gradient at one scale to `grad` and `grad_rows`; stores dL/d(point) to flat `out`."""
     xy, xz, yz, rx, ry, rz = offsets
     dx, dy, dz, xy_y, xz_z, yz_z = steps
     real = grid.dtype.type
@@ -249,10 +249,10 @@ def sample_backward(
     points: Array,
     box: Array,
 ) -> None:
-    """The transpose of `sample`. g: [N, S * C]. Results, to be given zeroed except grad_points:
+    """The transpose of `sample`. g: [N, S * C]. Fills arrays that, except grad_points, are given zeroed:
 
-    grad [cells, C], of which the spatial planes are filled by the first part; extra [parts - 1, n_spatial, C], of the
-    other parts; grad_rows [parts, n_rows, C]; grad_points [S, N, 3], per scale.
+    grad [cells, C], its spatial planes, by the first part; extra [parts - 1, n_spatial, C], by the other parts;
+    grad_rows [parts, n_rows, C]; grad_points [S, N, 3], per scale.
     """
     channels, parts, n_points = grid.shape[1], len(grad_rows), len(points)
     for task in range(tasks[0], tasks[1]):
@@ -267,7 +267,7 @@ def sample_backward(
             )
 
 
-@kernel()  # exact arithmetic: the rounding must be that of the codec's quantiser
+@kernel()  # exact arithmetic: the rounding must equal the codec's quantiser's
 def collapse(rows: Array, grid: Array, reso: Array, start: Array, row_start: Array, t: float, step: float) -> None:
     """Fills rows [n_rows, C] with the time planes of `grid` at time t, rounded to multiples of `step` if step > 0."""
     real = grid.dtype.type

@@ -1,9 +1,9 @@
-"""Networks for many points: linear layers with ReLU between them, in one pass, and the gradient. Numba kernels.
+"""Numba kernels of multi-layer perceptrons, linear layers with ReLU between them, for many points; and their gradient.
 
 Points go through all layers in blocks that stay in the cache. Arguments of the kernels, all floats of one dtype: x
 [n, inputs]; sizes int64 [layers, 2], the inputs and outputs of each layer, no more inputs than the layer before has
-outputs; weights, the layers packed by `_pack`; hidden [n, `_hidden_width`], the activations behind each layer but the
-last side by side, each padded with zeros to whole vectors.
+outputs; weights, the layers packed by `_pack`; hidden [n, `_hidden_width`], the activations after each layer but the
+last, side by side, each padded with zeros to whole vectors.
 
 Each part of a backward pass owns its sums, which are added in order: bits repeat for a fixed number of parts.
 """
@@ -33,7 +33,7 @@ from pd4dgs_codec.draw.simd import (
 )
 from pd4dgs_codec.threads import kernel_threads
 
-POINTS = 48  #: points per block: whole rows of `product`
+POINTS = 48  #: points per block, a multiple of PRODUCT_ROWS
 BLOCKS = 8  #: blocks that share scratch memory
 
 Layer = tuple[Array, Array]  #: weight [outputs, inputs] and bias [outputs]
@@ -47,7 +47,7 @@ class Layers:
         self._sizes, self._weights = _pack(layers)
 
     def __call__(self, x: Array, outputs: int | None = None) -> Array:
-        """float32 [n, outputs] of x float32 [n, inputs]; outputs beyond the last layer's are 0."""
+        """Evaluates x float32 [n, inputs] to float32 [n, outputs]; columns beyond the last layer's outputs are 0."""
         out = np.zeros((len(x), self.outputs if outputs is None else outputs), np.float32)
         self.add(out, x)
         return out
@@ -60,8 +60,8 @@ class Layers:
         return hidden
 
     def backward(self, g: Array, x: Array, hidden: Array, g_hidden: Array | None = None) -> tuple[Array, list[Layer]]:
-        """The gradients by x and by each layer, from g [n, outputs] and, where the activations are used elsewhere too,
-        g_hidden, as hidden. Without relu_last."""
+        """Returns the gradients by x and by each layer, from g [n, outputs] and, if the activations are also used
+        elsewhere, from g_hidden, shaped as hidden. Not for relu_last."""
         g_x, sums = np.empty_like(x), np.zeros((kernel_threads(), _sums_width(self._sizes)), x.dtype)
         elsewhere = hidden[:0] if g_hidden is None else g_hidden
         backward(g_x, sums, g, elsewhere, hidden, x, self._sizes, self._weights)
@@ -69,9 +69,9 @@ class Layers:
 
 
 def _pack(layers: Sequence[Layer]) -> tuple[Array, Array]:
-    """(sizes, weights) of the layers.
+    """Packs layers for the kernels; returns (sizes, weights).
 
-    weights: per layer those by input [inputs, padded outputs], the bias, then those by output [outputs, padded inputs].
+    weights: flat; per layer the transposed weight [inputs, padded outputs], bias, and weight [outputs, padded inputs].
     """
     parts = []
     for weight, bias in layers:
@@ -99,7 +99,7 @@ def _sums_width(sizes: Array) -> int:
 
 
 def _gradients(sums: Array, sizes: Array) -> list[Layer]:
-    """The gradients by each layer: the sum of all parts of `sums`."""
+    """Adds the parts of `sums` and splits the result into the gradients by each layer."""
     whole_sums, found, at = sums.sum(0), [], 0
     for inputs, outputs in sizes.tolist():
         rows, columns = whole(outputs, PRODUCT_ROWS), whole(inputs, WIDE)
@@ -123,7 +123,7 @@ def multiply(
     y: Array, y_at: int, y_row: int, start: Array, start_at: int, start_row: int, a: Array, a_row: int,
     a_step: int, b: Array, b_at: int, b_row: int, count: int, rows: int, columns: int, relu: bool,
 ) -> None:  # fmt: skip
-    """`product` of `rows` and `columns` numbers, both in whole blocks."""
+    """`product` for any multiple `rows` of PRODUCT_ROWS and `columns` of WIDE."""
     wide = columns - columns % (PRODUCT_VECTORS * WIDE)
     for r in range(0, rows, PRODUCT_ROWS):
         for c in range(0, wide, PRODUCT_VECTORS * WIDE):
@@ -149,23 +149,23 @@ def _widest(sizes: Array) -> int:
 
 @kernel(inline=True)
 def _take(block: Array, row: int, values: Array, first: int, count: int, column: int, columns: int) -> None:
-    """Copies `columns` columns, from `column` on, of `count` rows of `values`, from `first` on, to the first columns of
-    `block`, whose rows have `row` numbers."""
+    """Copies values[first : first + count, column : column + columns] to the first columns of flat `block`, whose rows
+    have `row` numbers."""
     for p in range(count):
         copy(block, p * row, values, (first + p) * values.shape[1] + column, columns)
 
 
 @kernel(inline=True)
 def _give(values: Array, first: int, count: int, column: int, columns: int, block: Array, row: int) -> None:
-    """The opposite of `_take`."""
+    """The inverse of `_take`."""
     for p in range(count):
         copy(values, (first + p) * values.shape[1] + column, block, p * row, columns)
 
 
 @parallel(lambda out, *_: -(-len(out) // (POINTS * BLOCKS)))
 def forward(tasks: Tasks, out: Array, hidden: Array, x: Array, sizes: Array, weights: Array, relu_last: bool) -> None:
-    """Adds the network's outputs to out [n, at most the last outputs in whole vectors]; relu_last: ReLU after the last
-    layer as well. Fills hidden unless it has no rows."""
+    """Adds the network's outputs to out [n, at most the last outputs padded to whole vectors]; fills hidden unless it
+    has no rows. relu_last: ReLU after the last layer as well."""
     row, layers, columns = up(_widest(sizes), WIDE), len(sizes), out.shape[1]
     vectors = columns - columns % LANES
     a, b = aligned(POINTS * row, x.dtype.type), aligned(POINTS * row, x.dtype.type)
@@ -214,7 +214,7 @@ def backward(
     blocks, real = (len(x) + POINTS - 1) // POINTS, x.dtype.type
     zero = wide_splat(real(0))
     for part in range(tasks[0], tasks[1]):
-        own, size = sums[part], POINTS * row + WIDE  # whole blocks read further than they mean
+        own, size = sums[part], POINTS * row + WIDE  # whole blocks read past the last row
         slope, before, taken, none = aligned(size, real), aligned(size, real), aligned(size, real), aligned(row, real)
         for block in range(blocks * part // parts, blocks * (part + 1) // parts):
             first = block * POINTS

@@ -1,6 +1,6 @@
-"""Render_level of a decoded scene through a camera, without torch: `model.Model`'s arithmetic, by the same kernels.
+"""Draws decoded scenes without torch, with the arithmetic and the kernels of `model.Model`.
 
-The two agree to rounding: activations differ in the last bit.
+Pictures of the two agree up to rounding: activations differ in the last bit.
 """
 
 from collections.abc import Sequence
@@ -27,11 +27,11 @@ from pd4dgs_codec.scene import MASK_STEP, MASK_THRESHOLD, SCAFFOLD_NETWORKS, Cam
 
 
 class Player:
-    """Draws the highest level of a decoded scene.
+    """Draws the highest level of a decoded scene. Not thread-safe.
 
-    What does not depend on the eye is kept at one time: the anchors' residuals and, where opacity and covariance do not
-    take the view direction, from the second view on their Gaussians without the colours. Further views at that time
-    evaluate only anchors that were not met, and colours. Not for several threads at once.
+    Results that do not depend on the eye are kept until the time changes: the anchors' residuals and, if opacity and
+    covariance do not take the view direction, the Gaussians without colours (from the second view on). Further views at
+    the same time evaluate only new anchors, and colours.
     """
 
     def __init__(self, scene: Scene):
@@ -40,7 +40,7 @@ class Player:
         self._mask = codes.astype(np.float32) * MASK_STEP
         self._anchor = np.ascontiguousarray(scene.anchor[: len(codes)], np.float32)
         self.slots = scene.widths.slots  #: Gaussians of an anchor
-        #: float32 [N, 9 + D + 3 G]: rows as the kernels take them and as the deformation moves them
+        #: float32 [N, 9 + D + 3 G]: rows of the kernels, to which the deformation adds
         self._table = np.concatenate(
             [self._anchor, scene.feature, scene.offset.reshape(len(codes), 3 * self.slots), scene.scaling_log], axis=1
         )
@@ -50,14 +50,14 @@ class Player:
         self._field = None if motion is None else Field(motion, scene.info.box, scene.widths.heads)
         widths = scene.widths
         self._decoders = Decoders([scene.networks[name] for name in SCAFFOLD_NETWORKS], widths.feature)
-        self.shapes_are_blind = widths.shapes_are_blind  #: whether of the Gaussians colours alone depend on the eye
+        self.shapes_are_blind = widths.shapes_are_blind  #: whether only colours depend on the eye
         self._time: float | None = None
         self._moved = self._table  # at self._time
         if self._field is not None:
             self._table, self._moved = self._field.rest(self._table, self._anchor), np.empty_like(self._table)
-        self._known = np.full(len(codes), self._field is None)  # the rows of _moved that are there
-        self._count = np.full(len(codes), -1)  # of an anchor's Gaussians in _grown; -1: not evaluated
-        self._first = np.zeros(len(codes), np.int64)  # the first of them
+        self._known = np.full(len(codes), self._field is None)  # the valid rows of _moved
+        self._count = np.full(len(codes), -1)  # of each anchor's Gaussians in _grown; -1: not evaluated
+        self._first = np.zeros(len(codes), np.int64)  # the index of the first one
         self._slots, self._grown = np.zeros(0, np.int64), np.zeros((0, GAUSSIAN_WIDTH), np.float32)  # with colours of 0
 
     @property
@@ -67,11 +67,11 @@ class Player:
 
     @property
     def positions(self) -> np.ndarray:
-        """float32 [N, 3]: all anchors at rest, world."""
+        """float32 [N, 3]: positions of all anchors, undeformed, world."""
         return self._anchor
 
     def picture(self, camera: Camera, t: float) -> np.ndarray:
-        """float32 [H, W, 3] in 0..1 at normalised time t in 0..1. Raises RenderError unless t is finite."""
+        """Draws float32 [H, W, 3] in 0..1 at normalised time t in 0..1. Raises RenderError unless t is finite."""
         check_time(t)
         g = self.gaussians(camera, t)
         finite = np.isfinite(g.colors).all(axis=1)  # a colour that overflowed hides its Gaussian
@@ -82,7 +82,7 @@ class Player:
         return picture
 
     def gaussians(self, camera: Camera, t: float) -> Gaussians:
-        """The Gaussians at normalised time t in 0..1 as the camera meets them."""
+        """Returns the Gaussians that the camera may see at normalised time t in 0..1."""
         viewmat = np.asarray(camera.viewmat, np.float32)
         with np.errstate(all="ignore"):
             near = in_view(camera, viewmat, self._anchor, self._radius, self.info.near)
@@ -90,10 +90,10 @@ class Player:
             return self._of_eyes(rows, t, [-viewmat[:3, :3].T @ viewmat[:3, 3]])
 
     def gaussians_of_eyes(self, rows: np.ndarray, t: float, eyes: np.ndarray) -> Gaussians:
-        """The Gaussians of the anchors `rows` int64 [n] that any of E eyes, float32 [E, 3] world, would see, at
-        normalised time t: those of the first eye, then as many of the second, and so on, slot by slot.
+        """Returns the Gaussians of the anchors `rows` (int64 [n]) at normalised time t for all `eyes` (float32 [E, 3],
+        world), one eye after the other. View frusta are ignored.
 
-        An eye that does not see a Gaussian has opacity 0 for it. Frusta are ignored.
+        Each eye has the same slots, all that any eye sees; opacity is 0 where the eye itself does not see the Gaussian.
         """
         with np.errstate(all="ignore"):
             return self._of_eyes(rows, t, list(eyes))
@@ -120,7 +120,7 @@ class Player:
         return _joined(found)
 
     def _of_colors(self, rows: np.ndarray, t: float, eyes: list[np.ndarray]) -> Gaussians:
-        """`_of_eyes` where nothing but colours depends on the eye."""
+        """`_of_eyes` if only colours depend on the eye."""
         anchors = self._anchors(rows, t)
         self._grow(rows, anchors)
         count = self._count[rows]
@@ -135,7 +135,7 @@ class Player:
         return _joined(found)
 
     def _grow(self, rows: np.ndarray, anchors: np.ndarray) -> None:
-        """Appends the Gaussians of `rows` that are not in _grown."""
+        """Evaluates the anchors `rows` that are not in _grown yet, and appends their Gaussians to it."""
         missing = self._count[rows] < 0
         own, anchors, slots = rows[missing], anchors[missing], self.slots
         if not own.size:
@@ -150,7 +150,7 @@ class Player:
         self._grown = np.concatenate([self._grown, gaussians])
 
     def _anchors(self, rows: np.ndarray, t: float) -> np.ndarray:
-        """float32 [n, 9 + D + 3 G]: the anchors `rows` as the deformation moves them."""
+        """Returns float32 [n, 9 + D + 3 G]: the rows of the anchors `rows` with the deformation's residuals."""
         if self._field is not None:
             missing = rows[~self._known[rows]]
             if missing.size:
@@ -163,7 +163,7 @@ class Player:
 
 
 def _joined(eyes: Sequence[tuple[np.ndarray, ...]]) -> Gaussians:
-    """The Gaussians of all eyes, one behind the other."""
+    """Concatenates the Gaussians of all eyes."""
     return Gaussians(*(eyes[0] if len(eyes) == 1 else map(np.concatenate, zip(*eyes, strict=True))))
 
 
@@ -171,8 +171,8 @@ def _joined(eyes: Sequence[tuple[np.ndarray, ...]]) -> Gaussians:
 
 
 def warm_up() -> None:
-    """Loads the kernels (where none are cached: compiles them) by drawing one anchor with both deformations. A viewer
-    calls it in a thread, with the import of this module, while the first layer is on its way."""
+    """Loads the kernels, or compiles them if none are cached, by drawing one anchor with both deformations. A viewer
+    imports this module and calls this function in a thread while it receives the first layer."""
     widths, box = Widths(), np.array([[-1, -1, 1], [1, 1, 3]], np.float32)
     camera = Camera(np.eye(4, dtype=np.float32), np.array([[16, 0, 8], [0, 16, 8], [0, 0, 1]], np.float32), 16, 16)
     scene = Scene(

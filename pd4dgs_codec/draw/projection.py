@@ -1,10 +1,10 @@
-"""World-space Gaussians to image-space ellipses, and the gradient back: numba kernels, float64 inside, float32 outside.
+"""Numba kernels that project Gaussians to image-space ellipses, and the gradient: float64 inside, float32 outside.
 
 Sigma2 = U U^T + EPS2D I with U = J W R S (2x3). Its determinant |u0 x u1|^2 + EPS2D tr + EPS2D^2 (Cauchy-Binet) is
-never negative, and does not cancel for needles as p r - q^2 does.
+never negative and, unlike p r - q^2, does not cancel for long thin Gaussians.
 
-Compositing takes a Gaussian as log2(alpha) = q - t^2 - r^2 with t = sa (dx - k dy), r = sb dy. This completed square
-loses no digits in float32 for a long thin Gaussian, and |t|, |r| stay below 3 where it is drawn.
+Compositing evaluates a Gaussian as log2(alpha) = q - t^2 - r^2 with t = sa (dx - k dy), r = sb dy. This completed
+square loses no digits in float32 for a long thin Gaussian, and |t|, |r| stay below 3 where it is drawn.
 """
 
 import math
@@ -40,7 +40,7 @@ SLOTS = SLOT_COLOR + 3
 
 @kernel()
 def _saturate(value: float) -> Any:
-    """float32 of `value`, at most float32's largest magnitude; NaN passes."""
+    """Converts `value` to float32, clamped to float32's range; NaN passes."""
     return np.float32(min(max(value, -_F32_MAX), _F32_MAX)) if value == value else np.float32(value)
 
 
@@ -159,7 +159,7 @@ def project(
         seen = radius_x > 0.0 and mx + radius_x > 0.0 and mx - radius_x < width
         if not (seen and my + radius_y > 0.0 and my - radius_y < height):
             continue
-        # Slightly too wide, so that only the alpha test itself decides about a pixel, whatever the tiles.
+        # Slightly too wide, so that the alpha test alone decides which pixels are drawn.
         half_width, half_height = half_width * (1.0 + 1e-5) + 1e-3, half_height * (1.0 + 1e-5) + 1e-3
         left, right = np.ceil(mx - half_width - 0.5), np.floor(mx + half_width - 0.5)
         top, bottom = np.ceil(my - half_height - 0.5), np.floor(my + half_height - 0.5)
@@ -231,8 +231,8 @@ def project_backward(
     g_colors: Array,
     g_means2d: Array,
 ) -> None:
-    """Sums each Gaussian's slots in float64, in a fixed order, and carries the gradient to the inputs: fills g_*, which
-    are given zeroed. slots[first[i] : first[i + 1]] belong to Gaussian i.
+    """Sums each Gaussian's slots in float64, in a fixed order, and backpropagates the sums to the inputs: fills g_*,
+    given zeroed. slots[first[i] : first[i + 1]] belong to Gaussian i.
     """
     sums = np.empty(SLOTS)
     for i in range(tasks[0], tasks[1]):

@@ -1,8 +1,8 @@
-"""Gaussians to pictures and the gradient back, on the CPU: plain functions over numpy arrays around the numba kernels.
+"""The rasteriser on the CPU: draws Gaussians and computes gradients, by functions of numpy arrays around numba kernels.
 
 `draw` draws one picture. Training calls the stages one by one: `project`, `composite`, `backward`. Gaussians are sorted
-into tiles here: depth order by a radix sort, then a stable counting sort, parallel over equal chunks of the depth
-order, whose result does not depend on the number of chunks or threads.
+into tiles here: a radix sort by depth, then a stable counting sort by tile, parallel over equal chunks of the depth
+order. The result does not depend on the number of chunks or threads.
 """
 
 import math
@@ -21,7 +21,7 @@ from pd4dgs_codec.scene import Camera
 CHUNKS_PER_THREAD = 4  #: of the depth order while binning
 MAX_COUNT = 2**31  #: of Gaussians, and of pairs of a Gaussian and a tile
 MAX_SIDE = 65535  #: pixels
-#: Least volume of a viewmat's 3 x 3 part; that of a rotation is 1.
+#: Least absolute determinant of a viewmat's 3 x 3 part; a rotation has 1.
 LEAST_VOLUME = 1e-9
 
 
@@ -36,7 +36,7 @@ class Geometry(NamedTuple):
 
 @dataclass(eq=False)
 class Projected:
-    """N Gaussians in front of a camera and the tiles that they touch; radii and means2d are 0 where one is skipped."""
+    """N projected Gaussians and the tiles that they touch; radii and means2d of skipped Gaussians are 0."""
 
     width: int
     height: int
@@ -70,7 +70,7 @@ def draw(
     *,
     near_plane: float = 0.01,
 ) -> tuple[Array, Array]:
-    """The picture of N Gaussians, float32 [H, W, 3], and its alpha, float32 [H, W] in 0..1.
+    """Draws N Gaussians. Returns the picture, float32 [H, W, 3], and its alpha, float32 [H, W] in 0..1.
 
     means      [N, 3] world, scene units.
     quats      [N, 4] rotations wxyz, not necessarily unit; a zero quaternion is the identity.
@@ -80,7 +80,7 @@ def draw(
     near_plane: Gaussians with camera z outside (near_plane, FAR] are skipped, scene units.
 
     Arrays of any float type are drawn in float32. A Gaussian with NaN or infinity in its position, rotation or scale is
-    skipped. Raises RenderError for wrong shapes, NotFinite (a RenderError) for colours.
+    skipped. Raises RenderError for wrong shapes, NotFinite (a RenderError) for colours that are not finite.
     """
     given = means, quats, scales, opacities, colors
     behind = check_input(given, camera, background, near_plane, _is_floats, lambda a: float(a.astype(np.float32).sum()))
@@ -103,8 +103,8 @@ def project(geometry: Geometry, camera: Camera, near_plane: float) -> Projected:
 
 
 def composite(projected: Projected, colors: Array, background: Array) -> tuple[Array, Array]:
-    """(picture float32 [H, W, 3], transmittance float32 [H, W] = 1 - alpha) of colors float32 [N, 3], contiguous, over
-    background float32 [3]."""
+    """Composites colors float32 [N, 3], contiguous, over background float32 [3]. Returns the picture, float32
+    [H, W, 3], and the transmittance 1 - alpha, float32 [H, W]."""
     picture = np.empty((projected.height, projected.width, 3), np.float32)
     transmittance = np.empty(picture.shape[:2], np.float32)
     compositing.composite(projected.items, projected.starts, projected.geom, colors, background, picture, transmittance)
@@ -120,8 +120,8 @@ def backward(
     g_picture: Array,
     g_alpha: Array,
 ) -> Gradients:
-    """Gradients of a loss from g_picture [H, W, 3] and g_alpha [H, W], its derivatives by the results of `composite`,
-    float32 and contiguous. The other arguments are those of `project` and `composite` and their results."""
+    """Returns the gradients of a loss from g_picture [H, W, 3] and g_alpha [H, W], its derivatives by picture and 1 -
+    transmittance, float32 and contiguous. `project` and `composite` take or return the other arguments."""
     result = Gradients(
         Geometry(*(np.zeros_like(a) for a in geometry)), np.zeros_like(colors), np.zeros_like(projected.means2d)
     )
@@ -151,7 +151,7 @@ def _pack_camera(camera: Camera) -> Array:
 
 
 def _bin(visible: Array, depths: Array, rects: Array, width: int, height: int) -> tuple[Array, Array, Array, Array]:
-    """(first, items, slot_of, starts), see `Projected`."""
+    """Sorts Gaussians into tiles. Returns (first, items, slot_of, starts), see `Projected`."""
     order = depth_order(visible, depths)
     columns, rows = -(-width // projection.TILE_WIDTH), -(-height // projection.TILE_HEIGHT)
     counts = np.empty((CHUNKS_PER_THREAD * threads.kernel_threads(), columns * rows), np.int64)
@@ -264,10 +264,10 @@ def check_input(
     is_floats: Callable[[Any], bool],
     total: Callable[[Any], float],
 ) -> Array:
-    """The background, float32 [3]. Raises RenderError for wrong types, shapes and cameras, NotFinite for colours.
+    """Checks the arguments of `draw`; returns the background, float32 [3].
 
-    given: arrays or tensors, in the order of SHAPES. is_floats: whether one is an array of floats. total: the sum of
-    one in float32.
+    given: arrays or tensors, in the order of SHAPES. is_floats: whether one holds floats. total: the float32 sum of
+    one. Raises RenderError for wrong types, shapes and cameras, NotFinite for colours that are not finite.
     """
     if not 0 <= near_plane < projection.FAR:
         raise RenderError(f"near_plane is {near_plane}, expected 0 <= near_plane < {projection.FAR:g}")
@@ -300,7 +300,7 @@ def _check_shape(name: str, found: Sequence[int], *expected: int | None) -> None
 
 
 def check_camera(camera: Camera) -> None:
-    """Raises RenderError unless it is a pinhole without skew whose picture has 1 to MAX_SIDE pixels a side."""
+    """Raises RenderError unless `camera` is a pinhole without skew and has 1 to MAX_SIDE pixels a side."""
     for name, value in (("width", camera.width), ("height", camera.height)):
         if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MAX_SIDE:
             raise RenderError(f"{name} is {value!r}, expected an integer from 1 to {MAX_SIDE}")

@@ -1,13 +1,13 @@
-"""The decorators of numba kernels, and explicit vectors for them: `LANES` floats, or `WIDE`, as one value.
+"""Decorators for numba kernels, and a vector type for them: `LANES` or `WIDE` floats as one value.
 
 LLVM's loop vectoriser gives up on a loop that reads a dozen rows and writes others, since it cannot prove that they do
 not overlap (numba has no `noalias`), and on short rows it stores every sum back to memory. With a vector type each
-operation of the inner loop is one LLVM instruction, which LLVM splits where registers are narrower. Lookups in planes
-are 2.6 to 4.5 times faster so.
+operation of the inner loop is one LLVM instruction, which LLVM splits where registers are narrower. This makes lookups
+in planes 2.6 to 4.5 times faster.
 
-Sums are never reordered, and only `fma` and `fnma` fuse operations, so that the bits of a result do not depend on how
-often LLVM optimised a function. With numba's fast math they may: a function is optimised on its own and again inside
-the kernel that calls it.
+Sums are never reordered, and only functions of this module fuse operations, so that the bits of a result do not depend
+on how often LLVM optimised a function. numba's fast math would break this: LLVM optimises a function on its own and
+again inside the kernel that calls it.
 
 Arrays are float32 or float64, C-contiguous, of any rank; an index is an offset into the flattened array, unchecked.
 
@@ -36,14 +36,14 @@ from pd4dgs_codec import threads
 LANES = 8
 #: Floats in the widest register of the CPU that numba compiles for (its cache is keyed by that CPU).
 WIDE = 16 if "+avx512f" in cpu_target.target_context.codegen().magic_tuple()[2] else LANES
-#: Rows and vectors of WIDE floats of a `product`: as many sums as leave registers for the rows that are read.
+#: Size of a `product`, rows and vectors of WIDE floats: its sums leave enough registers for the rows that are read.
 PRODUCT_ROWS, PRODUCT_VECTORS = 12 if WIDE > LANES else 6, 2
 
 CACHE_LINE = 64  #: bytes
 
 Array = np.ndarray  #: in annotations of kernels
 Vector = Any  #: in annotations of kernels: a value of the numba type `Lanes`
-Tasks = tuple[int, int]  #: a range of tasks: the first, and the end
+Tasks = tuple[int, int]  #: a half-open range of tasks
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 _Arguments = ParamSpec("_Arguments")
 _intrinsic: Callable[[Callable[..., Any]], Callable[..., Any]] = _numba_intrinsic
@@ -52,7 +52,7 @@ _intrinsic: Callable[[Callable[..., Any]], Callable[..., Any]] = _numba_intrinsi
 class _Uncollected(event.Listener):
     """Turns Python's garbage collection off while numba compiles: it took a sixth of the time."""
 
-    depth, was_enabled = 0, False  #: under numba's lock of all compiling
+    depth, was_enabled = 0, False  #: guarded by numba's compiler lock
 
     def on_start(self, event: Any) -> None:
         if self.depth == 0:
@@ -72,8 +72,7 @@ event.register("numba:compile", _Uncollected())  # type: ignore[no-untyped-call]
 def kernel(*, inline: bool = False) -> Callable[[_Function], _Function]:
     """Decorator of a function that numba compiles at its first call and caches beside its source.
 
-    inline: into the functions that call it. Divisions by zero give what IEEE 754 says; the interpreter's lock is
-    released.
+    inline: inlines it into its callers. Divisions by zero follow IEEE 754; the interpreter's lock is released.
     """
     options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
     if inline:
@@ -84,8 +83,8 @@ def kernel(*, inline: bool = False) -> Callable[[_Function], _Function]:
         template = compiled.get_call_template
 
         def get_call_template(args: Sequence[Any], named: dict[str, Any]) -> Any:
-            """For calls from other kernels. To numba a constant is a type of its own, for which it would compile the
-            function again; LLVM propagates constants into inlined functions all the same."""
+            """Gives constants in calls from other kernels their plain type: numba has a type per constant and would
+            compile the function again for each. LLVM still propagates constants into inlined functions."""
             return template(tuple(map(types.unliteral, args)), named)
 
         compiled.get_call_template = get_call_template
@@ -98,16 +97,16 @@ def kernel(*, inline: bool = False) -> Callable[[_Function], _Function]:
 def parallel(
     tasks: Callable[..., int],
 ) -> Callable[[Callable[Concatenate[Tasks, _Arguments], None]], Callable[_Arguments, None]]:
-    """Decorator of a `kernel` whose independent tasks threads share; `tasks` gives their number from its arguments.
+    """Decorator of a `kernel` whose independent tasks are shared among threads; `tasks` counts them from its arguments.
 
-    The kernel's first argument, which callers leave out, is the range of tasks to do: all, or a part in each of several
-    calls. numba's own parallel loops take more than twice as long to compile and to load.
+    The kernel's first argument, which callers leave out, is the range of tasks to do. numba's own parallel loops take
+    more than twice as long to compile and to load.
     """
 
     def decorate(function: Callable[Concatenate[Tasks, _Arguments], None]) -> Callable[_Arguments, None]:
         compiled, sharer = kernel()(function), threads.Sharer()
 
-        @functools.wraps(compiled, updated=())  # which is `__wrapped__`
+        @functools.wraps(compiled, updated=())  # sets `__wrapped__` to the kernel
         def call(*arguments: _Arguments.args, **named: _Arguments.kwargs) -> None:
             sharer.share(tasks(*arguments, **named), lambda own: compiled(own, *arguments, **named))
 
@@ -198,7 +197,7 @@ def _load(count: int) -> Callable[..., Any]:
     return _intrinsic(function)
 
 
-#: flat array[index : index + LANES], and the same of WIDE
+#: flat array[index : index + LANES], or of WIDE
 load, wide_load = _load(LANES), _load(WIDE)
 
 
@@ -231,7 +230,7 @@ def _splat_of(count: int) -> Callable[..., Any]:
     return _intrinsic(function)
 
 
-#: The float `scalar` in each of LANES lanes, and of WIDE
+#: The float `scalar` in each of LANES lanes, or of WIDE
 splat, wide_splat = _splat_of(LANES), _splat_of(WIDE)
 
 
@@ -293,7 +292,7 @@ def fnma(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
 
 
 def _product(rows: int, vectors: int) -> Callable[..., Any]:
-    """`product`, of so many rows and vectors."""
+    """Makes a `product` of `rows` rows and `vectors` vectors of WIDE columns."""
 
     def function(
         typingctx: Any, y: Any, y_at: Any, y_row: Any, start: Any, start_at: Any, start_row: Any, a: Any, a_at: Any,
@@ -346,9 +345,9 @@ def _product(rows: int, vectors: int) -> Callable[..., Any]:
 #: y = start + a b, of PRODUCT_ROWS rows and PRODUCT_VECTORS * WIDE columns; with `relu` negative values become 0 (NaN
 #: passes).
 #:
-#: Each array comes with the offset of its first number and the distance between its rows, 0 for a single row. The
-#: `count` columns of a, `a_step` apart, meet as many rows of b. Sums are in the order of the columns, fused where the
-#: CPU can, so that the bits do not depend on the blocks that a product is cut into.
+#: Each array comes with the offset of its first number and the distance between its rows (0 repeats one row). The sums
+#: run over `count` columns of a, `a_step` apart, and as many rows of b, in order and fused where the CPU can, so that
+#: the bits do not depend on the blocks that a product is cut into.
 product = _product(PRODUCT_ROWS, PRODUCT_VECTORS)
 #: The same of WIDE columns.
 narrow_product = _product(PRODUCT_ROWS, 1)
