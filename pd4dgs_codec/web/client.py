@@ -1,4 +1,4 @@
-"""The viewer's side of a `.pd4` file on a web server: its first bytes, and scenes as its slices arrive.
+"""Fetches `.pd4` files from web servers: whole files, prefixes, and scenes while their slices arrive.
 
 Bytes that have arrived are never requested again unless the file changes. HTTP comes from the standard library.
 Connections are direct (no proxies), stay open between requests, and follow redirects.
@@ -39,7 +39,7 @@ from pd4dgs_codec.web.headers import content_range, strong_etag
 
 BLOCK = 1 << 16
 MAX_REDIRECTS = 5
-#: After so many changes during one transfer the file counts as never stable.
+#: A transfer fails if the file changes more often than this.
 MAX_CHANGES = 4
 BACKOFF_SECONDS = 0.2
 #: Temporary errors; all others are final.
@@ -47,17 +47,17 @@ TEMPORARY = {408, 425, 429, 500, 502, 503, 504}
 REDIRECTS = {301, 302, 303, 307, 308}
 #: Characters of a server's text that an error message quotes.
 SHOWN = 80
-#: Most headers have some 300 bytes; a longer one costs a second request.
+#: Bytes of the first request for a prefix. Most headers have some 300; a longer one costs a second request.
 HEADER_GUESS = 512
 LONGEST_HEADER = PREAMBLE_SIZE + MAX_HEADER
-#: Bytes of a file that are fetched where no budget is given: a header of a few bytes may promise terabytes.
+#: Limit of the bytes fetched if no budget is given: a header of a few bytes may promise terabytes.
 MOST_BYTES = 1 << 28
 
 T = TypeVar("T")
 
 
 class Changed(Exception):
-    """The file has changed: its earlier bytes are discarded, and the transfer stands at byte 0."""
+    """The file has changed: its earlier bytes are discarded, and the transfer restarts at byte 0."""
 
 
 class _Cut(Exception):
@@ -65,11 +65,11 @@ class _Cut(Exception):
 
 
 class Transfer:
-    """Fetches one URL front to back, as far as asked, and resumes after interruptions.
+    """Fetches one URL from byte 0 up to the requested offset, and resumes after interruptions.
 
-    data: bytes that have arrived, from byte 0. total: length of the file, None until known. stall: seconds until a
-    connection without a complete response header, or without a further byte of the body, counts as interrupted.
-    attempts: consecutive failures, without a byte between them, before giving up. requests, cuts, changes: counts.
+    data: bytes from byte 0 on that have arrived. total: length of the file, None until known. stall: seconds without a
+    complete response header, or a further byte of the body, after which a connection counts as interrupted. attempts:
+    failures without a byte between them after which it gives up. requests, cuts (interruptions), changes: counts.
     """
 
     def __init__(self, url: str, *, stall: float = 10.0, attempts: int = 5):
@@ -82,13 +82,13 @@ class Transfer:
         self._connection: http.client.HTTPConnection | None = None
         self._socket: socket.socket | None = None  # http.client forgets it before the last response is read
         self._response: http.client.HTTPResponse | None = None
-        self._at = 0  # offset in the file of the next byte of the response; bytes that are here are skipped
+        self._at = 0  # offset in the file of the next byte of the response; bytes already in `data` are skipped
         self._response_end: int | None = None  # offset in the file where the response ends, if known
 
     def read(self, end: int | None = None, *, reach: int | None = None) -> bytes:
-        """The next bytes to arrive, none beyond `end` (None: the end of the file); empty if all are here.
+        """Returns the next bytes to arrive, none beyond `end` (None: the end of the file); empty if all have arrived.
 
-        reach: offset up to which one request may ask, so that later reads need no further request; None: the end.
+        reach: offset up to which a request asks for bytes, so that later reads need no other; None: the file's end.
         Raises Changed, or DeliveryError if the file is not available.
         """
         failures = 0
@@ -137,7 +137,7 @@ class Transfer:
         return (end is not None and size >= end) or (self.total is not None and size >= self.total)
 
     def _receive(self, end: int | None) -> bytes:
-        """One block of the response; b"" at its regular end and while bytes are skipped."""
+        """Reads a block of the response; returns b"" at its regular end and for bytes that are skipped."""
         response, skipped = self._response, len(self.data) - self._at
         assert response is not None and self._socket is not None
         limits = [BLOCK]
@@ -188,11 +188,11 @@ class Transfer:
         raise DeliveryError(f"more than {MAX_REDIRECTS} redirects")
 
     def _send(self, headers: dict[str, str]) -> http.client.HTTPResponse:
-        """The response with its headers. The time limit covers name resolution, connection, TLS and all headers."""
+        """Sends a request. The time limit covers name resolution, connection, TLS and all headers of the response."""
         if self._connection is None:
             secure = self._place.scheme == "https"
             kind = http.client.HTTPSConnection if secure else http.client.HTTPConnection
-            port = self._place.port or kind.default_port  # without one it is looked for in an IPv6 address
+            port = self._place.port or kind.default_port  # HTTPConnection would seek one in an IPv6 address
             self._connection = kind(str(self._place.hostname), port, timeout=self.stall)
         connection, target = self._connection, _target(self._place)
         self.requests += 1
@@ -214,11 +214,11 @@ class Transfer:
         return _within(self.stall, exchange)
 
     def _accept(self, response: http.client.HTTPResponse, start: int, asked_range: bool) -> None:
-        """Checks a response for bytes from `start` on. Raises Changed if it is about another file than before."""
+        """Checks a response for bytes from `start` on. Raises Changed if the file is no longer the same."""
         status, part = response.status, content_range(response.headers.get("Content-Range"))
         if status == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE and asked_range:
             if start:
-                self._restart()  # the file has become shorter than the bytes that are here
+                self._restart()  # the file is now shorter than the bytes that have arrived
             self.close()
             self.total = 0
             return
@@ -247,7 +247,7 @@ class Transfer:
         self._validator = validator or self._validator
 
     def _restart(self, keep_response: bool = False, validator: str | None = None) -> None:
-        """Back to byte 0. keep_response: the current response, with this validator, begins there."""
+        """Restarts at byte 0 and raises Changed. keep_response: the response, with `validator`, begins at byte 0."""
         self.data.clear()
         self.changes += 1
         self._validator = validator
@@ -260,8 +260,8 @@ class Transfer:
 
 
 def _within(seconds: float, work: Callable[[], T]) -> T:
-    """The result of `work` in a thread; TimeoutError after `seconds`. Sockets have a time limit for each operation
-    alone, the system's resolver has none."""
+    """Runs `work` in a thread and returns its result. Raises TimeoutError after `seconds`, since a socket limits only
+    the time of each operation and the system's resolver has no limit."""
     result: futures.Future[T] = futures.Future()
 
     def run() -> None:
@@ -278,7 +278,7 @@ def _within(seconds: float, work: Callable[[], T]) -> T:
 
 
 def _parsed(url: str, base: str = "") -> SplitResult:
-    """The parts of an address that can be fetched, if relative from `base` on. Raises DeliveryError for any other."""
+    """Splits an HTTP address, which may be relative to `base`. Raises DeliveryError if it cannot be fetched."""
     with contextlib.suppress(ValueError):
         parts = urlsplit(urljoin(base, url))
         if is_url(parts.geturl()) and parts.hostname and "@" not in parts.netloc and parts.port != 0:
@@ -305,7 +305,7 @@ def _reason(error: BaseException) -> str:
 
 
 def slice_ends(data: bytes | bytearray) -> list[tuple[int, int]]:
-    """(layer, end offset) of each slice in file order, from a file's first bytes; empty if they end within the
+    """Reads (layer, end offset) of each slice in file order from a file's first bytes; empty if they end within the
     header."""
     size = _header_size(data)
     layers = [] if size is None else info(bytes(data[:size]))["layers"]
@@ -313,24 +313,24 @@ def slice_ends(data: bytes | bytearray) -> list[tuple[int, int]]:
 
 
 def prefix_end(slices: list[tuple[int, int]], max_layer: int | None = None, max_bytes: int | None = None) -> int:
-    """End of the last slice of a layer up to max_layer that ends within max_bytes; 0 if there is none."""
+    """Returns the end of the last slice within max_bytes that belongs to a layer up to max_layer; 0 if none does."""
     layer_limit, limit = (math.inf if most is None else most for most in (max_layer, max_bytes))
     return max((end for layer, end in slices if layer <= layer_limit and end <= limit), default=0)
 
 
 def check_end(end: int) -> None:
-    """Raise LimitExceeded if a file, or the prefix of it that is asked for, ends too far behind."""
+    """Raises LimitExceeded if a file, or the requested prefix of it, ends more than a byte beyond MOST_BYTES."""
     if end > MOST_BYTES + 1:
         raise LimitExceeded(f"ends at byte {end:,}, limit {MOST_BYTES:,} without a budget of bytes")
 
 
 def fetch(transfer: Transfer, max_layer: int | None = None, max_bytes: int | None = None) -> bytes:
-    """The file, or its prefix of layers up to max_layer, or of slices within max_bytes, the header in any case; fewer
-    bytes if the remote file ends early.
+    """Fetches a file, or its prefix: the header, and the slices of layers up to max_layer that end within max_bytes.
+    Returns fewer bytes if the remote file ends early.
 
-    A prefix takes two requests for exactly its bytes, the whole file one. One byte after the last chunk is fetched, so
-    that the decoder sees trailing data. Raises as Transfer.read does, and DecodeError for an invalid header, and for a
-    prefix that ends behind byte MOST_BYTES without max_bytes.
+    A whole file takes one request, a prefix two (three with a long header). Of a whole file one byte more is fetched,
+    so that the decoder sees trailing data. Raises as Transfer.read does, DecodeError for an invalid header, and
+    LimitExceeded for bytes beyond MOST_BYTES without max_bytes.
     """
     whole = max_layer is None and max_bytes is None
 
@@ -363,7 +363,7 @@ def _header_size(data: bytes | bytearray) -> int | None:
 
 
 class SceneClient:
-    """Scenes of one URL, as early as they can be decoded. Use it in a `with` block, or close it.
+    """Decodes the scenes of one URL as early as possible. Use it in a `with` block, or close it.
 
     The first request is one open-ended GET, read as it arrives. After an interruption, and for slices requested later,
     Range with If-Range fetches the missing bytes only. If the file has changed, decoding restarts with its layer 0. A
@@ -388,11 +388,11 @@ class SceneClient:
         self.transfer.close()
 
     def scenes(self, max_layer: int | None = None, max_bytes: int | None = None) -> Iterator[Scene]:
-        """The newest scene as slices arrive, with all slices so far: those of layers up to max_layer that end within
-        the first max_bytes of the file; without max_bytes nothing behind byte MOST_BYTES is fetched.
+        """Yields the newest scene, with all slices so far, as slices arrive. Only slices of layers up to max_layer that
+        end within the first max_bytes of the file (None: MOST_BYTES) are fetched.
 
         A further call continues after the last slice yielded. Raises DeliveryError if the file is not available,
-        DecodeError if it is invalid or its first slice ends behind MOST_BYTES; scenes yielded before stay valid.
+        DecodeError if it is invalid or its first slice ends beyond MOST_BYTES; scenes yielded before stay valid.
         """
         limits = max_layer, MOST_BYTES if max_bytes is None else max_bytes
         while True:
@@ -440,7 +440,7 @@ class SceneClient:
         data, end = self.transfer.data, len(self.transfer.data)
         if not self._slices:
             self._slices = slice_ends(data)
-        if self._slices:  # the first bytes of a small file may hold more than is asked for
+        if self._slices:  # the first bytes of a small file may hold more than requested
             end = min(end, prefix_end(self._slices, max_layer, max_bytes))
         block, self._fed = bytes(data[self._fed : end]), max(self._fed, end)
         return self._stream.feed(block)

@@ -11,7 +11,7 @@ _CONTENT_RANGE = re.compile(rf"bytes ({_DIGITS})-({_DIGITS})/({_DIGITS})", re.IG
 _ADDRESSED = re.compile(r"-[0-9a-f]{16}\.\w+$")
 #: Caches keep immutable files for a year, and revalidate all others on every use.
 IMMUTABLE, CHANGES = "public, max-age=31536000, immutable", "no-cache"
-#: Of files by their suffix. That of scenes is described in packaging/.
+#: Media type by suffix; packaging/ describes the type of scenes.
 MEDIA_TYPES = {
     ".css": "text/css; charset=utf-8",
     ".html": "text/html; charset=utf-8",
@@ -38,7 +38,7 @@ class Unsatisfiable(Exception):
 
 
 def requested_range(header: str | None, size: int) -> tuple[int, int] | None:
-    """(start, end), end exclusive, of the Range header for a file of `size` bytes; None for the whole file.
+    """Returns (start, end), end exclusive, that a Range header requests of `size` bytes; None for the whole file.
 
     A list of ranges and an invalid header are ignored, as RFC 9110 (14.2) permits. Raises Unsatisfiable.
     """
@@ -59,14 +59,14 @@ def requested_range(header: str | None, size: int) -> tuple[int, int] | None:
 
 
 def content_range(header: str | None) -> tuple[int, int, int] | None:
-    """(start, end, length of the file) of a Content-Range header, end exclusive; None unless it tells all three."""
+    """Returns (start, end, file length) of a Content-Range header, end exclusive; None unless it has all three."""
     match = _CONTENT_RANGE.fullmatch(header.strip()) if header else None
     first, last, size = map(int, match.groups()) if match else (0, 0, 0)
     return (first, last + 1, size) if first <= last < size else None
 
 
 def strong_etag(header: str | None) -> str | None:
-    """The entity tag if it is a strong one, which promises equal bytes."""
+    """Returns the entity tag if it is strong, which promises equal bytes, else None."""
     return header if header and header.startswith('"') and header.endswith('"') and len(header) > 2 else None
 
 

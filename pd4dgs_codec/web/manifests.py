@@ -1,7 +1,7 @@
-"""DASH and HLS manifests of a package, and the MP4 files that they name.
+"""Writes DASH and HLS manifests of a package and the MP4 boxes that hold its slices.
 
 DASH carries the layers: one AdaptationSet per slice, whose Representation names the slices that it depends on. HLS has
-no dependent layers: its playlist shows the 2D video and refers to the JSON index, which tells where the layers are.
+no dependent layers: its playlist plays the 2D video and links the JSON index, which lists the layers.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _CONTAINERS = {b"moov", b"trak", b"mdia", b"minf", b"stbl", b"mvex", b"moof", b"
 
 LAYER_SCHEME = "urn:pd4dgs:layer:2026"
 SESSION_DATA_ID = "org.pd4dgs.layers"
-MIN_BUFFER_SECONDS = 1  #: the time in which each bandwidth delivers its layers
+MIN_BUFFER_SECONDS = 1  #: time in which each bandwidth delivers the file up to the slice's end
 MAX_SECONDS = ((1 << 32) - 1) // TIMESCALE  #: the duration of a sample has 32 bits
 
 
@@ -43,7 +43,7 @@ class Video:
 
 
 def dash(slices: list[dict[str, Any]], seconds: float, video: Video | None = None, video_name: str = "") -> bytes:
-    """The MPD. slices: as the index of the package lists them. video, video_name: the 2D rendition and its file."""
+    """Returns the DASH MPD. slices: `layers` of the package's index. video, video_name: 2D rendition and its file."""
     root = Element("MPD", xmlns="urn:mpeg:dash:schema:mpd:2011", profiles="urn:mpeg:dash:profile:full:2011")
     root.attrib |= {"type": "static", "mediaPresentationDuration": _duration(seconds)}
     root.set("minBufferTime", _duration(MIN_BUFFER_SECONDS))
@@ -87,7 +87,7 @@ def _video_set(period: Element, video: Video, name: str) -> None:
 
 
 def _segment_list(parent: Element, url: str, init: int, seconds: float, ranges: Iterable[tuple[int, int]]) -> None:
-    """ranges: bytes of segments that last `seconds` each, ends exclusive."""
+    """Adds a SegmentList. ranges: bytes of segments that last `seconds` each, ends exclusive."""
     SubElement(parent, "BaseURL").text = url
     segments = SubElement(parent, "SegmentList", timescale=str(TIMESCALE), duration=str(ticks(seconds)))
     SubElement(segments, "Initialization", range=f"0-{init - 1}")
@@ -100,7 +100,7 @@ def _duration(seconds: float) -> str:
 
 
 def hls(index: str, video: Video | None = None, playlist: str = "") -> bytes:
-    """The multivariant playlist. index: the JSON index. video, playlist: the 2D rendition and its media playlist."""
+    """Returns the multivariant HLS playlist. index, playlist: names of the JSON index and of the media playlist."""
     lines = ["#EXTM3U", "#EXT-X-VERSION:7", f'#EXT-X-SESSION-DATA:DATA-ID="{SESSION_DATA_ID}",URI="{index}"']
     if video is not None:
         init, pieces = fragments(video.data)
@@ -111,7 +111,7 @@ def hls(index: str, video: Video | None = None, playlist: str = "") -> bytes:
 
 
 def hls_video(video: Video, name: str) -> bytes:
-    """The media playlist of the 2D rendition, whose file is `name`."""
+    """Returns the HLS media playlist of the 2D rendition, whose file is `name`."""
     init, pieces = fragments(video.data)
     seconds = [piece.samples / video.fps for piece in pieces]
     lines = ["#EXTM3U", "#EXT-X-VERSION:7", "#EXT-X-PLAYLIST-TYPE:VOD", "#EXT-X-INDEPENDENT-SEGMENTS"]
@@ -135,7 +135,7 @@ def _codec(init: bytes) -> str:
     return f"avc1.{init[at + 5 : at + 8].hex()}"
 
 
-# -- MP4 files (ISO/IEC 14496-12): of slices, a metadata track each of one fragment; and the fragments of others -------
+# -- MP4 (ISO/IEC 14496-12): writes a track of one fragment per slice, and finds the fragments of other files ----------
 
 
 def ticks(seconds: float) -> int:
@@ -144,7 +144,7 @@ def ticks(seconds: float) -> int:
 
 
 def box(kind: bytes, *parts: bytes) -> bytes:
-    """One box. Raises DeliveryError if its size exceeds 32 bits."""
+    """Returns one box. Raises DeliveryError if its size exceeds 32 bits."""
     size = 8 + sum(map(len, parts))
     if size > MAX_BOX:
         raise DeliveryError(f"a layer of {size:,} bytes, an MP4 box holds at most {MAX_BOX:,}")
@@ -156,7 +156,7 @@ def _full(kind: bytes, version: int, flags: int, *parts: bytes) -> bytes:
 
 
 def initialisation(tracks: int, ticks: int) -> bytes:
-    """`ftyp` and `moov` of `tracks` metadata tracks, ids from 1, that last `ticks` (32 bits) each; samples follow."""
+    """Returns `ftyp` and `moov` of `tracks` metadata tracks with ids from 1 that last `ticks` (32 bits) each."""
     times = struct.pack(">QQIQ", 0, 0, TIMESCALE, ticks)
     rate_volume = struct.pack(">IH10x", 1 << 16, 1 << 8)
     header = _full(b"mvhd", 1, 0, times, rate_volume, _IDENTITY, bytes(24), struct.pack(">I", tracks + 1))
@@ -188,7 +188,7 @@ def _track(number: int, ticks: int) -> bytes:
 
 
 def fragment(number: int, track: int, payload: bytes, ticks: int) -> bytes:
-    """`moof` and `mdat` of one sample that lasts from 0 to `ticks`."""
+    """Returns `moof` and `mdat` of one sample that lasts from 0 to `ticks`. number: of the fragment in the file."""
 
     def moof(data_offset: int) -> bytes:
         run_flags = 0x000301  # data offset, and each sample's duration and size
@@ -207,7 +207,7 @@ def fragment(number: int, track: int, payload: bytes, ticks: int) -> bytes:
 
 
 class Box(NamedTuple):
-    """kind, and the offsets of its first byte, of its content and of its end (exclusive)."""
+    """An MP4 box: its kind and the offsets of its first byte, its content and its end (exclusive)."""
 
     kind: bytes
     start: int
@@ -216,7 +216,7 @@ class Box(NamedTuple):
 
 
 def boxes(data: bytes, start: int = 0, end: int | None = None) -> Iterator[Box]:
-    """The sequence of boxes in data[start:end]. Raises DeliveryError if they do not fill it."""
+    """Yields the boxes in data[start:end] in order. Raises DeliveryError if they do not fill it."""
     end = len(data) if end is None else end
     while start < end:
         size, kind = struct.unpack_from(">I4s", data, start) if end - start >= 8 else (0, b"")
@@ -230,7 +230,7 @@ def boxes(data: bytes, start: int = 0, end: int | None = None) -> Iterator[Box]:
 
 
 def find(data: bytes, kind: bytes, inside: Sequence[Box]) -> Iterator[Box]:
-    """All boxes of a kind inside others, at any depth."""
+    """Yields all boxes of a kind inside the boxes `inside`, at any depth."""
     for parent in inside:
         for child in boxes(data, parent.content, parent.end):
             if child.kind == kind:
@@ -248,7 +248,7 @@ class Fragment(NamedTuple):
 
 
 def fragments(data: bytes) -> tuple[int, list[Fragment]]:
-    """(bytes before the first fragment, fragments) of a fragmented file."""
+    """Returns (bytes before the first fragment, fragments) of an MP4 file. Raises DeliveryError if it has none."""
     top = list(boxes(data))
     result = []
     for moof, mdat in zip(top, top[1:], strict=False):

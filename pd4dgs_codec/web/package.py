@@ -1,7 +1,7 @@
-"""A `.pd4` file as a folder for any web server: the player's page, DASH and HLS manifests, and a JSON index.
+"""Packages a `.pd4` file as a folder for any web server: the player's page, DASH and HLS manifests, a JSON index.
 
-`scene.mp4` holds each slice in an MP4 fragment of its own; concatenated, its samples are the `.pd4` file. A folder of
-packages gets an index of its own, the library.
+`scene.mp4` holds each slice in an MP4 fragment of its own; concatenated, its samples are the `.pd4` file. A library is
+the index of a folder of packages.
 """
 
 import hashlib
@@ -24,7 +24,7 @@ from pd4dgs_codec.web.page import page
 
 SCENE, SEGMENTS, MPD, PLAYLIST, INDEX = "scene.pd4", "scene.mp4", "scene.mpd", "scene.m3u8", "index.json"
 VIDEO, VIDEO_PLAYLIST, POSTER = "fallback.mp4", "fallback.m3u8", "poster.jpg"
-#: Link rates, bits per second, for which the index tells the time of the first picture.
+#: Link rates, bits per second, for which the index gives the time of the first picture.
 RATES = {"2M": 2e6, "10M": 1e7, "50M": 5e7}
 STILL_SECONDS = 1.0  #: presentation time of a static scene
 
@@ -32,10 +32,10 @@ STILL_SECONDS = 1.0  #: presentation time of a static scene
 def package(
     data: bytes, render: Callable[[Scene], Video | None] | None = None, *, immutable: bool = False
 ) -> dict[str, bytes]:
-    """Name -> content of every file of the folder.
+    """Returns name -> content of every file of the folder.
 
-    render: makes the 2D rendition of the decoded scene, or returns None. immutable: names of files to which others
-    refer contain a digest of their content, so that caches may keep them forever. Raises DecodeError unless `data` is a
+    render: makes the 2D rendition of the decoded scene, or returns None. immutable: names of scene and media files
+    contain a digest of their content, so that caches may keep them forever. Raises DecodeError unless `data` is a
     complete, valid `.pd4` file, and DeliveryError if it is too long or too large for MP4, both before rendering.
     """
     scene = decode(data)
@@ -84,7 +84,7 @@ def addressed(name: str, content: bytes) -> str:
 
 
 def _segments(data: bytes, about: dict[str, Any], seconds: float) -> tuple[bytes, list[dict[str, Any]]]:
-    """(scene.mp4, the slices as the index lists them). Chunks between slices belong to the slice after them.
+    """Returns (scene.mp4, slices as the index lists them). Chunks between slices belong to the slice after them.
 
     Byte ranges are [first, one past the last]; sha256: of the `.pd4` bytes.
     """
@@ -111,7 +111,7 @@ def _json(content: dict[str, Any]) -> bytes:
 # -- the library -------------------------------------------------------------------------------------------------------
 
 LIBRARY = "library.json"
-LARGEST, LONGEST = 2**53, 200  #: number and text in the index of a package that a library repeats
+LARGEST, LONGEST = 2**53, 200  #: largest number and longest text that a library copies from a package's index
 STYLE = (
     "body{font:16px system-ui;margin:2rem;background:#111;color:#eee}"
     "main{display:grid;grid-template-columns:repeat(auto-fill,minmax(220px,1fr));gap:1rem}"
@@ -121,7 +121,7 @@ STYLE = (
 
 
 def library(folder: Path) -> dict[str, bytes]:
-    """Name -> content of the two files that list all packages below `folder`: a JSON index and a page of posters.
+    """Returns name -> content of two files that list all packages below `folder`: a JSON index and a page of posters.
 
     Raises DeliveryError if there are no packages, or one has an invalid index.
     """
@@ -143,7 +143,7 @@ def _scenes(folder: Path) -> Iterator[dict[str, Any]]:
 
 
 def _listed(name: str, about: Any) -> dict[str, Any]:
-    """What the library says of a package by its index, in which somebody else may have written anything."""
+    """Returns a package's entry in the library. about: the package's index, which is not trusted."""
     base = quote(os.fsencode(name))
     layers = [{"layer": _number(part["layer"]), "end": _number(part["range"][1])} for part in about["layers"]]
     return {

@@ -1,8 +1,8 @@
 """The player as one HTML file: beside a scene on any web server, with the scene inside, or in a notebook.
 
-The file takes one request instead of one for each module, and browsers open it without a server. Workers of a page that
-is opened as a file cannot import modules, so each entry point becomes one script. A module in it is a function that
-returns its exports, in the order in which a browser would run the modules.
+One file takes one request instead of one for each module, and browsers open it without a server. Workers of a page that
+is opened as a file cannot import modules, so each entry point is bundled into one script. In it, each module is a
+function that returns the module's exports, in the order in which a browser would run the modules.
 """
 
 import base64
@@ -34,17 +34,17 @@ _EXPORT = re.compile(r"^export (?=(?:async )?(?:const|function\*?|class) (\w+))"
 
 
 def bundle(root: Path, entry: str) -> str:
-    """The module `entry` of the folder `root` and all that it imports as one script, without comments and indentation.
+    """Bundles the module `entry` of the folder `root` and its imports into one script without indentation.
 
-    It knows the forms of import and export that the player uses. Raises DeliveryError for any other.
+    Only the player's forms of import and export are supported; any other raises DeliveryError.
     """
     modules: dict[Path, str] = {}  # imported ones first
 
     def add(path: Path) -> str:
-        """The module's variable."""
+        """Adds a module after its imports and returns its variable."""
         if path not in modules:
             modules[path] = _module(path, lambda name: add((path.parent / name).resolve()))
-            modules[path] = modules.pop(path)  # behind those that it imports
+            modules[path] = modules.pop(path)  # behind its imports
         return "m_" + re.sub(r"\W", "_", path.relative_to(root.resolve()).as_posix())
 
     add((root / entry).resolve())
@@ -72,12 +72,12 @@ def _module(path: Path, imported: Callable[[str], str]) -> str:
 
 
 def packed(path: Path) -> str:
-    """A script without indentation, and without comments but those that hold a quote and stand behind code."""
+    """Returns a script without indentation and comments, except comments after code that contain a quote."""
     return _SPACE.sub("\n", _COMMENTS.sub("", path.read_text(encoding="utf-8"))).strip() + "\n"
 
 
 def player_folder() -> Path:
-    """Folder of the player, in the installed package or beside it in a checkout. Raises DataError if it is missing."""
+    """Finds the player's folder in the installed package or beside it in a checkout. Raises DataError."""
     package = Path(__file__).parents[1]
     for folder in (package / "player", package.parent / "player"):
         if (folder / PAGE).is_file():
@@ -86,10 +86,10 @@ def player_folder() -> Path:
 
 
 def page(source: bytes | str | None = None) -> str:
-    """The player as one HTML file.
+    """Returns the player as one HTML file.
 
-    source: the bytes of a `.pd4`, which the page then holds, or its URL; None: `scene.pd4` beside the page, or the
-    page's `?src=address`.
+    source: the bytes of a `.pd4` to embed, or its URL; None: `scene.pd4` beside the page, or the page's
+    `?src=address`.
     """
     root = player_folder()
     workers = {name: bundle(root, f"render/{name}") for name in WORKERS}
@@ -115,7 +115,7 @@ globalThis.early?.begin(workers["{WORKERS[0]}"]);
 
 
 def _literal(value: object) -> str:
-    """As JavaScript inside a page, where `</script` and `<!--` would end the script."""
+    """Returns a JavaScript literal without `</script` and `<!--`, which would end the page's script."""
     return json.dumps(value).replace("<", "\\u003c")
 
 
@@ -136,9 +136,9 @@ class Shown:
 
 
 def show(scene: Scene | bytes | str | os.PathLike[str], *, width: str = "100%", height: int = 480) -> Shown:
-    """The player with a scene, for a notebook: the last line of a cell, or `display(show(scene))`.
+    """Shows a scene in a notebook, as the last line of a cell or by `display(show(scene))`.
 
-    scene: a decoded scene, the bytes of a `.pd4`, its path or its URL. The page holds the scene unless it is a URL,
+    scene: a decoded scene, the bytes of a `.pd4`, its path or its URL. The page embeds the scene, except for a URL,
     whose server must allow pages of other sites to read it, as pd4dgs-serve does. width: CSS. height: pixels. Raises
     DecodeError for bytes that are not a complete, valid `.pd4` file.
     """

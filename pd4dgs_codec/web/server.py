@@ -43,14 +43,14 @@ PREFLIGHT = {
     "Access-Control-Allow-Headers": "Range, If-Range, If-None-Match, If-Modified-Since",
     "Access-Control-Max-Age": "86400",
 }
-#: Flags that open neither a link nor a pipe that has just been put there. Windows has none of them.
+#: Flags against links and pipes that replace a file just before it is opened. Windows has neither flag.
 FILE_ITSELF = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
 #: Time limit for a client to send its next request, and to accept each block of the response.
 IDLE_SECONDS = 60.0
-#: Link time of a block: short against the milliseconds to be measured, long against waking a thread.
+#: Link time of a block: shorter than the times to be measured, longer than waking a thread takes.
 QUANTUM_SECONDS = 0.005
 MIN_BLOCK, MAX_BLOCK = 64, 1 << 18
-#: A thread that wakes late catches up by this much; further capacity that a slow reader leaves unused is lost.
+#: A late transfer catches up by at most this; further capacity that a slow reader leaves unused is lost.
 CATCH_UP_SECONDS = 0.05
 
 
@@ -70,7 +70,7 @@ class Link:
 
     @contextlib.contextmanager
     def transfer(self) -> Iterator[None]:
-        """Surrounds one response. After a pause the link starts without saved capacity."""
+        """Encloses one response. A link that was idle starts without saved capacity."""
         with self._lock:
             if not self._transfers:
                 self._free_at = max(self._free_at, time.monotonic())
@@ -82,7 +82,7 @@ class Link:
                 self._transfers -= 1
 
     def cross(self, size: int) -> None:
-        """Returns when `size` more bytes have crossed. Deadlines are absolute, so that delays do not accumulate."""
+        """Sleeps until `size` more bytes have crossed. Deadlines are absolute, so that delays do not accumulate."""
         if self.rate is None:
             return
         with self._lock:
@@ -96,7 +96,7 @@ class Link:
 class Server(ThreadingTCPServer):
     """Serves `folder` on host:port (0: any free port) once serve_forever runs.
 
-    private: for pages of its own origin alone, asked for by an address of this machine; else for those of every site.
+    private: answers only the requests that `is_own` accepts; otherwise pages of every site may read the files.
     link: carries all response bodies. latency: seconds of a round trip, for each new connection and each request.
     log: called with one line per request. Raises DeliveryError for an unusable folder or address.
     """
@@ -137,8 +137,8 @@ class Server(ThreadingTCPServer):
         return f"http://{_authority(str(host), port)}/"
 
     def is_own(self, host: str | None, origin: str | None) -> bool:
-        """Whether a request names this server, and comes from a page of it or from none. A site can give its own name
-        the address of this machine, and then asks with that name."""
+        """Whether a request names this server, and comes from its own page or from none. A foreign site can point its
+        own name at this machine, but its requests then carry that name (DNS rebinding)."""
         own, port = str(self.server_address[0]), self.server_address[1]
         names = {_authority(name, port) for name in {own, "localhost"}}
         names |= {name.removesuffix(":80") for name in names}
@@ -179,11 +179,10 @@ def _authority(host: str, port: int) -> str:
 
 
 def _opened(root: Path, target: str) -> BinaryIO | None:
-    """The file under `root` that a request target names; None for missing and hidden files, folders, pipes, and paths
-    out of `root`.
+    """Opens the file under `root` that a request target names; returns None for missing and hidden files, folders,
+    pipes, and paths outside `root`, which is absolute and free of links.
 
-    A target that ends in a slash names the folder's page. Links inside `root`, itself absolute and free of links,
-    count if they lead to a place inside it.
+    A target that ends in a slash names the folder's page. Links are followed if they lead to a place inside `root`.
     """
     try:
         path = unquote(urlsplit(target).path, errors="strict")
@@ -236,11 +235,11 @@ class _Handler(BaseHTTPRequestHandler):
         return complete and self._is_taken()
 
     def _is_taken(self) -> bool:
-        """Whether the request is answered as what it says. No body is read, and none is taken for a request."""
+        """Sends an error and returns False for ambiguous or foreign requests. No body is read, or read as a request."""
         head = self.headers
         if "Content-Length" in head or "Transfer-Encoding" in head or self.command not in METHODS.split(", "):
             self.close_connection = True
-        # what the parser could not read as header fields may announce a body, as may a line that goes on
+        # lines that the parser could not read as header fields may announce a body, as may a folded line
         broken = head.defects or head.get_payload() or any("\n" in value or "\r" in value for value in head.values())
         if broken or any(len(head.get_all(name, [])) > 1 for name in ("Host", "Origin")):
             self.send_error(HTTPStatus.BAD_REQUEST)
@@ -324,7 +323,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(text)
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Refuses an invalid request, of whatever HTTP version, like any other."""
+        """Refuses an invalid request of any HTTP version as `_fail` does."""
         self.request_version, self.close_connection = self.protocol_version, True
         self._fail(HTTPStatus(code))
 
