@@ -1,6 +1,6 @@
-"""The options of a training run. Constants are those of the PD-4DGS method.
+"""The options of a training run, after the PD-4DGS method.
 
-A field of `TrainConfig` is declared once, by `option`: default, help, range and its part in the quality dial. The
+`option` declares the default, help text, range and quality-dial factor of a field of `TrainConfig` in one place. The
 command line, the checks and resuming read these declarations.
 """
 
@@ -17,15 +17,15 @@ from pd4dgs_codec.scene import MAX_FEATURE, MAX_SLOTS, Steps, Widths
 #: Iterations per preset when neither a count nor a time limit is given.
 DEFAULT_ITERATIONS = {"tiny": 3_000, "small": 10_000, "paper": 15_000}
 
-#: Which levels a step trains after the coarse phase: mostly the highest, with a key instant for level 0, see `rollout`;
-#: one drawn from pi(rho), from the uniform or from the paper's fixed distribution; the highest alone, as a monolithic
-#: model is trained; or each of them, with a view of its own, at three times the cost.
+#: Which levels a step trains after the coarse phase. key: mostly the highest, see `rollout`. adaptive, uniform, fixed:
+#: a level drawn from pi(rho), from the uniform distribution or from the paper's fixed one. top: the highest level, as a
+#: monolithic model is trained. all: every level, each with its own view, at three times the cost.
 ROLLOUTS = ("key", "adaptive", "uniform", "fixed", "top", "all")
 
 #: Which of the scaffold's networks take the view direction.
 VIEW_DEPENDENT = ("color", "covariance+color", "opacity+color", "opacity+covariance+color")
 
-#: Parts of the method that `--without` turns off, as the fields of `TrainConfig` that do so.
+#: Parts of the method that `--without` turns off, with the fields of `TrainConfig` that it sets.
 ABLATIONS: dict[str, dict[str, Any]] = {
     "rate": {"rate_scale": 0.0, "plane_rate": 0.0},
     "planes": {"plane_rate": 0.0},
@@ -36,19 +36,19 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "whitening": {"whitening": False},
 }
 
-#: The steps that `step_scale` multiplies. Offsets and weights cost more quality per byte than any of these.
+#: The quantisation steps that `step_scale` multiplies. Coarser offsets and weights cost more quality per byte saved.
 COARSENED = ("feature", "scaling_log", "planes_global", "planes_local")
 
 
 @dataclass(frozen=True)
 class Option:
-    """What is known about a field of `TrainConfig` besides its type and default.
+    """The declaration of a field of `TrainConfig`, besides its type and default.
 
-    help, metavar: of the command-line option of the same name; no help where the command has none.
-    least, most: the range of numbers, both ends included; above: a lower end that is not included.
+    help, metavar: texts of the generated command-line option; without help, none is generated.
+    least, most: inclusive bounds of a number; above: an exclusive lower bound.
     count: how many numbers the value holds, as a tuple if more than one.
-    choices: the values allowed, if they are few.
-    dial: the value at quality 0 over the default, which is the value at quality 50; None if the dial leaves it alone.
+    choices: all allowed values; if empty, the bounds apply.
+    dial: ratio of the value at quality 0 to the default (quality 50); None if the dial does not set the field.
     fixed: a resumed run takes the value from its checkpoint, and the command line may not contradict it.
     """
 
@@ -64,7 +64,7 @@ class Option:
 
     @property
     def range(self) -> str:
-        """The values allowed, in words."""
+        """The allowed values, in words."""
         if self.choices:
             return f"one of {', '.join(map(str, self.choices))}"
         if self.above > -math.inf:
@@ -72,13 +72,13 @@ class Option:
         return f"at least {self.least:g}" if self.most == math.inf else f"from {self.least:g} to {self.most:g}"
 
     def check(self, name: str, value: Any) -> None:
-        """Raises TrainError for a value out of range; None is the default of optional fields and passes."""
+        """Raises TrainError for a value out of range. None, the default of optional fields, passes."""
         allowed = value in self.choices if self.choices else value is None or self.contains(value)
         if not allowed:
             raise TrainError(f"{name} must be {self.range}, found {value}")
 
     def contains(self, value: Any) -> bool:
-        """Whether a number, or each of several, is finite and within the range."""
+        """Whether the number, or each of a tuple of `count` numbers, is finite and within the bounds."""
         if self.count > 1:
             one = replace(self, count=1)
             return isinstance(value, tuple) and len(value) == self.count and all(map(one.contains, value))
@@ -86,20 +86,20 @@ class Option:
 
 
 def option(default: Any, **about: Any) -> Any:
-    """A field of `TrainConfig` with its default and the fields of its `Option`."""
+    """Declares a field of `TrainConfig` by its default and the fields of its `Option`."""
     return field(default=default, metadata={"option": Option(**about)})
 
 
-#: Steps of a run whose deformation has the rates of `LearningRates` as they are.
+#: Steps up to which a run uses the deformation rates of `LearningRates` unchanged.
 SHORT_RUN = 1500
 
 
 @dataclass(frozen=True)
 class LearningRates:
-    """(start, end) of a log-linear schedule over the run, which `TrainConfig.cooldown` multiplies; Adam, eps 1e-15.
+    """Adam's learning rates by parameter group: (start, end) of a log-linear schedule over the run.
 
-    Final rates stay high: the cooldown anneals them to 0. planes and deformation are those of a run of up to
-    SHORT_RUN steps; see `of_run` for longer ones.
+    Final rates stay high because `TrainConfig.cooldown` anneals them to 0. `planes` and `deformation` apply to runs of
+    up to SHORT_RUN steps; `of_run` scales them for longer runs.
     """
 
     feature: tuple[float, float] = (7.5e-3, 1.2e-2)
@@ -113,8 +113,8 @@ class LearningRates:
     deformation: tuple[float, float] = (1.5e-3, 5.6e-4)
 
     def of_run(self, iterations: int | None) -> LearningRates:
-        """The rates of a run of so many steps: the deformation's end as the reciprocal of the number, its planes start
-        as that of its square root. At rates of a short run a long one would move what it has learnt to the end."""
+        """The rates of a run of `iterations` steps. Beyond SHORT_RUN, the end rates of planes and deformation fall as
+        1/iterations and the start rate of planes as 1/sqrt(iterations), so that long runs settle."""
         share = min(SHORT_RUN / iterations, 1.0) if iterations else 1.0
         planes = self.planes[0] * math.sqrt(share), self.planes[1] * share
         return replace(self, planes=planes, deformation=(self.deformation[0], self.deformation[1] * share))
@@ -122,7 +122,7 @@ class LearningRates:
 
 @dataclass(frozen=True)
 class PlaneWeights:
-    """Weights of the plane regularisers: spatial second difference, its time twin, mean |1 - g| of the time planes."""
+    """Weights of the plane regularisers: second differences in space and in time, mean |1 - g| of the time planes."""
 
     plane_smooth: float
     time_smooth: float
@@ -131,7 +131,7 @@ class PlaneWeights:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """All that decides a run besides the data. Raises TrainError for a value out of its option's range."""
+    """The configuration of a run, without its data. Raises TrainError for a value out of its option's range."""
 
     preset: str = option("small", help="model size", choices=tuple(DEFAULT_ITERATIONS))
     source: str = ""  #: what `data.load` was given; stored so that a resumed run reads the same data
@@ -146,25 +146,25 @@ class TrainConfig:
     holdout: int = option(8)
     #: RGB behind pictures with alpha; None: white
     background: tuple[float, float, float] | None = option(None, least=0, most=1, count=3)
-    #: None: the preset's default, or by the clock if there is a time limit
+    #: None: the preset's default, or as many as `max_seconds` allows
     iterations: int | None = option(
         None, help="training steps (default: by preset, unless --max-seconds is given)", metavar="N", least=1
     )
-    #: without `iterations` the whole schedule is spread over the time, with them it stops the run early
+    #: without `iterations`, the schedule is spread over this time; with `iterations`, the limit stops the run early
     max_seconds: float | None = option(
         None, help="time to train; a resumed run counts the time before it too", metavar="S", above=0, fixed=False
     )
     seed: int = option(0, help="seed of all randomness in training", metavar="N", least=0, most=2**63 - 2)
-    #: rate weight per level; the paper's of level 2 is 0.00025, for anchors that only layer 2 has
+    #: rate weight per level; the paper's weight of level 2 is 0.00025, for anchors that only layer 2 has
     lambdas: tuple[float, float, float] = (0.04, 0.01, 0.01)
     #: multiplies every lambda; 1 is the paper's operating point
     rate_scale: float = option(0.08, help="weight of the anchors' bit rate; 1 is the paper's", least=0, dial=4.0)
     rate_share: float = 0.05  #: share of the anchors from which a step estimates the rate
-    plane_rate: float = option(4e-9, least=0, dial=4.0, fixed=False)  #: weight of a bit of the planes, ramped up
+    plane_rate: float = option(4e-9, least=0, dial=4.0, fixed=False)  #: weight per bit of the planes, ramped up
     tmc: float = 0.01
     tmc_binary: bool = True
-    #: the binary term's weight grows to this multiple of its start, so that masks end near 0 or 1: an anchor that is
-    #: half visible at a level takes all its bytes there
+    #: the binary term's weight grows to this multiple of its start, so that masks end near 0 or 1: a half-visible
+    #: anchor costs all its bytes
     tmc_binary_growth: float = 20.0
     tmc_smooth: bool = True
     tmc_tau: float = 4.0  #: voxels
@@ -172,7 +172,7 @@ class TrainConfig:
     views_per_step: int = option(
         1, help="views of each level per step; torchrun's workers share them", metavar="V", least=1
     )
-    #: a step on a smaller picture costs less, and what is coarse has to be learnt first
+    #: steps on smaller pictures cost less, and coarse structure is learnt before detail
     small_pictures: float = option(
         0.4,
         help="share of the run, at its start, that sees pictures of 400 pixels a side or more at a quarter, then at "
@@ -206,8 +206,8 @@ class TrainConfig:
         dial=3.0,
     )
     whitening: bool = True  #: transform the channels of the features, see `phases.quantisation`
-    #: share of the run, at its end, over which all learning rates fall to 0: otherwise the last steps carry weights
-    #: over the edges of their rounding intervals, and the PSNR jumps by tenths of a dB from one step to the next
+    #: share of the run, at its end, over which all learning rates fall to 0: otherwise the last steps move weights
+    #: across rounding boundaries, and the PSNR jumps by tenths of a dB from one step to the next
     cooldown: float = option(0.4, least=0, most=1, fixed=False)
     ssim: float = 0.2
     volume: float = 0.01  #: weight of the mean product of scales (Scaffold-GS)
@@ -225,15 +225,15 @@ class TrainConfig:
 
     @property
     def widths(self) -> Widths:
-        """Of a fresh model's anchors."""
+        """The widths of a fresh model's anchors."""
         return Widths(self.feature_width, self.slots, viewing=tuple(self.view_dependent.split("+")))
 
     def model_steps(self, steps: Steps) -> Steps:
-        """The steps of a fresh model whose preset has the given ones."""
+        """The preset's `steps` with the steps named in COARSENED multiplied by `step_scale`."""
         return replace(steps, **{name: getattr(steps, name) * self.step_scale for name in COARSENED})
 
     def to_json(self) -> str:
-        """As checkpoints store it."""
+        """The configuration as checkpoints store it."""
         return json.dumps(self, default=vars)
 
     @classmethod
@@ -246,24 +246,24 @@ class TrainConfig:
             raise TrainError(f"{path}: its stored configuration cannot be read: {error}") from None
 
 
-#: The declared fields of `TrainConfig`.
+#: The `Option` of each declared field of `TrainConfig`.
 OPTIONS: dict[str, Option] = {f.name: f.metadata["option"] for f in fields(TrainConfig) if "option" in f.metadata}
-#: Fields that a resumed run takes from its checkpoint and the command line may not contradict.
+#: Fields that a resumed run takes from its checkpoint; the command line may not contradict them.
 FIXED = tuple(name for name, about in OPTIONS.items() if about.fixed)
-#: What the quality dial moves, as (value at 50, value at 0 over it).
+#: The fields that the quality dial sets: (value at quality 50, ratio of the value at quality 0 to it).
 DIAL = {name: (getattr(TrainConfig, name), about.dial) for name, about in OPTIONS.items() if about.dial is not None}
 
 
 def at_quality(quality: float) -> dict[str, float]:
-    """The fields of `TrainConfig` at a quality of 0..100: log-linear around the defaults, which are those of 50."""
+    """The values of the fields in DIAL at a quality of 0..100, log-linear. Raises TrainError for another quality."""
     if not 0 <= quality <= 100:
         raise TrainError(f"quality must be from 0 to 100, found {quality:g}")
     return {name: middle * factor ** ((50 - quality) / 50) for name, (middle, factor) in DIAL.items()}
 
 
 def _rebuilt(plain: Any, like: Any) -> Any:
-    """JSON data as a value of the same type as `like`: nested dataclasses, and tuples for lists. Raises ValueError,
-    TypeError or AttributeError."""
+    """Converts JSON data to the type of `like`: nested dataclasses, and tuples for lists. Raises ValueError, TypeError
+    or AttributeError."""
     if is_dataclass(like) and not isinstance(like, type):
         return type(like)(**{name: _rebuilt(value, getattr(like, name)) for name, value in plain.items()})
     if isinstance(plain, list):

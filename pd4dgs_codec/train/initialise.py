@@ -18,13 +18,13 @@ from pd4dgs_codec.scene import INSTANTS, SceneInfo, Steps, Widths
 #: Voxels along the longest side of the scene's box.
 GRID = 1024
 MASK_START = 2.0
-#: a_j of absent levels: its softplus is 4e-18, so their masks are those of the highest level present.
+#: a_j of absent levels: its softplus is 4e-18, so their masks equal those of the highest level present.
 TIED = -40.0
-NEAREST = 3  #: points whose distance is the size of an anchor
+NEAREST = 3  #: neighbours whose distance sets the size of an anchor
 #: For a dataset without points: random candidates per initial point, and training views that score them.
 CARVE_CANDIDATES = 20
 CARVE_VIEWS = 40
-#: The difference of a channel from the background, of 255, that counts as an object.
+#: A pixel shows an object if a channel differs from the background by more than this, of 255.
 CARVE_CONTRAST = 8
 
 
@@ -37,10 +37,10 @@ def fresh_model(
     max_layer: int = 2,
     key: float | None = None,
 ) -> Model:
-    """An untrained model without the deformations of the layers above max_layer. key: its key instant, normalised time.
+    """Returns an untrained model without the deformations of the layers above max_layer.
 
-    Anchors start on the dataset's points (with more of them near by if there are few), or all over its box. The start
-    of a layer does not depend on max_layer.
+    Anchors start at the dataset's points, with jittered copies if there are few, or else in its box. A layer's
+    start values do not depend on max_layer. key: the key instant, normalised time; None: no key instant.
     """
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)  # nn.Linear and HexPlane draw their start values from the global generator
@@ -75,8 +75,8 @@ def fresh_model(
 
 
 def fresh_mask_logits(n: int, level: int) -> Tensor:
-    """float32 [n, 3]: a_0 = MASK_START, a_1 = 0 if the model has that level, the others TIED: layer 2 has no anchors of
-    its own."""
+    """float32 [n, 3]: a_0 = MASK_START, a_1 = 0 if `level` is at least 1, and TIED for the rest, since layer 2 starts
+    without anchors of its own."""
     logits = torch.full((n, 3), TIED)
     logits[:, 0] = MASK_START
     logits[:, 1 : min(level, 1) + 1] = 0
@@ -84,7 +84,7 @@ def fresh_mask_logits(n: int, level: int) -> Tensor:
 
 
 def scene_info(dataset: Dataset) -> SceneInfo:
-    """The header of a file for the dataset; the voxel is 1/GRID of the box's longest side."""
+    """The `SceneInfo` of a dataset; a voxel is 1/GRID of the box's longest side."""
     box = np.asarray(dataset.box, np.float32)
     return SceneInfo(
         voxel_size=_binary32(float((box[1] - box[0]).max()) / GRID),
@@ -94,7 +94,7 @@ def scene_info(dataset: Dataset) -> SceneInfo:
         near=_binary32(dataset.near),
         far=_binary32(dataset.far),
         up=tuple(_binary32(v) for v in dataset.up),  # type: ignore[arg-type]
-        unit=0.0,  # no reader knows it
+        unit=0.0,  # unknown to all dataset readers
         camera=dataset.camera,
     )
 
@@ -116,7 +116,7 @@ def initial_cells(dataset: Dataset, count: int, voxel_size: float, generator: to
 
 
 def _points_near_box(dataset: Dataset) -> Tensor:
-    """float32 [n, 3] the dataset's points without those so far from its box that they would stretch the grid."""
+    """float32 [n, 3]: the dataset's points in or near its box; points farther away would stretch the grid."""
     points = torch.from_numpy(np.array(() if dataset.points is None else dataset.points, np.float32).reshape(-1, 3))
     low, high = (torch.from_numpy(np.asarray(dataset.box[i], np.float32)) for i in (0, 1))
     reach = 0.5 * (high - low).max()
@@ -126,8 +126,8 @@ def _points_near_box(dataset: Dataset) -> Tensor:
 def carved_points(dataset: Dataset, count: int, generator: torch.Generator) -> Tensor:
     """float32 [count, 3] random points of the box, more likely where more training views show an object.
 
-    A view shows an object where its pixel differs from the constant background; without such a background, or outside
-    every view, all points are equally likely.
+    A view shows an object where its pixel differs from the constant background. Without such a background, points that
+    several views see are about equally likely. Points outside every view are rarely chosen.
     """
     low, high = (torch.from_numpy(np.asarray(dataset.box[i], np.float32)) for i in (0, 1))
     points = low + (high - low) * torch.rand(CARVE_CANDIDATES * count, 3, generator=generator)
@@ -144,12 +144,12 @@ def carved_points(dataset: Dataset, count: int, generator: torch.Generator) -> T
         inside = (z > 0) & (column >= 0) & (column < width) & (line >= 0) & (line < height)
         seen[inside] += 1
         hits[inside] += shown[line[inside].astype(int), column[inside].astype(int)]
-    share = torch.from_numpy((hits + np.float32(1e-3)) / (seen + 1))  # little evidence from few views
+    share = torch.from_numpy((hits + np.float32(1e-3)) / (seen + 1))  # + 1 discounts points that few views see
     return points[torch.multinomial(share.square(), count, generator=generator)]
 
 
 def nearest_distances(points: Tensor) -> Tensor:
-    """Root mean squared distance of points [n, 3] to their NEAREST nearest others, [n]; exact."""
+    """[n]: root mean squared distance of points [n, 3] to their NEAREST nearest neighbours, exact; 1 for one point."""
     n = len(points)
     if n < 2:
         return torch.full((n,), 1.0)
@@ -162,8 +162,8 @@ def nearest_distances(points: Tensor) -> Tensor:
 
 @parallel(lambda out, *_: len(out))
 def _nearest_squares(tasks: Tasks, out: np.ndarray, points: np.ndarray, k: int) -> None:
-    """out [n] = mean squared distance to the k < n nearest others of points [n, 3], which ascend along the first axis:
-    the search stops where that axis alone is too far."""
+    """out [n] = mean squared distance of points [n, 3], sorted along the first axis, to their k < n nearest neighbours.
+    The search stops where the distance along that axis alone is too large."""
     for i in range(tasks[0], tasks[1]):
         nearest = np.full(k, np.inf)
         for way in (-1, 1):

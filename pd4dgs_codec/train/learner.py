@@ -1,4 +1,4 @@
-"""The training step: draw a level and a view, render, add the level's terms, update; the phases of a run in between."""
+"""The training step: draw a level and a view, render, add the level's terms, update. Phases act between steps."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ from pd4dgs_codec.train.state import TrainState
 
 
 class Learner(TrainState):
-    """The state of a training and its steps.
+    """A model in training, with its steps.
 
-    before_step: the phases that act before a step, in their order; `grow` acts after the update.
-    before_practice: called before each step on trial with the steps done and their number; what it raises ends the
+    before_step: the phases that act before a step, in order; `grow` acts after the update.
+    before_practice: called before each trial step with the trial steps done and their total; an exception ends the
     trial.
     """
 
@@ -47,9 +47,9 @@ class Learner(TrainState):
         device: torch.device,
         size: ModelConfig | None = None,
     ):
-        """A fresh model for `dataset`, of the preset's size by default."""
+        """Starts with a fresh model for `dataset`, of the preset's size by default."""
         keep_freed_memory()
-        if device.type == "cuda":  # SSIM's variances are differences of blurred images, which TF32 is too coarse for
+        if device.type == "cuda":  # TF32 is too coarse for SSIM's variances, differences of blurred images
             torch.backends.cudnn.allow_tf32 = False
         super().__init__(config, dataset, schedule, device, size)
         self.model_loss = ModelLoss(config, self.generator)
@@ -65,7 +65,7 @@ class Learner(TrainState):
         ]
 
     def step(self) -> dict[str, Any]:
-        """One training step; returns its log record with every term unweighted."""
+        """Performs a training step and returns its log record, with unweighted loss terms."""
         record: dict[str, Any] = {"iteration": self.iteration}
         self._apply(self.before_step, record)
         levels, record["pi"] = draw_levels(self)
@@ -81,7 +81,7 @@ class Learner(TrainState):
         return record
 
     def practise(self, level: int, steps: int) -> None:
-        """Trains `level` for so many steps where the run stands, on trial: nothing is grown."""
+        """Trains `level` on trial for `steps` steps at the present position of the schedule. Nothing is grown."""
         self.practising = True
         try:
             for done in range(steps):
@@ -96,15 +96,15 @@ class Learner(TrainState):
             if phase.due(self):
                 try:
                     phase.apply(self, record)
-                except NotFinite:  # passed over like a step that diverged
+                except NotFinite:  # skipped like a step that diverged
                     pass
 
     # -- loss and update -------------------------------------------------------------------------------------------
 
     def _learn(self, drawn: list[tuple[int, int]], record: dict[str, Any], only: Tensor | None) -> bool:
-        """Losses of (view, level) pairs, gradients, update; False, with nothing changed, if any of it is not finite.
-        The record is that of the last pair of this worker, which takes every Nth of N workers. only: bool [N], the
-        anchors to render, if not all."""
+        """Computes losses and gradients of (view, level) pairs and updates the model. Returns False, with the model
+        unchanged, if a value is not finite. Each worker renders its share of the pairs and records its last one.
+        only: bool [N], the anchors to render, if not all."""
         pictures = self._pictures(drawn, record, only)
         if workers.count() > 1:
             pictures = self._shared_gradients(pictures)
@@ -121,7 +121,7 @@ class Learner(TrainState):
         return True
 
     def _update(self, instants: int | None) -> None:
-        """One update, after which the planes of the deformations have so many instants, if not all their own."""
+        """Updates the parameters. With `instants`, the deformations' planes stay linear between so many instants."""
         confined = [] if instants is None else [(field, instants) for field in self.model.deformations.values()]
         for field, few in confined:
             field.spread_gradients(few)
@@ -132,7 +132,7 @@ class Learner(TrainState):
     def _pictures(
         self, drawn: list[tuple[int, int]], record: dict[str, Any], only: Tensor | None
     ) -> list[Picture] | None:
-        """The pictures of this worker's share of the pairs, their gradients summed; None if one is not finite."""
+        """Renders this worker's share of the pairs and sums their gradients. None if a value is not finite."""
         pictures = []
         seeds: list[int | None] = [None] * len(drawn)
         if self.config.views_per_step > 1:
@@ -145,20 +145,20 @@ class Learner(TrainState):
                 self.noise.generator.manual_seed(seed + 1)
             try:
                 pictures.append(self._gather(index, level, only, record))
-            except NotFinite as error:  # a diverged step can be skipped; any other error would come again
+            except NotFinite as error:  # a diverged step can be skipped; any other error would recur
                 record["refused"] = str(error)
                 return None
             finally:
                 if seed is not None:
                     self.generator.set_state(state)
-            self.optimiser.add_gradients(earlier)  # sums a view's gradients first, as they are of another worker
+            self.optimiser.add_gradients(earlier)  # after the view's own sum, as if another worker had rendered it
             if not math.isfinite(record["loss"]):
                 return None
         return pictures
 
     def _gather(self, index: int, level: int, only: Tensor | None, record: dict[str, Any]) -> Picture:
-        """The picture of training view `index` at `level`, the gradients of its loss summed and its terms in the
-        record. Raises NotFinite where the model has diverged."""
+        """Renders training view `index` at `level`, accumulates the gradients of its loss and records its terms.
+        Raises NotFinite if the model has diverged."""
         share = 1 / self.config.views_per_step
         finish = self.model_loss.begin(self.model, level, self.schedule, self.position)
         try:
@@ -175,7 +175,7 @@ class Learner(TrainState):
         return picture
 
     def _shared_gradients(self, pictures: list[Picture] | None) -> list[Picture] | None:
-        """Sums the gradients of all workers; None if any of them was not finite."""
+        """Sums the gradients over all workers. Returns None if a worker's `pictures` are None."""
         parameters = self.optimiser.parameters
         met = torch.tensor([p.grad is not None for p in parameters], dtype=torch.float32, device=self.device)
         failed = torch.full((1,), float(pictures is None), device=self.device)
@@ -191,7 +191,7 @@ class Learner(TrainState):
     ) -> tuple[Picture, dict[str, Tensor], Tensor]:
         """(picture of training view `index` at `level`, unweighted terms by name, their weighted sum).
 
-        only: bool [N], the anchors to render, if not all. Raises NotFinite where the model has diverged.
+        only: bool [N], the anchors to render, if not all. Raises NotFinite if the model has diverged.
         """
         config, shown = self.config, as_taught(self, self.picture(index), level)
         picture = render(self.model, level, shown.view.time, shown.view.camera, self.rounding(), only)
@@ -224,14 +224,14 @@ class Learner(TrainState):
     # -- checkpoints -----------------------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
-        """What a checkpoint holds besides the model, that of the phases included."""
+        """The state that a checkpoint holds besides the model, including that of the phases."""
         stored = super().state()
         for phase in self.before_step:
             stored |= phase.stored()
         return stored
 
     def restore(self, model: Model, state: dict[str, Any]) -> None:
-        """Continues with `model` from a `state`. A broken state raises its first fault's own exception."""
+        """Continues with `model` from a `state`. Raises an exception of any type if the state is broken."""
         super().restore(model, state)
         for phase in self.before_step:
             phase.restore(state)

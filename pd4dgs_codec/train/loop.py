@@ -26,11 +26,11 @@ from pd4dgs_codec.train.config import DEFAULT_ITERATIONS, TrainConfig
 from pd4dgs_codec.train.learner import Learner
 from pd4dgs_codec.train.schedule import COARSE_SHARE, Schedule
 
-#: A timed run settles the N of its schedule after TIMED_STEPS; a slow one once it has spent the coarse phase's share of
-#: the limit, but not before FEWEST_TIMED_STEPS, of which the first ones compile.
+#: A timed run estimates the N of its schedule after TIMED_STEPS steps. A slow run does so once it has spent the coarse
+#: phase's share of the limit, but not before FEWEST_TIMED_STEPS, since the first steps compile kernels.
 TIMED_STEPS = 50
 FEWEST_TIMED_STEPS = 5
-#: Mean cost of a step over a run relative to its first steps, which are all of level 0.
+#: Mean cost of a step over a run, relative to its first steps, which train level 0 only.
 LATER_COST = 1.5
 #: Held-out evaluations over a run, for the curve of quality against wall time, and views in each.
 CURVE_POINTS = 12
@@ -44,36 +44,36 @@ class Progress(Protocol):
         """Called after every step with its log record."""
 
     def on_trial(self, done: int, steps: int) -> None:
-        """Called before every step on trial with the steps done and their number."""
+        """Called before every trial step with the trial steps done and their total."""
 
     def close(self) -> None:
         """Called once, when the run ends or raises."""
 
 
 class Stopped(Exception):
-    """A signal came in a trial, which is undone; the same step comes again when the run is resumed."""
+    """A signal stopped a trial. The trial is undone; a resumed run repeats it."""
 
 
 class Trainer:
-    """A run in progress; `run` carries it to its end.
+    """A training run; `run` executes it.
 
-    A run with a number of steps goes through its schedule step by step, and a time limit stops it early. A timed run,
-    with a limit only, goes through it by the clock: each step advances it by the share of the remaining schedule that
-    the step took of the remaining time. Its N, the steps it would take at the pace of its first ones, decides whether
-    the run is long enough to prune and to select levels, but not when it ends.
+    A run with a number of steps follows its schedule step by step, and a time limit stops it early. A timed run has a
+    time limit only: if a step takes a share of the remaining time, it advances by that share of the remaining schedule.
+    Its N, estimated from the pace of its first steps, decides whether the run is long enough to prune and to select
+    levels, but not when it ends.
 
-    learner: the model and its steps. seconds: of training, those before a resumption included. curve: quality against
-    time, a row for each evaluation. interrupted: a signal ended the last `run`.
+    learner: the model and its steps. seconds: training time, including that before a resumption. curve: quality
+    against time, a row for each evaluation. interrupted: whether a signal ended the last `run`.
     """
 
     def __init__(self, config: TrainConfig, dataset: Dataset, device: str = "cpu", size: ModelConfig | None = None):
-        """size: of the model, if not the preset's."""
+        """size: the model's size; by default the preset's."""
         self.timed = config.max_seconds is not None and config.iterations is None
         total = config.iterations or (None if self.timed else DEFAULT_ITERATIONS[config.preset])
         self.config, self.dataset = config, dataset
         self.learner = Learner(config, dataset, Schedule(total), torch.device(device), size)
         self.learner.share = 0.0 if self.timed else None
-        self._costs: list[float] = []  #: seconds of the steps from which a timed run settles N
+        self._costs: list[float] = []  #: seconds of each step from which a timed run estimates N
         self._step = self._evaluation = 0.0  #: seconds of the last step and of the last evaluation
         self.seconds = 0.0
         self.interrupted = False
@@ -91,7 +91,7 @@ class Trainer:
 
     @property
     def total(self) -> int | None:
-        """N of the schedule: the steps of the whole run, approximate in a timed one; None until it is settled."""
+        """N of the schedule: the steps of the whole run, estimated in a timed one; None before the estimate."""
         return self.learner.schedule.iterations
 
     @property
@@ -102,11 +102,11 @@ class Trainer:
     def run(
         self, output: Path, *, log: Path | None = None, progress: Progress | None = None, save_every: float = 60.0
     ) -> None:
-        """Trains to the end, to the time limit, or to Ctrl-C or SIGTERM, which end the run after the current step and
-        set `interrupted`; in each case `output` holds a complete checkpoint.
+        """Trains to the end, the time limit or a signal, then writes a complete checkpoint to `output`.
 
-        A second signal raises KeyboardInterrupt at once: `output` stays as last saved. save_every: seconds. Raises
-        DataError if the checkpoint cannot be written, or the log, in which case the checkpoint is saved first.
+        Ctrl-C or SIGTERM ends the run after the current step and sets `interrupted`. A second signal raises
+        KeyboardInterrupt at once and leaves `output` as last saved. save_every: seconds between checkpoints. Raises
+        DataError if the checkpoint or the log cannot be written; a log's error is raised after saving.
         """
         with stop_request() as stop, one_torch_thread():
             records = RecordLog(log)
@@ -117,7 +117,7 @@ class Trainer:
                 if progress:
                     progress.close()
             if self.config.noise and self.finished:
-                self.model.round_to_steps()  # as the end of the run rendered it and the file will hold it
+                self.model.round_to_steps()  # to the values that the last steps rendered and the file will hold
             self.save(output)
         self.interrupted = stop.is_set()
         if records.failure:
@@ -126,7 +126,7 @@ class Trainer:
     def _steps(
         self, output: Path, stop: threading.Event, records: RecordLog, progress: Progress | None, save_every: float
     ) -> None:
-        """Steps until the run ends; a record that cannot be logged ends it too."""
+        """Performs steps until the run ends or a record cannot be logged."""
         saved = now = time.monotonic()
 
         def before_practice(done: int, steps: int) -> None:
@@ -159,7 +159,7 @@ class Trainer:
                 break
 
     def _spend(self, seconds: float) -> bool:
-        """Counts the time of a step; a timed run advances in its schedule. Returns whether the limit is reached."""
+        """Adds the time of a step, and advances a timed run in its schedule. Returns whether the limit is reached."""
         begun, limit = self.seconds, self.config.max_seconds
         self.seconds += seconds
         usual, self._step = min(seconds, self._step), seconds  # a pause does not predict the cost of the next step
@@ -180,15 +180,15 @@ class Trainer:
         return True
 
     def _curve_due(self, before: int) -> bool:
-        """Whether the step that began at position `before` ended at or past a point of the curve."""
+        """Whether the step that began at position `before` crossed a point of the curve or finished the run."""
         if self.total is None:
             return False
         every = max(1, self.total // CURVE_POINTS)
         return self.finished or self.learner.position // every > before // every
 
     def _evaluate(self, record: dict[str, Any]) -> None:
-        """Adds a point to the curve: mean PSNR per level on a few held-out views, or training views if there are
-        none."""
+        """Adds a point to the curve: mean mPSNR per level, dB, on a few held-out views, or on training views if none
+        are held out."""
         views = self.dataset.test or self.dataset.train
         chosen = views[:: max(1, len(views) // CURVE_VIEWS)][:CURVE_VIEWS]
         record["held_out_psnr"] = psnr = workers.alike(lambda: self.learner.level_psnr(chosen))
@@ -196,7 +196,7 @@ class Trainer:
         record["plane_bits"] = self.learner.plane_bits()
 
     def save(self, path: Path) -> None:
-        """Writes the checkpoint with all that resuming needs; of several workers only the first one writes."""
+        """Writes a checkpoint from which a run can resume. Of several workers only the first one writes."""
         if workers.rank():
             return
         training = {
@@ -210,7 +210,7 @@ class Trainer:
     def resume(self, path: Path) -> None:
         """Continues from a checkpoint of the same configuration and data.
 
-        Raises TrainError if it holds no training state, DataError if that state is broken or of other data.
+        Raises TrainError if it holds no training state, DataError if the state is broken or belongs to other data.
         """
         model, training = checkpoint.load(path)
         if "optimiser" not in training:
@@ -220,7 +220,7 @@ class Trainer:
             self.seconds, self.curve = float(training["seconds"]), _curve(training["curve"])
             if not 0 <= self.seconds < math.inf:
                 raise ValueError(f"seconds are {self.seconds}")
-        except Exception as error:  # of many kinds
+        except Exception as error:  # a broken state can raise any exception
             reason = one_line(f"{type(error).__name__}: {error}")  # torch's messages have several lines
             raise DataError(f"{path}: its training state cannot be read: {reason}") from None
         order, count = self.learner.order, len(self.dataset.train)
@@ -231,7 +231,7 @@ class Trainer:
 
 
 def _curve(text: str) -> list[dict[str, Any]]:
-    """The curve in a checkpoint. Raises ValueError, KeyError or TypeError."""
+    """Parses the curve of a checkpoint. Raises ValueError, KeyError or TypeError."""
     rows = list(json.loads(text))
     if not all(math.isfinite(v) for row in rows for v in (row["iteration"], row["seconds"], *row["psnr"])):
         raise ValueError("a curve that is not finite")
@@ -239,9 +239,9 @@ def _curve(text: str) -> list[dict[str, Any]]:
 
 
 class RecordLog:
-    """A log with a line of JSON per record, appended to the file `path`; none if it is None.
+    """Appends a line of JSON per record to the file `path`; writes nothing if `path` is None.
 
-    failure: why a record could not be written, or None; the run saves its checkpoint before it raises that.
+    failure: the error if a record could not be written, or None. The run saves its checkpoint before it raises it.
     """
 
     def __init__(self, path: Path | None):
@@ -255,7 +255,7 @@ class RecordLog:
             raise self._error(error) from None
 
     def write(self, record: dict[str, Any]) -> bool:
-        """Whether the record is in the log, if there is one."""
+        """Writes a record. Returns False if this record or an earlier one could not be written."""
         try:
             if self._stream:
                 self._stream.write(json.dumps(finite(record), allow_nan=False) + "\n")
@@ -264,7 +264,7 @@ class RecordLog:
         return self.failure is None
 
     def close(self) -> None:
-        """Closes the file; a failed write has been reported by `failure`."""
+        """Closes the file and ignores errors, since `failure` reports failed writes."""
         if self._stream:
             with contextlib.suppress(OSError):
                 self._stream.close()

@@ -30,7 +30,7 @@ Weighted = tuple[str, float, Tensor]  #: a term's name, weight and value
 
 @dataclass
 class Terms:
-    """loss: the weighted sum. terms: unweighted, by name. gradients: of the loss by each parameter it depends on."""
+    """loss: the weighted sum. terms: unweighted, by name. gradients: the loss's, for each parameter that has one."""
 
     loss: float
     terms: dict[str, float]
@@ -45,8 +45,8 @@ class ModelLoss:
         self._neighbours: Neighbours | None = None
 
     def begin(self, model: Model, level: int, schedule: Schedule, position: int) -> Callable[[], Terms]:
-        """Starts to compute the terms of a step at `position`; the function returned waits for them. Until then nothing
-        else may draw from the generator or change the model."""
+        """Starts to compute the terms of a step at `position` and returns a function that waits for them. Until it
+        returns, nothing else may draw from the generator or change the model."""
         fields = {layer: field for layer, field in model.deformations.items() if layer <= level}
         parameters = [getattr(model, name) for name in PER_ANCHOR]
         parameters += [feature for field in fields.values() for feature in field.features]
@@ -72,7 +72,7 @@ class ModelLoss:
     def _field_terms(
         self, layer: int, field: DeformationField, features: list[Tensor], step: float, pressure: float
     ) -> Iterator[Weighted]:
-        """The regularisers and the rate of a layer's deformation."""
+        """Yields the regularisers and the rate of a layer's deformation."""
         name = {1: "global", 2: "local"}[layer]
         for term, value in field.regularisers(features).items():
             yield f"{name}_{term}", getattr(self.config.planes, term), value
@@ -82,7 +82,7 @@ class ModelLoss:
     def _mask_terms(
         self, model: Model, level: int, anchors: Mapping[str, Tensor], separation: float
     ) -> Iterator[Weighted]:
-        """The rate and the two terms of temporal mask consistency."""
+        """Yields the anchors' rate and the two terms of temporal mask consistency."""
         config, mask = self.config, level_mask(anchors["mask_logits"], level)
         if config.rate_scale:
             weight = config.lambdas[level] * config.rate_scale
@@ -97,8 +97,8 @@ class ModelLoss:
 
 
 def anchor_bits(model: Model, anchors: Mapping[str, Tensor], rows: Tensor, active: Tensor) -> Tensor:
-    """Rbar [n]: the mean R over the scalars of each of the anchors `rows` (int64 [n], distinct, all active); priors are
-    the moments over the anchors `active` (int64) of the same step class. anchors: attributes by name, in the model's
+    """Rbar [n]: the mean bits R per scalar of each anchor in `rows` (int64 [n], distinct, all in `active`). The priors
+    are moments over the anchors in `active` (int64) of the same step class. anchors: attributes by name, in the model's
     shapes."""
     classes = torch.full_like(model.step_class, -1, dtype=torch.int8)
     classes[active] = model.step_class[active].to(torch.int8)
@@ -109,9 +109,8 @@ def anchor_bits(model: Model, anchors: Mapping[str, Tensor], rows: Tensor, activ
 def rate_term(
     model: Model, anchors: Mapping[str, Tensor], mask: Tensor, share: float, generator: torch.Generator
 ) -> Tensor:
-    """R_l = 1/|V| sum_i m_i Rbar_i, Rbar_i the mean bits over the scalars of anchor i, estimated on a random share
-    of the anchors; the gradient reaches masks, attributes and the priors' moments. mask: m^(l) [N]; anchors: as in
-    `anchor_bits`."""
+    """R_l = 1/|V| sum_i m_i Rbar_i over the active anchors i, estimated on a random `share` of them. Gradients reach
+    the masks, the attributes and the priors' moments. mask: m^(l) [N]; anchors, Rbar: as in `anchor_bits`."""
     active = (mask.detach() > MASK_THRESHOLD).nonzero()[:, 0]
     if len(active) < 2:
         return mask.sum() * 0.0
@@ -131,7 +130,7 @@ class Neighbours:
     """Pairs of anchors that are at most REACH apart on a space-filling (Morton) curve. A pair i, j has the weight
     exp(-|x_i - x_j| / tau), distances in voxels.
 
-    order: int64 [N], the anchors along the curve. weights: [N, REACH], of each and the one 1..REACH behind it.
+    order: int64 [N], the anchors along the curve. weights: [N, REACH], of each anchor and the one 1..REACH further on.
     """
 
     REACH = 8
@@ -146,12 +145,12 @@ class Neighbours:
             self.weights[:-away, away - 1] = torch.exp(distance / -tau)
 
     def draw(self, generator: torch.Generator) -> Tensor:
-        """int64 [N]: for each anchor along the curve how far behind it its partner is, 1..REACH."""
+        """Draws int64 [N]: for each anchor along the curve, how far along its partner is, 1..REACH."""
         return torch.randint(1, self.REACH + 1, (len(self.order),), generator=generator)
 
 
 def smooth_term(mask: Tensor, neighbours: Neighbours, away: Tensor) -> Tensor:
-    """L_smooth = 1/|S| sum w_ij |m_i - m_j| over the pairs S whose second anchor is on the curve, 0 if there are none;
+    """L_smooth = 1/|S| sum w_ij |m_i - m_j| over the pairs S that end within the curve; 0 without such pairs.
     away: from `Neighbours.draw`."""
     order, weights = neighbours.order, neighbours.weights
     first = (torch.arange(len(order)) + away < len(order)).nonzero()[:, 0]

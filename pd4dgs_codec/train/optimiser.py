@@ -1,7 +1,7 @@
-"""Adam over named groups of the model's parameters, whose moments follow anchors that come and go.
+"""Adam over named groups of the model's parameters; its moments follow the addition and removal of anchors.
 
-The update is torch's fused kernel. The class `torch.optim.Adam` would import torch's compiler at its first use, which
-takes a second of every start.
+The update calls torch's fused kernel, because `torch.optim.Adam` imports torch's compiler at its first use, which takes
+a second.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from pd4dgs_codec.train.schedule import learning_rate
 
 #: Parameters with one row per anchor.
 PER_ANCHOR = ("feature", "scaling_log", "offset", "mask_logits")
-#: Of a parameter that has had a gradient: its steps so far, and the running means of gradients and their squares.
+#: Names of a parameter's moments: its steps so far, and the running means of gradients and of their squares.
 STEP, MEAN, SQUARE = "step", "exp_avg", "exp_avg_sq"
 
 
 class Optimiser:
-    """One Adam with a group per learning-rate schedule.
+    """Adam with a parameter group per learning-rate schedule.
 
-    groups: parameters by the field of LearningRates they follow. moments: of each parameter that has had a gradient, by
-    STEP, MEAN and SQUARE.
+    groups: parameters by field of LearningRates. moments: for each parameter that has had a gradient, tensors by STEP,
+    MEAN and SQUARE.
     """
 
     def __init__(self, model: Model, rates: LearningRates, cooldown: float):
@@ -41,12 +41,12 @@ class Optimiser:
 
     @property
     def parameters(self) -> list[nn.Parameter]:
-        """Of all groups, in their order."""
+        """The parameters of all groups, in order."""
         return [p for params in self.groups.values() for p in params]
 
     @torch.no_grad()
     def step(self, progress: float, iterations: int | None) -> None:
-        """One update at progress 0..1 of a schedule of so many steps."""
+        """Updates the parameters at progress 0..1 of a schedule of `iterations` steps, None while unknown."""
         rates = self.rates.of_run(iterations)
         for name, params in self.groups.items():
             rate = learning_rate(getattr(rates, name), progress, self.cooldown)
@@ -65,7 +65,7 @@ class Optimiser:
                 )  # fmt: skip
 
     def clip_gradients(self, most: float) -> float:
-        """Norm over all gradients, which are scaled down to `most`; not finite if one of them is not."""
+        """Scales the gradients to a norm of at most `most`. Returns the norm before; not finite if a gradient is not."""
         gradients = [p.grad for p in self.parameters if p.grad is not None]
         norm = float(torch.stack(torch._foreach_norm(gradients)).norm()) if gradients else 0.0
         if most < norm < math.inf:
@@ -73,7 +73,7 @@ class Optimiser:
         return norm
 
     def take_gradients(self) -> list[Tensor | None]:
-        """The gradients of all parameters, which then have none."""
+        """Removes and returns the gradients of all parameters."""
         taken = [p.grad for p in self.parameters]
         self.zero_grad()
         return taken
@@ -106,10 +106,10 @@ class Optimiser:
 
     @torch.no_grad()
     def transform(self, parameter: Tensor, columns: slice, right: Tensor, *, transposed: bool = False) -> None:
-        """Replaces the parameter's `columns` X by X M, M = `right` [d, d]; if transposed, its rows.
+        """Replaces the parameter's `columns` X by X M with M = `right` [d, d]; if transposed, its rows.
 
-        Its gradients become G M^-T, and so do their means. Their mean squares follow as if the gradients of the columns
-        were independent.
+        Gradients G by X become G M^-T by X M, and their running means change likewise. The mean squares change as if
+        the gradients of the columns were independent.
         """
         moment = torch.linalg.inv(right).T
         moments = self.moments.get(parameter, {})
@@ -120,7 +120,7 @@ class Optimiser:
             part.copy_((part.double() @ by).to(part))
 
     def forget(self, module: nn.Module) -> None:
-        """Removes the parameters of `module`, and groups that are empty without them."""
+        """Removes the parameters of `module`, and groups that become empty."""
         gone: set[Tensor] = set(module.parameters())
         for name, params in list(self.groups.items()):
             self.groups[name] = [p for p in params if p not in gone]
@@ -130,11 +130,11 @@ class Optimiser:
             self.moments.pop(p, None)
 
     def state(self) -> dict[str, Any]:
-        """What resuming needs: under "state" the moments of each parameter by its index."""
+        """The state for a checkpoint: under "state", the moments of each parameter by its index."""
         return {"state": {i: dict(self.moments[p]) for i, p in enumerate(self.parameters) if p in self.moments}}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Restores a `state`; a broken one raises its first fault's own exception."""
+        """Restores a `state`. Raises an exception of any type if it is broken."""
         by_index = dict(enumerate(self.parameters))
         self.moments = {}
         for index, stored in state["state"].items():

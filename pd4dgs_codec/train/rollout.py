@@ -1,12 +1,12 @@
-"""Which levels and views a step trains, and which pixels of a view teach a level.
+"""Selects the levels and views that a step trains, and the pixels of a view that train a level.
 
-With a key instant t*, level 0 is the scene at t*, to which the others add F(x, t) - F(x, t*). The levels then agree:
-most steps train the highest level, from views whose times spread from t* (`phases.opening`). The first steps, in which
-the deformation is still, see views near t* alone: in views of all times what moves would fade. Later a share of the
-steps trains level 0: near t*, and from all views in the pixels that motion leaves as they are, so that what stands
-still is complete without it.
+With a key instant t*, level 0 is the scene at t*, and higher levels add F(x, t) - F(x, t*). The levels then agree, so
+most steps train the highest level, from views whose times spread from t* (`phases.opening`). The first steps have no
+deformation yet and see only views near t*: with views of all times, moving objects would fade. Later a share of the
+steps trains level 0, from views near t* or from any view in the pixels that motion does not change, so that level 0
+shows static content completely.
 
-The rollouts of the paper have no key instant: they teach level 0 the mean over time.
+The paper's rollouts have no key instant: level 0 learns the mean over time.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from pd4dgs_codec.train.phases.opening import window, within
 from pd4dgs_codec.train.schedule import CAPACITY_WEIGHTED, LOWEST, TOP, UNIFORM, Probabilities, rollout_probabilities
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
-#: Share of the steps that train level 0 once the deformation moves, and of these the share near the key instant.
+#: Share of the steps after the coarse phase that train level 0, and the share of these near the key instant.
 STILL_ODDS, NEAR_ODDS = 0.15, 1 / 3
 #: The views near the key instant: this share of all, but at least so many.
 NEAR_SHARE, NEAR_VIEWS = 1 / 12, 4
-#: The largest difference of a colour between level 0 and the highest in pixels that motion leaves as they are.
+#: Motion changes a pixel if a colour differs by at least this between level 0 and the highest level.
 STILL_CONTRAST = 0.15
 #: Share of the steps that train level 1 where there is a level 2.
 GLOBAL_ODDS = 0.1
@@ -53,8 +53,8 @@ def draw_levels(state: TrainState) -> tuple[tuple[int, ...], Probabilities]:
 
 
 def next_view(state: TrainState, level: int) -> int:
-    """The training view of the next picture at `level`: each in turn, in random order; views near the key instant at
-    random."""
+    """Draws the training view of the next picture at `level`: a random one near the key instant where `_near` lists
+    them, otherwise each in turn, in random order."""
     near = [] if state.key is None else _near(state, level)
     if near:
         return near[int(torch.randint(len(near), (), generator=state.generator))]
@@ -66,7 +66,7 @@ def next_view(state: TrainState, level: int) -> int:
 
 
 def _near(state: TrainState, level: int) -> list[int]:
-    """The views near the key instant of which the next picture is one; none if it may be of any view."""
+    """The views near the key instant from which the next one is drawn; none if any view may be drawn."""
     if level > 0 and window(state) >= 1:
         return []
     held_back = _held_back(state)
@@ -82,25 +82,25 @@ def _near(state: TrainState, level: int) -> list[int]:
 
 
 def _held_back(state: TrainState) -> set[int]:
-    """The training views that wait for the selection of levels."""
+    """The training views that are held back until levels are selected."""
     return held_back_views(state) if state.position <= state.schedule.rounding else set()
 
 
 def near_key(state: TrainState, among: list[int]) -> list[int]:
-    """Those of the training views `among` that are nearest to the key instant."""
+    """The training views in `among` that are nearest to the key instant, the nearest first."""
     key, views = state.key or 0.0, state.views.views
     nearest = sorted(among, key=lambda index: abs(views[index].time - key))
     return nearest[: max(NEAR_VIEWS, round(len(among) * NEAR_SHARE))]
 
 
 def taught_views(state: TrainState, views: Sequence[TrainingView]) -> dict[int, list[TrainingView]]:
-    """The views as they teach each of the trained levels."""
+    """By trained level, the views with the pixel weights of `as_taught`."""
     return {level: [as_taught(state, view, level) for view in views] for level in state.trained_levels()}
 
 
 def as_taught(state: TrainState, shown: TrainingView, level: int) -> TrainingView:
-    """The view with the weights of the pixels that teach `level`: at level 0 of a scene with a key instant none where
-    motion changes the picture."""
+    """The view with its pixel weights for training `level`. At level 0 of a scene with a key instant, pixels that
+    motion changes have weight 0."""
     if level > 0 or state.key is None or state.practising or state.position < state.schedule.coarse_end:
         return shown
     with torch.no_grad():

@@ -14,25 +14,25 @@ LOWEST: Probabilities = (1.0, 0.0, 0.0)
 RHO_DECAY = 0.95
 #: Share of a run in which level 0 alone is trained.
 COARSE_SHARE = 1 / 10
-#: Share of a run with a key instant after which views of all times teach motion, see `phases.opening`.
+#: Share of a run with a key instant after which views of all times train motion, see `phases.opening`.
 OPENING_SHARE = 1 / 2
-#: Rounds in which anchors of little use are pruned; each anchor can be pruned in one of them.
+#: Rounds in which anchors of little use are pruned; each anchor is a candidate in one round.
 PRUNING_ROUNDS = 4
 
 
 class Schedule:
     """The phases of a run of N iterations, as fractions of N (the paper's N is 30,000).
 
-    iterations: N; None as long as the time limit of a run has not settled it. Such a run stays in its coarse phase:
-    every later phase begins at infinity, and nothing is grown or pruned.
+    iterations: N; None before a timed run has estimated it. Until then the run stays in its coarse phase: every later
+    phase begins at infinity, and nothing is grown or pruned.
     coarse_end: before it only level 0 is trained; from it on, quantisation noise is added.
-    moving: transparent anchors are pruned from here on; before it, what moves may not have been found yet.
+    moving: transparent anchors are pruned from here on; earlier, moving objects may be missing still.
     progressive: the rate term, TMC and the average rho start here (T_progressive; T_warm is within the coarse phase).
     rho_every: iterations between updates of rho (K).
     rounding: planes and weights are rounded straight-through from here on.
-    exact_rounding: the anchors' attributes are rounded straight-through from here on, where noise simulated it before.
+    exact_rounding: the anchors' attributes are rounded straight-through from here on, instead of noise.
     grow: iterations after which anchors are grown and pruned.
-    prune: iterations before which anchors of little use are pruned; growing has ended.
+    prune: iterations before which anchors of little use are pruned, once growing has ended.
     """
 
     def __init__(self, iterations: int | None):
@@ -55,7 +55,7 @@ class Schedule:
         return iteration / self.iterations if self.iterations else 0.0
 
     def opening(self, iteration: int) -> float:
-        """Progress of the opening of time, 0..1, from the end of the coarse phase."""
+        """Progress of opening the time window, 0..1, from the end of the coarse phase to OPENING_SHARE."""
         return min(max((self.progress(iteration) - COARSE_SHARE) / (OPENING_SHARE - COARSE_SHARE), 0.0), 1.0)
 
     def separation(self, iteration: int) -> float:
@@ -88,13 +88,13 @@ class Schedule:
 
 
 def reduction(progress: float, share: float) -> int:
-    """1/size of the training pictures at progress 0..1, where a `share` of the run has smaller ones: 4, 2, then 1."""
+    """The reduction of training pictures at progress 0..1: by 4, then by 2, over the first `share`; 1 afterwards."""
     return 4 if progress < share / 2 else 2 if progress < share else 1
 
 
 def learning_rate(bounds: tuple[float, float], progress: float, cooldown: float = 0.0) -> float:
-    """Log-linear between the bounds at progress 0..1; times a factor that falls from 1 to 0 over the last `cooldown`
-    of it."""
+    """The rate at progress 0..1: log-linear between the bounds, times a factor that falls from 1 to 0 over the last
+    `cooldown` of the run."""
     start, end = bounds
     left = min((1 - progress) / cooldown, 1.0) if cooldown else 1.0
     return start * math.pow(end / start, progress) * left

@@ -1,8 +1,8 @@
 """The picture's loss: L1 and 1 - SSIM of a render against a training image, as two unweighted terms.
 
 SSIM is that of Wang et al. 2004 as 3DGS uses it: 11-tap Gaussian window of sigma 1.5, zero padding, c1 = .01^2,
-c2 = .03^2, per channel, mean of the map. With a mask both maps are weighted by it and divided by its sum; a window
-still covers the masked pixels next to it. The CPU uses numba kernels, other devices `image_loss_reference`.
+c2 = .03^2, per channel, mean of the map. With a mask both maps are weighted by it and divided by its sum; windows
+at its border still read masked pixels. The CPU uses numba kernels, other devices `image_loss_reference`.
 
 In the kernels a row [W, 3] is 3 W floats, so that the horizontal pass is a sum of shifts by 3 and both passes are
 contiguous vectors. Images are padded with zeros by 5 pixels on each side and some more on the right, so that no loop
@@ -59,8 +59,8 @@ class _ImageLoss(torch.autograd.Function):
 
 
 def image_loss(image: Tensor, target: Tensor, weights: Tensor, part: Part = WHOLE) -> tuple[Tensor, Tensor]:
-    """(weighted mean of |image - target|, weighted mean of 1 - SSIM), scalars. image, target: float32 [H, W, 3], linear
-    0..1. weights: [H, W], from `pixel_weights`. part: of the image, that `target` and `weights` are cropped to."""
+    """(weighted mean of |image - target|, weighted mean of 1 - SSIM), scalars. image, target: float32 [H, W, 3], 0..1.
+    weights: [H, W], from `pixel_weights`. part: the rows and columns of the image that `target` and `weights` cover."""
     if image.device.type != "cpu":
         return image_loss_reference(image[part], target, weights)
     l1, dissimilarity = _ImageLoss.apply(image, target, weights, part)  # type: ignore[no-untyped-call]
@@ -84,8 +84,8 @@ def image_loss_reference(image: Tensor, target: Tensor, weights: Tensor) -> tupl
 
 
 def within_reach(differs: Tensor) -> slice:
-    """The rows (or columns) of two pictures that `image_loss` and its gradient depend on: outside of them both are
-    zero. differs: bool [n], whether the pictures may differ in a row.
+    """The rows (or columns) on which `image_loss` of two pictures and its gradient depend; outside, both are zero.
+    differs: bool [n], whether the pictures may differ in a row.
 
     A difference changes the SSIM of windows up to REACH away, whose other pixels lie up to REACH further.
     """

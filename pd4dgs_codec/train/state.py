@@ -1,4 +1,4 @@
-"""A model in training with all that its steps change: the steps and the phases of a run work on it."""
+"""The state of a model in training, on which the steps and the phases of a run work."""
 
 from __future__ import annotations
 
@@ -28,17 +28,17 @@ from pd4dgs_codec.train.ssim import Part, pixel_weights, within_reach
 
 #: Bytes of images on the device, weights included, beyond which the least recently used are dropped.
 KEPT_BYTES = 1 << 30
-#: Pixels of the shorter side from which on pictures are reduced: a quarter keeps 100, with fewer little time is saved.
+#: Pixels of the shorter side from which pictures are reduced at first: reducing smaller ones saves little time.
 LARGE = 400
-MOST_STEPS = 1 << 31  #: of a run that is resumed
+MOST_STEPS = 1 << 31  #: that a checkpoint may count
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingView:
     """A view of the dataset on the device.
 
-    pixels: uint8 [H, W, 3]. weights: float32 [H, W], see `pixel_weights`. rows, columns: bool [H] and [W], which of
-    them show something before the background.
+    pixels: uint8 [H, W, 3]. weights: float32 [H, W], see `pixel_weights`. rows, columns: bool [H] and [W], whether
+    a row or column differs from the background.
     """
 
     view: View
@@ -69,19 +69,19 @@ class TrainingView:
 
     def content(self, alpha: Tensor) -> Part:
         """The rows and columns that the loss of a picture with `alpha` [H, W] depends on: elsewhere the picture and the
-        image are the background."""
+        image show the background."""
         rows, columns = (alpha.detach().amax(axis).bool() for axis in (1, 0))
         return within_reach(self.rows | rows), within_reach(self.columns | columns)
 
     def squared_error(self, image: Tensor, where: Tensor | None = None) -> float:
-        """Of a picture [H, W, 3] of this view, summed over colours and weighted pixels; of those in the mask `where`
-        (bool [H, W]) if given."""
+        """The squared error of a picture [H, W, 3] of this view, summed over colours and weighted pixels; only over the
+        mask `where`, bool [H, W], if given."""
         errors = (image - self.image).square().sum(-1) * self.weights
         return float((errors if where is None else errors[where]).sum())
 
 
 class TrainingViews:
-    """A dataset's training views, copied to the device on demand; KEPT_BYTES of them stay there."""
+    """A dataset's training views, copied to the device on demand, where KEPT_BYTES of them stay."""
 
     def __init__(self, views: Sequence[View], background: Sequence[float], device: torch.device):
         self.views, self.background, self.device = views, background, device
@@ -99,7 +99,7 @@ class TrainingViews:
         return self.reduced(index, 1)
 
     def reduced(self, index: int, k: int) -> TrainingView:
-        """View `index` at 1/k of its size, if it is LARGE."""
+        """View `index`, at 1/k of its size if its shorter side has LARGE pixels or more."""
         view = self.views[index]
         k = k if min(view.width, view.height) >= LARGE else 1
         found = self._kept.pop((index, k), None)
@@ -115,17 +115,17 @@ class TrainingViews:
 class TrainState:
     """A model in training.
 
-    Everything random comes from two generators whose states are saved, so that on the CPU a resumed run repeats the
-    uninterrupted one bit for bit at a fixed number of iterations and threads; on CUDA the order of sums varies.
+    All random numbers come from two generators whose states checkpoints hold. On the CPU, a resumed run thus repeats
+    the uninterrupted one bit for bit at a fixed number of iterations and threads; on CUDA the order of sums varies.
 
-    schedule: of the run; replaced once where a time limit settles its length after some steps.
-    iteration: steps done, skipped ones included. skipped: those whose loss or gradient was not finite.
+    schedule: the run's schedule; a timed run replaces it once, when it has estimated its length.
+    iteration: steps done, skipped ones included. skipped: steps whose loss or gradient was not finite.
     share: in a timed run the share of the schedule that is done, 0..1, set by Trainer; None otherwise.
-    statistics: [N] or [N, slots] per anchor, what growing is decided by.
+    statistics: [N] or [N, slots] per anchor, on which growing depends, see `fresh_statistics`.
     order: training views drawn and not yet used, the next one last.
     rho: moving average of how much the masks of levels 0 and 2 differ.
-    practising: steps are on trial; all views and pixels teach level 0, see `phases.levels`.
-    opened: all views teach motion, see `phases.opening`.
+    practising: a trial is running; all views and pixels train level 0, see `phases.levels`.
+    opened: all views train motion, see `phases.opening`.
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class TrainState:
         device: torch.device,
         size: ModelConfig | None = None,
     ):
-        """A fresh model for `dataset`, of the preset's size by default."""
+        """Starts with a fresh model for `dataset`, of the preset's size by default."""
         self.config, self.dataset, self.schedule, self.device = config, dataset, schedule, device
         self.size = size or PRESETS[config.preset]
         steps = config.model_steps(self.size.steps)
@@ -152,13 +152,13 @@ class TrainState:
         self.share: float | None = None
         self.rho, self.practising, self.opened = 0.0, False, False
         self.order: list[int] = []
-        self._before = -1  #: the position of the step before; a timed run may advance by more than one
+        self._before = -1  #: the previous step's position; a timed run may advance by more than one
 
     # -- where the run stands --------------------------------------------------------------------------------------
 
     @property
     def position(self) -> int:
-        """Of the next step in the schedule, 0..N: the steps done, or in a timed run the share of N."""
+        """The next step's position in the schedule, 0..N: the steps done, or in a timed run the `share` of N."""
         return self.iteration if self.share is None else int(self.share * (self.schedule.iterations or 0))
 
     @property
@@ -172,11 +172,11 @@ class TrainState:
         return (self.position - 1 if self.share is None else self._before) < start <= self.position
 
     def steps_in(self, share: float) -> int:
-        """How many steps a share of the run takes at its pace so far: in a timed run fewer than that share of N."""
+        """How many steps a share of the run takes at its pace so far; in a timed run, N only estimates this pace."""
         return round(share * self.iteration / max(self.schedule.progress(self.position), 1e-9))
 
     def rounding(self, *, noisy: bool = True) -> Rounding:
-        """How the steps at this position simulate quantisation; without its noise if not `noisy`."""
+        """How the steps at this position simulate quantisation; without noise if not `noisy`."""
         if not self.config.noise:
             return EXACT
         exact = self.position >= self.schedule.exact_rounding
@@ -185,7 +185,7 @@ class TrainState:
         return Rounding(self.noise if noise else None, attributes=exact, weights=weights)
 
     def picture(self, index: int) -> TrainingView:
-        """Training view `index` as the steps at this position see it: a large one smaller at first."""
+        """Training view `index` as the steps at this position see it: reduced at first if large."""
         progress = self.schedule.progress(self.position)
         return self.views.reduced(index, reduction(progress, self.config.small_pictures))
 
@@ -201,8 +201,8 @@ class TrainState:
             return [int((self.model.masks(level) > MASK_THRESHOLD).sum()) for level in range(3)]
 
     def plane_bits(self) -> list[float]:
-        """The sum of R(a) of the planes of layers 1 and 2 as they would be coded now, in the groups of `--priors
-        gauss`; 0 for an absent layer."""
+        """The bits of the planes of layers 1 and 2 if coded now: sums of R(a) in the groups of `--priors gauss`; 0 for
+        an absent layer."""
         steps = self.model.steps.scaled(1.0)
         found = {i: f.bits(steps.planes(i)) for i, f in self.model.deformations.items()}
         return [found.get(1, 0.0), found.get(2, 0.0)]
@@ -219,7 +219,7 @@ class TrainState:
     # -- changes ---------------------------------------------------------------------------------------------------
 
     def snapshot(self) -> tuple[Any, ...]:
-        """The parameters, their moments and what draws views and noise as they are, for `return_to`."""
+        """Copies the parameters, their moments and the random state, for `return_to`."""
         values = {p: p.detach().clone() for p in self.optimiser.parameters}
         moments = {p: {n: m.clone() for n, m in own.items()} for p, own in self.optimiser.moments.items()}
         return values, moments, self.generator.get_state(), self.noise.generator.get_state(), list(self.order)
@@ -248,7 +248,7 @@ class TrainState:
     # -- checkpoints -----------------------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
-        """What a checkpoint holds besides the model, so that the next steps are the same."""
+        """The state that a checkpoint holds besides the model, so that a resumed run continues alike."""
         return {
             "iteration": self.iteration,
             "total": self.schedule.iterations or 0,
@@ -265,7 +265,7 @@ class TrainState:
         }
 
     def restore(self, model: Model, state: dict[str, Any]) -> None:
-        """Continues with `model` from a `state`. A broken state raises its first fault's own exception."""
+        """Continues with `model` from a `state`. Raises an exception of any type if the state is broken."""
         if model.widths != self.model.widths:
             raise ValueError(f"a model of {model.widths}, where its configuration has {self.model.widths}")
         fresh = fresh_statistics(len(model.anchor_q), self.config.slots)
@@ -292,7 +292,7 @@ class TrainState:
 
 
 def fresh_statistics(anchors: int, slots: int) -> dict[str, Tensor]:
-    """Zeros. pull, visits [N, slots]: sum of the image gradients of each Gaussian and the pictures it was drawn in;
-    opacity, anchor_visits [N]: sum of the opacities of each anchor and the pictures it was evaluated for."""
+    """Zeros, by name. pull, visits [N, slots]: sum of a Gaussian's image gradients, number of pictures that draw it.
+    opacity, anchor_visits [N]: sum of an anchor's opacities, number of pictures that evaluate it."""
     shapes = {"pull": (anchors, slots), "visits": (anchors, slots), "opacity": (anchors,), "anchor_visits": (anchors,)}
     return {name: torch.zeros(shape) for name, shape in shapes.items()}

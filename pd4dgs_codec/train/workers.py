@@ -1,7 +1,7 @@
 """Several workers on one scene, started by torchrun: each trains on its share of a step's views.
 
-All hold the same model. Gradients are summed, so that all take the same step. Occasional measurements, such as those of
-pruning, are made by the first worker for all. A single process communicates nothing.
+All hold the same model. Gradients are summed, so that all make the same update. The first worker makes occasional
+measurements, such as the errors of pruning, for all. A single process communicates nothing.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ T = TypeVar("T")
 
 
 def start(device: str, views: int) -> None:
-    """Joins the other workers if torchrun started this process. TrainError if they cannot share `views` evenly."""
+    """Joins the other workers if torchrun started this process. Raises TrainError if `views` do not divide evenly."""
     workers = int(os.environ.get("WORLD_SIZE", "1"))
     if views % workers:
         raise TrainError(f"found {workers} workers, expected a number that divides --views-per-step {views}")
     if workers > 1:
-        # Its functions take the group of all workers as a default when it is loaded. Loaded after the group is made, it
-        # would keep the group's threads beyond stop(), which sometimes aborts the process at its end.
+        # The module stores the default process group at import. Imported once the group exists, it would keep the
+        # group's threads beyond stop(), which sometimes aborts the process at exit.
         import_module("torch.distributed.nn.functional")
         if device == "cuda":
             torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
@@ -40,7 +40,7 @@ def stop() -> None:
 
 
 def count() -> int:
-    """Workers on this scene."""
+    """The number of workers on this scene."""
     return distributed.get_world_size() if distributed.is_available() and distributed.is_initialized() else 1
 
 
@@ -50,8 +50,8 @@ def rank() -> int:
 
 
 def alike(measure: Callable[[], T]) -> T:
-    """measure() of the first worker, for all: rounding on another machine must not lead to another decision. NotFinite
-    is raised on all workers. Tensors are on the CPU: each worker has a device of its own."""
+    """Returns the first worker's measure() on all workers, as rounding on another machine might change a decision.
+    Raises its NotFinite on all workers. Tensors must be on the CPU: each worker has its own device."""
     if count() == 1:
         return measure()
     found: list[Any] = [None, None]
