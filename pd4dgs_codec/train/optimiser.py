@@ -65,7 +65,7 @@ class Optimiser:
                 )  # fmt: skip
 
     def clip_gradients(self, most: float) -> float:
-        """Scales the gradients to a norm of at most `most`. Returns the norm before; not finite if a gradient is not."""
+        """Scales the gradients to a norm of at most `most`. Returns their norm before, NaN or inf if one is."""
         gradients = [p.grad for p in self.parameters if p.grad is not None]
         norm = float(torch.stack(torch._foreach_norm(gradients)).norm()) if gradients else 0.0
         if most < norm < math.inf:

@@ -10,7 +10,7 @@ MIN_ITERATIONS = 500
 
 
 class Phase:
-    """One phase; Learner asks each in turn before a step (growing, after its update)."""
+    """A phase of a run. Learner asks each in turn before a step whether it is due; growing, after the update."""
 
     def due(self, state: TrainState) -> bool:
         """Whether the phase acts at this step of the schedule."""
@@ -21,7 +21,7 @@ class Phase:
         raise NotImplementedError
 
     def stored(self) -> dict[str, Any]:
-        """What a checkpoint holds of it, so that a resumed run continues the same."""
+        """The phase's state for a checkpoint, so that a resumed run continues alike."""
         return {}
 
     def restore(self, stored: Mapping[str, Any]) -> None:
@@ -29,5 +29,5 @@ class Phase:
 
 
 def long_enough(state: TrainState) -> bool:
-    """Whether the run has phases that measure pictures."""
+    """Whether the run is long enough for phases that measure pictures."""
     return (state.schedule.iterations or 0) >= MIN_ITERATIONS

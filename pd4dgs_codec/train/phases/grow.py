@@ -27,7 +27,7 @@ MIN_SLOT_VISITS = 10
 
 
 class Grow(Phase):
-    """Collects statistics from every picture of the first half of a run, and adjusts the anchors at intervals."""
+    """Collects statistics from every picture of the first half of a run, and grows and prunes anchors at intervals."""
 
     def due(self, state: TrainState) -> bool:
         """At the positions of `Schedule.grow`."""
@@ -35,7 +35,7 @@ class Grow(Phase):
 
     @torch.no_grad()
     def observe(self, state: TrainState, pictures: Sequence[Picture]) -> None:
-        """Adds the statistics of a step's pictures, after their backward passes; of all workers' pictures."""
+        """Adds the statistics of a step's pictures, of all workers, after the backward passes."""
         if state.schedule.iterations is None or state.position > state.schedule.grow.stop:
             return
         found = state.statistics
@@ -49,7 +49,7 @@ class Grow(Phase):
 
     @torch.no_grad()
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
-        """Prunes and grows; resets the statistics that were used."""
+        """Prunes and grows anchors, and resets the statistics that decided it."""
         model, statistics = state.model, state.statistics
         most = state.size.max_anchors
         visited = statistics["anchor_visits"] >= MIN_ANCHOR_VISITS
@@ -69,7 +69,7 @@ class Grow(Phase):
 
 
 def _add(statistics: dict[str, Tensor], picture: Picture, views: int) -> None:
-    """The statistics of one picture, whose loss was divided by `views`."""
+    """Adds the statistics of a picture, whose loss was divided by `views`."""
     gradient, gaussians = picture.meta["means2d"].grad, picture.gaussians
     if gradient is None or not len(gaussians.slots):
         return
@@ -86,14 +86,14 @@ def _add(statistics: dict[str, Tensor], picture: Picture, views: int) -> None:
 
 
 def _opaque(model: Model, statistics: dict[str, Tensor], visited: Tensor) -> Tensor:
-    """int64 [n]: the anchors that show; all if none does."""
+    """int64 [n]: the anchors that are neither transparent nor masked out; all if there are none."""
     faint = visited & (statistics["opacity"] < MIN_MEAN_OPACITY * statistics["anchor_visits"])
     keep = (~faint & (model.masks(2).cpu() > MASK_THRESHOLD)).nonzero()[:, 0]
     return keep if len(keep) else torch.arange(len(faint))
 
 
 def _anchors(model: Model, cells: Tensor, feature: Tensor) -> dict[str, Tensor]:
-    """The attributes of new anchors."""
+    """The attributes of new anchors, by name. cells, feature: from `_new_cells`."""
     device, n = model.feature.device, len(cells)
     size = (cells[:, 3].double() * model.info.voxel_size).float()
     found = {
@@ -138,7 +138,7 @@ def _new_cells(
 
 
 def _inside(model: Model, slots: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """(slots, their anchors, float64 [n, 3] their positions in voxels) of those Gaussians that lie near the box."""
+    """(slots, their anchors, float64 [n, 3] their positions in voxels) of the Gaussians that lie near the box."""
     anchor_q, scaling = model.anchor_q.cpu(), model.scaling_log.detach().cpu().exp()
     low, high = (torch.from_numpy(model.info.box[i]).double() / model.info.voxel_size for i in (0, 1))
     reach = 0.5 * (high - low).max()
@@ -150,6 +150,6 @@ def _inside(model: Model, slots: Tensor) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _contained(rows: Tensor, among: Tensor) -> Tensor:
-    """bool [n]: which int64 rows [n, 3] occur among `among` [m, 3]."""
+    """bool [n]: which int64 rows [n, 3] occur in `among` [m, 3]."""
     _, index = torch.unique(torch.cat([rows, among]), dim=0, return_inverse=True)
     return torch.isin(index[: len(rows)], index[len(rows) :])

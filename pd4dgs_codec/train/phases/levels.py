@@ -1,8 +1,8 @@
-"""Selection of levels: a level without use is removed for the rest of the run.
+"""Selection of levels: a level of little use is removed for the rest of the run.
 
-Whether a level is of use shows on views held back from training, for on those it is trained on every level gains, and
-only after the level below, which has seen few steps of its own, has tried to do without it: on a static scene level 1
-is then no better. Both are compared in the pixels that the level changes, so that small things count as large ones do.
+A level is compared with the level below on views held back from training, because every level gains on training views.
+Before, the level below, which has had few steps of its own, is trained alone: on a static scene, level 1 is then no
+better. Only pixels that the level changes are compared, so that small objects count as much as large ones.
 """
 
 from __future__ import annotations
@@ -26,23 +26,23 @@ from pd4dgs_codec.train.state import TrainingView, TrainState
 #: One training view in so many is held back until levels are selected, if there are enough of them.
 EVERY = 16
 MIN_VIEWS = 4
-#: Level 1 stays if it is better by so many dB, together with what level 2 gained, for both tell that something moves;
-#: level 2 if it gains this share of what it gains over level 0, and so many dB at least, ...
+#: Level 1 stays if its gain and that of a removed level 2, which also shows motion, sum to MIN_GAIN_1 dB. Level 2 stays
+#: if it gains at least SHARE_2 of its gain over level 0, and MIN_GAIN_2 dB.
 MIN_GAIN_1, SHARE_2, MIN_GAIN_2 = 1.1, 0.15, 0.5
-#: ... in the pixels in which it changes some colour by so much, if there are so many of them, ...
+#: A gain counts the pixels in which the level changes a colour by MIN_CONTRAST; if there are fewer than this, it is 0.
 MIN_CONTRAST, MIN_PIXELS = 0.02, 32
-#: ... than the level below after so many further steps: a share of the run, and so many at least.
+#: Steps for which the level below is trained before: a share of the run, and so many at least.
 PRACTICE, MIN_PRACTICE = 1 / 10, 75
 
-#: A timed run of fewer steps keeps its levels: quick motion is not learnt by then, and nobody has asked for so few.
+#: A timed run of fewer steps keeps its levels: fast motion is not learnt by then, and nobody asked for so few.
 MIN_TIMED = 1000
 
 
 class SelectLevels(phases.Phase):
-    """Where planes and weights begin to be rounded, removes the levels of little use.
+    """Removes the levels of little use, where planes and weights begin to be rounded.
 
-    practise: trains a level alone for so many steps. left_out: the removed levels, each with its level, gain in dB
-    where it acts, and number of views.
+    practise: trains a level on trial for a number of steps. left_out: for each removed level, the level, its gain in
+    dB in the pixels that it changes, and the number of views.
     """
 
     def __init__(self, practise: Callable[[int, int], None]) -> None:
@@ -55,7 +55,7 @@ class SelectLevels(phases.Phase):
         return judges and (state.share is None or state.steps_in(1.0) >= MIN_TIMED)
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
-        """From the highest level down, until one stays."""
+        """Removes levels from the highest down, until one stays."""
         record["level_gains"] = gains = []
         above = 0.0
         while state.model.level:
@@ -70,8 +70,8 @@ class SelectLevels(phases.Phase):
         record["left_out"] = self.left_out
 
     def _gain(self, state: TrainState, level: int, views: list[TrainingView], above: float) -> tuple[float, float]:
-        """(by how many dB `level` is better in the pixels that it changes than the level below after practice, what it
-        needs to stay). The state is as before if the level stays. above: what the level above gained."""
+        """(the gain of `level` over the level below after a trial, dB in the pixels that it changes; the gain that it
+        needs to stay). The state is restored if the level stays. above: the gain of the level above."""
         below = max(layer for layer in (0, *state.model.deformations) if layer < level)
         pictures = [images(state, view, (below, level)) for view in views]
         acts, with_it = [changes(*pair) for pair in pictures], [shown for _, shown in pictures]
@@ -107,21 +107,21 @@ class SelectLevels(phases.Phase):
 
 @torch.no_grad()
 def images(state: TrainState, view: TrainingView, levels: Sequence[int]) -> list[Tensor]:
-    """The pictures of a view at these levels, as the steps at this position see them, without noise."""
+    """The pictures [H, W, 3] of a view at these levels, rounded as at this position, without noise."""
     rounding = state.rounding(noisy=False)
     return [render(state.model, level, view.view.time, view.view.camera, rounding).image for level in levels]
 
 
 def changes(without: Tensor, with_it: Tensor) -> Tensor:
-    """bool [H, W]: the pixels in which two pictures differ enough to see."""
+    """bool [H, W]: the pixels in which a colour differs by MIN_CONTRAST or more between two pictures."""
     return (without - with_it).abs().amax(-1) >= MIN_CONTRAST
 
 
 def gain_in(
     views: Sequence[TrainingView], where: Sequence[Tensor | None], without: Sequence[Tensor], with_it: Sequence[Tensor]
 ) -> float:
-    """By how many dB the squared error of a second picture of each view is less than that of a first one, in the pixels
-    `where`, bool [H, W]; None: in all."""
+    """The gain in dB, in squared error, of the pictures `with_it` over the pictures `without`, one of each per view, in
+    the pixels `where`, bool [H, W]; None: in all."""
     first, second = (
         sum(view.squared_error(image.clamp(0, 1), mask) for view, mask, image in zip(views, where, drawn, strict=True))
         for drawn in (without, with_it)
@@ -130,8 +130,8 @@ def gain_in(
 
 
 def held_back_views(state: TrainState) -> set[int]:
-    """Indices of the training views by which levels are selected, unseen until then; none if nothing is selected or
-    the length of the run is not known yet."""
+    """Indices of the training views that select levels and are unseen until then; none if no level is selected or the
+    length of the run is not known yet."""
     config = state.config
     selects = not config.keep_layers and config.max_layer > 0 and config.rollout != "top" and phases.long_enough(state)
     views = set(range(EVERY // 2, len(state.views), EVERY)) if selects else set()

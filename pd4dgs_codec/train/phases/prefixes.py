@@ -1,8 +1,8 @@
 """Training of prefixes: steps that render only the most useful anchors, so that a file's first slices look whole.
 
-A model that was always rendered with all of its anchors has holes where some are missing. So in the last third of a run
-some steps of level 0 render its most useful anchors alone, in the order in which `pd4dgs-encode --slices` sends them
-(nested dropout: Rippel, Gelbart and Adams, Learning ordered representations with nested dropout, 2014).
+A model that is always rendered with all anchors has holes where some are missing. In the last third of a run, some
+steps of level 0 therefore render only its most useful anchors, in the order in which `pd4dgs-encode --slices` sends
+them (nested dropout: Rippel, Gelbart and Adams, Learning ordered representations with nested dropout, 2014).
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from pd4dgs_codec.train.state import TrainState
 VIEWS = 8
 #: The fewest anchors of a prefix, about those of a first slice of 50 kB.
 FEWEST = 1500
-#: Share of the steps of level 0 that render a prefix, and where it is the only level.
+#: Share of the steps of level 0 that render a prefix, and the share if level 0 is the only level.
 SHARE, STILL_SHARE = 0.5, 0.15
 
 
 class Prefixes(Phase):
-    """Ranks the anchors of level 0 where planes and weights begin to be rounded; from then on draws prefixes of them.
+    """Ranks the anchors of level 0 where planes and weights begin to be rounded, and draws prefixes from then on.
 
-    rank: float64 [N], see `rank_anchors`; None before, and where level 0 has no more than FEWEST anchors.
+    rank: float64 [N], see `rank_anchors`; None before, or if level 0 has at most FEWEST anchors.
     """
 
     def __init__(self) -> None:
@@ -68,8 +68,8 @@ class Prefixes(Phase):
 
 
 def rank_anchors(model: Model, views: Sequence[View]) -> Tensor:
-    """float64 [N]: the utility of each anchor at level 0, the highest first in a file, equal for the last FEWEST to
-    leave; -inf if absent there."""
+    """float64 [N]: the utility of each anchor at level 0. Files store the highest first; the last FEWEST anchors of
+    `utility` rank equal, and anchors that level 0 lacks have -inf."""
     absent = (model.masks(0).detach() <= MASK_THRESHOLD).cpu().numpy()
     scene = without(to_scene(model).prefix(0), np.flatnonzero(absent))
     scene = replace(scene, steps=scene.steps.scaled(1.0))  # binary32, as a file has them
@@ -80,7 +80,7 @@ def rank_anchors(model: Model, views: Sequence[View]) -> Tensor:
 
 
 def draw_prefix(rank: Tensor, generator: torch.Generator) -> Tensor:
-    """bool [N]: the anchors of highest rank, from FEWEST to all that are present, their number log-uniform."""
+    """bool [N]: the anchors of highest rank, their number log-uniform from FEWEST to all that are present."""
     present = int(rank.isfinite().sum())
     count = present * (FEWEST / present) ** float(torch.rand((), generator=generator))
     chosen = torch.zeros(len(rank), dtype=torch.bool)

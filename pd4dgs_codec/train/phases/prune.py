@@ -1,9 +1,9 @@
 """Pruning of anchors that pictures depend on little, once growing has ended: they leave the model, or layer 0.
 
-Growing makes more anchors than a scene can use, and masks do not tell which: the rate term lowers all alike, and a
-small mask does not mean a small error. So the error of leaving an anchor out is measured in training views. Of many
-anchors in one place each is redundant, but not all are: in each of several rounds only a part of the anchors, scattered
-over the scene, can be pruned, and the rest is measured again.
+Growing makes more anchors than a scene needs, and masks do not identify them: the rate term lowers all masks alike, and
+a small mask does not mean a small error. The error of omitting an anchor is therefore measured in training views. Each
+of many anchors in one place is redundant, but not all of them together: each of several rounds can prune only some
+anchors, scattered over the scene, and the rest is measured again.
 """
 
 from __future__ import annotations
@@ -25,37 +25,37 @@ from pd4dgs_codec.train.rollout import taught_views
 from pd4dgs_codec.train.schedule import PRUNING_ROUNDS
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
-#: Training views in which an anchor is measured; in each round others.
+#: Training views in which an anchor is measured; each round uses others.
 VIEWS = 24
 #: Mask of an anchor at a level that it has left: below the threshold, so that it is neither drawn there nor coded.
 ABSENT = 1e-3
 
-#: Mean squared error, that of 30 dB, beyond which the error of a view pays for no saving: what has not been learnt yet
-#: would pay for all of it, and with it what few views show.
+#: The mean squared error (30 dB) up to which a view's error counts towards the budget: otherwise views that are not
+#: learnt yet would allow pruning the content that few views show.
 LEARNT = 1e-3
 
-#: `omission_error` or one of the same arguments: (errors, bool [N] whether an anchor may reach the picture, picture).
+#: `omission_error` or a similar function, which returns (errors, bool [N] whether an anchor may reach it, picture).
 ErrorOf = Callable[..., tuple[Tensor, Tensor, Tensor]]
 
 
 class Prune(Phase):
-    """One round of PRUNING_ROUNDS.
+    """One of PRUNING_ROUNDS rounds, which concerns only the anchors whose `round_of` it is.
 
-    Removes the anchors whose absence together adds at most a share of the squared error to any of the trained levels,
-    then removes from level 0 those whose absence adds as much there. Only anchors whose `round_of` is this round's are
-    concerned. Anchors that no view shows stay, and all do if none would be left.
+    Removes anchors whose absence together adds at most a share of the squared error to any trained level, then removes
+    from level 0 anchors whose absence adds at most as much there. Anchors that no view shows stay. If none would be
+    left, all stay.
     """
 
     def __init__(self, turn: int):
         self.turn = turn
 
     def due(self, state: TrainState) -> bool:
-        """At its position of `Schedule.prune`."""
+        """At the round's position in `Schedule.prune`."""
         starts = state.schedule.prune if state.config.prune and long_enough(state) else range(0)
         return bool(starts) and state.reached(starts[self.turn])
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
-        """Logs how many anchors left the model and how many left layer 0."""
+        """Prunes, and logs how many anchors left the model and how many left layer 0."""
         model, levels = state.model, state.trained_levels()
         share, before, held_back = state.config.prune / PRUNING_ROUNDS, len(model.anchor_q), held_back_views(state)
         order = [i for i in range(len(state.views)) if i not in held_back]
@@ -80,8 +80,8 @@ class Prune(Phase):
 def added_error(
     model: Model, views: Mapping[int, Sequence[TrainingView]], rounding: Rounding, error_of: ErrorOf
 ) -> Tensor:
-    """float64 [levels, N], on the CPU and alike in all workers: the squared error over `views`, by level, that
-    `error_of` says each anchor adds there, relative to the present error. Infinite where no view shows the anchor."""
+    """float64 [levels, N], on the CPU and equal in all workers: the error of each anchor by `error_of`, summed over the
+    `views` of a level and relative to their present squared error. Infinite where no view shows the anchor."""
 
     def measure() -> Tensor:
         found = [relative_error(model, level, views[level], rounding, error_of) for level in views]
@@ -93,8 +93,8 @@ def added_error(
 def relative_error(
     model: Model, level: int, views: Sequence[TrainingView], rounding: Rounding, error_of: ErrorOf
 ) -> tuple[Tensor, Tensor]:
-    """(the sum over `views` of the float64 errors that `error_of` finds at `level`, relative to the present squared
-    error, of a view at most LEARNT; bool [N]: whether a view shows the anchor)."""
+    """(float64 errors by `error_of` at `level`, summed over `views` and relative to their present squared error, of
+    which a view counts at most LEARNT; bool [N]: whether a view shows the anchor)."""
     generator = torch.Generator().manual_seed(0)
     total, met, error = torch.zeros((), dtype=torch.float64), torch.zeros((), dtype=torch.bool), 0.0
     for view in views:
@@ -113,7 +113,7 @@ def round_of(anchor_q: Tensor) -> Tensor:
 
 
 def least(errors: Tensor, share: float) -> Tensor:
-    """bool [N]: the anchors of least error, at most `share` together. errors: float64 [N] >= 0, may be infinite."""
+    """bool [N]: the anchors of least error, whose sum is at most `share`. errors: float64 [N] >= 0, may be infinite."""
     order = errors.argsort(stable=True)
     found = torch.zeros(len(errors), dtype=torch.bool, device=errors.device)
     found[order[errors[order].cumsum(0) <= share]] = True
@@ -122,7 +122,7 @@ def least(errors: Tensor, share: float) -> Tensor:
 
 @torch.no_grad()
 def _leave_level_0(model: Model, rows: Tensor) -> None:
-    """The anchors `rows` (bool [N]) begin at level 1; their masks at levels 1 and 2 stay."""
+    """Removes the anchors `rows` (bool [N]) from level 0; their masks at levels 1 and 2 stay."""
     masks = torch.stack([model.masks(level) for level in range(3)], dim=1)[rows]
     masks[:, 0] = ABSENT
     logits = torch.from_numpy(mask_logits(masks.cpu().numpy()))

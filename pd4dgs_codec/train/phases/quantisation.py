@@ -1,14 +1,14 @@
 """Fitting of the scene to its quantisation, where planes and weights begin to be rounded: whitening and step classes.
 
-Whitening transforms the features so that a quantisation step costs the same in every channel. The networks read a few
-directions of a feature, which are not its channels: a step harms pictures in those directions and takes bits in all.
-Only linear layers read or change a feature, so any invertible transform of its channels can be undone in them. With H
+Whitening transforms the features so that a quantisation step costs the same in every channel. The networks read few
+directions of a feature, which are not its channels: rounding causes errors in these directions but costs bits in all.
+Only linear layers read or change a feature, so they can undo any invertible transform of its channels. With H
 the mean Gauss-Newton matrix of the pictures by an anchor's feature and C the features' covariance, the bits at a given
 error are least where H becomes the identity and C diagonal (Goyal, Theoretical foundations of transform coding, 2001).
 
-Step classes give anchors that pictures depend on little coarser steps. The error of a step differs a thousandfold
-between anchors, and neither position nor size predicts it, so it is measured. The classes of least bytes at a given
-error follow: the next class doubles the steps, which quadruples the squared error and saves the same bits everywhere.
+Step classes give coarser steps to anchors that pictures depend on little. The error of a step differs a thousandfold
+between anchors, and neither position nor size predicts it, so it is measured. Each next class doubles the steps, which
+quadruples an anchor's squared error and saves the same bits for all anchors, from which the best classes follow.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ from pd4dgs_codec.train.state import TrainingView, TrainState
 
 #: Training views in which the error of a step is measured.
 VIEWS = 16
-#: Halvings of the interval, at first 80 octaves wide, in which the threshold of the classes is searched.
+#: Halvings of the interval in which the threshold of the classes is searched.
 HALVINGS = 40
-#: Share of the mean error that every direction has at least: what no picture shows must not be scaled without bound.
+#: Share of the mean error that every direction has at least, so that invisible directions are scaled within bounds.
 LEAST_ERROR = 0.01
 
 
@@ -45,7 +45,7 @@ class FitQuantisation(phases.Phase):
         return state.config.noise and phases.long_enough(state) and state.reached(state.schedule.rounding)
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
-        """Logs how many anchors each step class has."""
+        """Grades and whitens, and logs how many anchors each step class has."""
         model, config, rounding = state.model, state.config, state.rounding(noisy=False)
         views = taught_views(state, state.views.spread(VIEWS))
         found: list[int] = []
@@ -63,8 +63,8 @@ class FitQuantisation(phases.Phase):
 
 
 def grade(model: Model, views: Mapping[int, Sequence[TrainingView]], share: float, rounding: Rounding) -> list[int]:
-    """Gives every anchor the class at which quantisation adds at most `share` to the squared error of `views`, by
-    level, beyond what it adds at class 0, and the attributes their centres. Returns how many anchors each class has."""
+    """Sets the attributes' centres, and step classes whose quantisation adds at most `share` to the squared error of
+    `views`, by level, beyond that of class 0. Returns how many anchors each class has."""
     errors = added_error(model, views, rounding, rounding_error)
     met = errors.isfinite()
     worst = torch.where(met, errors, 0.0).amax(0)  # a level of large error must not set the budget of the others
@@ -75,8 +75,8 @@ def grade(model: Model, views: Mapping[int, Sequence[TrainingView]], share: floa
 
 
 def classes_within(errors: Tensor, budget: float) -> Tensor:
-    """uint8 [N]: the classes round(log2(T / error) / 2) of the largest T at which the sum of error (4^c - 1) stays
-    within the budget. errors: float64 [N] >= 0, at class 0; an infinite error has class 0."""
+    """uint8 [N]: the classes c = round(log2(T / error) / 2) for the largest T at which the sum of error (4^c - 1) stays
+    within the budget. errors: float64 [N] >= 0, at class 0; an infinite error keeps class 0."""
     finite = errors[errors.isfinite() & (errors > 0)]
     if not len(finite):
         return torch.zeros(len(errors), dtype=torch.uint8)
@@ -96,8 +96,8 @@ def classes_within(errors: Tensor, budget: float) -> Tensor:
 
 @torch.no_grad()
 def centre(model: Model) -> Tensor:
-    """[channels]: the means of features and log-scalings over the active anchors, as multiples of the steps, and 0 for
-    offsets, the value of Gaussians that were never seen."""
+    """[channels]: the means of features and log-scalings over the active anchors, rounded to steps, and 0 for offsets,
+    which is their value in Gaussians that were never seen."""
     active = model.masks(2) > MASK_THRESHOLD
     active = active if active.any() else torch.ones_like(active)
     means = [model.feature[active].mean(0), model.scaling_log[active].mean(0)]
@@ -110,15 +110,15 @@ def centre(model: Model) -> Tensor:
 
 
 def whiten(model: Model, optimiser: Optimiser, views: Mapping[int, Sequence[TrainingView]], rounding: Rounding) -> None:
-    """Transforms the features' channels in the anchors and in all that reads or moves them: pictures stay, to rounding.
-    The error of a step, summed over the channels, stays the same too."""
+    """Transforms the features' channels in the anchors and in all layers that read or change them. Pictures stay the
+    same up to rounding, and so does the error of a step, summed over the channels."""
     transform = workers.alike(lambda: _measured(model, views, rounding))
     if transform is not None:
         _apply(model, optimiser, transform.to(model.feature.device))
 
 
 def _measured(model: Model, views: Mapping[int, Sequence[TrainingView]], rounding: Rounding) -> Tensor | None:
-    """float64 [D, D]: the transform for the model; None where no picture shows a feature."""
+    """float64 [D, D]: the transform for the model; None if no picture depends on a feature."""
     errors = torch.stack([relative_error(model, i, views[i], rounding, _feature_error)[0] for i in views]).sum(0)
     active = model.masks(2).detach() > MASK_THRESHOLD
     if not errors.trace() > 0 or int(active.sum()) < 2:
@@ -128,9 +128,9 @@ def _measured(model: Model, views: Mapping[int, Sequence[TrainingView]], roundin
 
 
 def whitening_transform(errors: Tensor, covariance: Tensor) -> Tensor:
-    """float64 [D, D]: A of features f' = A f for which A^-T errors A^-1, the errors in the new channels, is about a
-    multiple of the identity, its trace that of `errors`, and A covariance A^T is diagonal with falling entries. Both
-    arguments are [D, D], symmetric and positive semidefinite."""
+    """float64 [D, D]: A of features f' = A f. A^-T errors A^-1, the errors in the new channels, is about a multiple of
+    the identity with the trace of `errors`, and A covariance A^T is diagonal with falling entries. Both arguments are
+    [D, D], symmetric and positive semidefinite."""
     floor = LEAST_ERROR * errors.trace() / len(errors) * torch.eye(len(errors)).to(errors)
     root = torch.linalg.cholesky(errors + floor)
     back = torch.linalg.inv(root)
@@ -150,7 +150,7 @@ def _feature_error(model: Model, *place: Any, **about: Any) -> tuple[Tensor, Ten
 
 @torch.no_grad()
 def _apply(model: Model, optimiser: Optimiser, transform: Tensor) -> None:
-    """Replaces features f by A f, A = `transform` [D, D], with the layers before and behind them and their moments."""
+    """Replaces features f by A f, A = `transform` [D, D], and adapts the layers that read or change them."""
     back, width = torch.linalg.inv(transform), model.widths.feature
     optimiser.transform(model.feature, slice(None), transform.T)
     for name in SCAFFOLD_NETWORKS:
