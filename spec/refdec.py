@@ -542,9 +542,9 @@ def read_sections(layer, parts):
     keep_symbols(layer, positions, channels, planes, weights)
 
 
-# 11.1 Masks: "Layer ℓ codes a rise 0..255 for each earlier row, added to that row's code in the layer before in the
-# file, and a code 3..255 for each own row."
-# 11.2 Attributes: "Symbols, here and in 11.3 and 11.4, MUST lie in −2^23..2^23, else Malformed."
+# 11.1 Masks: "Layer ℓ codes a rise 0..255 for each earlier row and a code 3..255 for each own row."
+# 11.2 Attributes: "Attribute symbols, plane samples (11.3) and weight symbols MUST lie in −2^23..2^23, else
+# Malformed."
 def keep_symbols(layer, positions, channels, planes, weights):
     rise, own = channels[MASKS]
     need(all(v >= 0 for v in rise), "a mask code that falls")  # that neither is over 255 follows in finish_last
@@ -1261,7 +1261,7 @@ def children_of(k, octants, indices):
 
 
 # 11.5 Dequantisation: "x̂ = binary32(binary64(k) · binary64(Q)): the product is exact, and the one rounding is to
-# nearest, ties to even, with subnormal results kept."
+# nearest, ties to even."
 def dequantise(symbols, step):
     products, form = [k * step for k in symbols], f"<{len(symbols)}f"
     # From half a unit in the last place above the largest finite binary32 on, the rounding gives infinity.
@@ -1269,8 +1269,8 @@ def dequantise(symbols, step):
     return list(struct.unpack(form, struct.pack(form, *products)))
 
 
-# 11.5 Dequantisation: "In place of its symbol k, an attribute has m + k·2^c" "It MUST lie in −2^23..2^23, else
-# Malformed." "An anchor's position is dequantised from its voxel index with the voxel size as Q."
+# 11.5 Dequantisation: "For an attribute, k is replaced by m + k·2^c" "It MUST lie in −2^23..2^23, else Malformed." "An
+# anchor's position is dequantised from its voxel index with the voxel size as Q."
 def dequantise_layer(layer):
     attributes = attribute_channels(layer.header)
     steps = dict(zip(attributes, layer.header[4])) | {"anchor": layer.header[5]}
@@ -1287,8 +1287,8 @@ def dequantise_layer(layer):
             layer.tensors[name] = dequantise(symbols, step)
 
 
-# 12.2 Prefixes: "The rows of a layer are those of its slices, sorted by the code (10.1) of their voxel index less the
-# minimum of those that there are"
+# 12.2 Prefixes: "The rows of a layer are those of its decoded slices, sorted by the Morton code (10.1) of the voxel
+# index less the minimum over these rows."
 def add_slice(layer, part):
     """Makes `part` the last slice of `layer`."""
     cells = [cell for own in (layer, part) for cell in zip(*[iter(own.symbols["anchor"])] * 3)]
@@ -1307,14 +1307,14 @@ def add_slice(layer, part):
 
 
 # 10.1 Payload: "bit 3i of the code is bit i of x, 3i + 1 of y, 3i + 2 of z"
-# 12.2 Prefixes: "Sorted, the codes of slices that lie far apart may take 66 bits."
+# 12.2 Prefixes: "These codes may take 66 bits."
 def morton_code(offset):
     return sum((v >> i & 1) << 3 * i + axis for axis, v in enumerate(offset) for i in range(22))
 
 
-# 12.1 Order: "For each layer chunk, before the next chunk is looked at: parameters and their limits, sections, the
-# ranges of 11.1 and 11.2, sums of masks, each voxel at most once over the slices so far, and dequantisation."
-# 11.1 Masks: "No sum may exceed 255."
+# 12.1 Order: "For each layer chunk, check before the next chunk is read: parameters and their limits, sections, the
+# ranges of 11.1 and 11.2, sums of mask codes, each voxel at most once over the slices so far, and dequantisation."
+# 11.1 Masks: "its code in the layer before in the file plus its rise, and MUST NOT exceed 255."
 def finish_last(layers):
     codes = []
     for layer in layers:
@@ -1325,8 +1325,8 @@ def finish_last(layers):
     dequantise_layer(layers[-1])
 
 
-# 12.1 Order: "Read preamble and header, then the chunks in order." "A decoder of prefix ℓ stops after the last layer ≤
-# ℓ in the list and does not look at what follows."
+# 12.1 Order: "Read preamble and header, then the chunks in order." "A decoder of prefix ℓ stops after the last chunk of
+# a layer ≤ ℓ in the list and reads no further."
 # 3.2 Chunks: "Bytes after the last chunk make the file Malformed."
 def decode(data, max_layer=None):
     """The layers of a file's bytes, or of prefix max_layer, each with `symbols` and `tensors` by name, flat and in C
@@ -1355,7 +1355,7 @@ def decode(data, max_layer=None):
     return layers
 
 
-# 12.4 Hashes: "For conformance, two SHA-256 digests per layer, of the slices that there are, the rows as in 12.2,
+# 12.4 Hashes: "Conformance is tested with two SHA-256 digests per layer, of its decoded slices with the rows of 12.2,
 # printed in hexadecimal as a JSON list of {"layer", "symbols", "tensors"}."
 def hashes(data, max_layer=None):
     rows = []
