@@ -120,8 +120,8 @@ def backward(
     g_picture: Array,
     g_alpha: Array,
 ) -> Gradients:
-    """Returns the gradients of a loss from g_picture [H, W, 3] and g_alpha [H, W], its derivatives by picture and 1 -
-    transmittance, float32 and contiguous. `project` and `composite` take or return the other arguments."""
+    """Returns the gradients of a loss from g_picture [H, W, 3] and g_alpha [H, W], its derivatives by picture and
+    alpha, float32 and contiguous. The other arguments are arguments and results of `project` and `composite`."""
     result = Gradients(
         Geometry(*(np.zeros_like(a) for a in geometry)), np.zeros_like(colors), np.zeros_like(projected.means2d)
     )

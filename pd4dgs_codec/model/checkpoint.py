@@ -32,7 +32,7 @@ VERSION = 1
 
 
 def save(path: str | Path, model: Model, training: dict[str, Any] | None = None) -> None:
-    """Writes the model and, for resuming, `training`; the file appears whole or not at all. See `target`."""
+    """Writes the model and `training`, the state for resuming, whole or not at all. Raises DataError. See `target`."""
     real = target(path)
     content = {
         "format": FORMAT,
@@ -47,7 +47,7 @@ def save(path: str | Path, model: Model, training: dict[str, Any] | None = None)
         "training": training or {},
     }
     content["digest"] = _digest(content)
-    buffer = io.BytesIO()  # writing to a full disk itself, torch would only report "unexpected pos"
+    buffer = io.BytesIO()  # torch itself reports a full disk only as "unexpected pos"
     try:
         torch.save(content, buffer)
         write_bytes(real, buffer.getbuffer(), overwrite=True)
@@ -56,7 +56,7 @@ def save(path: str | Path, model: Model, training: dict[str, Any] | None = None)
 
 
 def target(path: str | Path) -> Path:
-    """The file that `save` replaces; a symbolic link stays. DataError if a device, a pipe or a folder is there."""
+    """Returns the file that `save` replaces; a symbolic link stays. Raises DataError for a device, pipe or folder."""
     real = Path(os.path.realpath(path))
     if real.exists() and not real.is_file():
         raise DataError(f"{path}: is not a regular file; expected the name of a checkpoint to write")
@@ -64,7 +64,7 @@ def target(path: str | Path) -> Path:
 
 
 def load(path: str | Path | BinaryIO) -> tuple[Model, dict[str, Any]]:
-    """(model, training) of a checkpoint. DataError, of one line, for any other or damaged file."""
+    """Reads a checkpoint. Returns (model, training). Raises DataError, of one line, for any other or damaged file."""
     try:
         raw = read_source(path) if isinstance(path, (str, Path)) else path.read()
     except FileNotFoundError:
@@ -84,7 +84,7 @@ def load(path: str | Path | BinaryIO) -> tuple[Model, dict[str, Any]]:
             raise DataError(f"{path}: damaged: its digest does not match its content")
         check_finite(content["state"])
         return _build(content), dict(content["training"])
-    except Exception as error:  # of many kinds, for a file that lies about its content
+    except Exception as error:  # of many kinds, if the content is inconsistent
         reason = one_line(str(error))  # torch's messages have several lines
         if isinstance(error, DataError) and reason.startswith(f"{path}: damaged"):
             raise
@@ -92,7 +92,7 @@ def load(path: str | Path | BinaryIO) -> tuple[Model, dict[str, Any]]:
 
 
 def _digest(content: dict[str, Any]) -> str:
-    """SHA-256, in hexadecimal, of all but "digest": nested dicts, lists and tuples of tensors and scalars."""
+    """Returns the SHA-256, in hexadecimal, of all entries but "digest": nested containers of tensors and scalars."""
     hasher = hashlib.sha256()
 
     def walk(value: Any) -> None:
@@ -118,7 +118,7 @@ def _digest(content: dict[str, Any]) -> str:
 
 
 def _build(content: dict[str, Any]) -> Model:
-    """The model is first built as a scene of the same shapes, then filled, so that shapes are checked in one place."""
+    """Builds the model from a scene of the same shapes, then fills it: `check_scene` alone checks shapes."""
     state = {name: tensor.numpy() for name, tensor in content["state"].items()}
     n = len(state["anchor_q"])
 

@@ -7,8 +7,8 @@ from pd4dgs_codec.scene import HEADS, Steps
 
 @dataclass(frozen=True)
 class DeformationConfig:
-    """Planes and networks of a layer. scales: of the planes, each with its cells along x, y and z, and along time.
-    width: of the trunk. heads: names in HEADS."""
+    """Sizes of a deformation. scales: per scale of the planes, cells along each of x, y, z, and along time. channels:
+    of each plane. width: of the trunk. heads: names in HEADS."""
 
     scales: tuple[tuple[int, int], ...]
     channels: int
@@ -17,22 +17,22 @@ class DeformationConfig:
 
     @property
     def features(self) -> int:
-        """Numbers that the planes give at a point."""
+        """Width of the planes' features at a point."""
         return self.channels * len(self.scales)
 
 
-#: Quantisation steps of the presets, before the quality dial scales them. The rate of the planes makes them so flat
-#: that coarse steps lose nothing.
+#: Quantisation steps of the presets, before they are scaled for a quality. Training with a rate makes the planes so
+#: flat that coarse steps lose nothing.
 STEPS = Steps(planes_global=0.2, planes_local=1 / 3)
 
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Both deformations (None: absent), of equal channels and width, and the counts of anchors that training starts
-    from and stays below.
+    """Sizes of a model. The deformations (None: absent) have equal channels and width. Training starts with
+    initial_anchors and keeps at most max_anchors.
 
-    Layer 1 is coarse in time. Layer 2 adds a scale that is finer in it: fast motion needs an instant for four pictures
-    or so, but training does not find it with such planes alone.
+    Layer 1 is coarse in time, layer 2 adds a finer scale: fast motion needs an instant for about every four pictures,
+    but training does not find the motion with fine planes alone.
     """
 
     global_deformation: DeformationConfig | None

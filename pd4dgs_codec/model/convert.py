@@ -1,4 +1,4 @@
-"""Model <-> Scene: torch tensors to the numpy arrays that the codec packs, and back."""
+"""Converts between `Model`, of torch tensors, and `Scene`, of the numpy arrays that the codec packs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def check_finite(state: Mapping[str, torch.Tensor]) -> None:
 
 
 def to_scene(model: Model) -> Scene:
-    """Every anchor of the model as one unplanned scene: rows (N, ...), masks of inactive anchors 0.
+    """Returns an unplanned scene of every anchor of the model: rows (N, ...), masks of inactive anchors 0.
 
     Raises DataError as `check_finite` does.
     """
@@ -51,9 +51,9 @@ def to_scene(model: Model) -> Scene:
 
 
 def from_scene(scene: Scene) -> Model:
-    """The model that renders `scene`, anchors in the scene's order.
+    """Returns the model that renders `scene`, with anchors in the scene's order.
 
-    A level whose layer is absent looks like the level below it; masks come back to within 1e-6.
+    A level whose layer is absent equals the level below it; masks are reproduced to within 1e-6.
     """
     n = len(scene.anchor_q)
     masks = np.zeros((n, 3), np.float64)

@@ -1,7 +1,7 @@
-"""A deformation as a torch module: residuals with gradients, start values, rate and regularisers, arrays both ways.
+"""The torch module of a deformation: residuals with gradients, start values, rate, regularisers, conversion to arrays.
 
-The rest of `model` and `train` know a deformation by `DeformationField` alone. This one is a HexPlane, a shared trunk
-and one network per residual head; another kind is another body of the class.
+The rest of `model` and `train` use a deformation only through `DeformationField`: here a HexPlane, a shared trunk and
+one network per residual head. Another kind of deformation needs only another `DeformationField`.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from pd4dgs_codec.model.networks import MLP, rounded
 
 
 class DeformationField(nn.Module):
-    """Residuals at points and a time. The heads start at zero, so a fresh field changes nothing.
+    """Computes residuals at points and a time. The heads start at zero, so a fresh field changes nothing.
 
     key: as in `scene.Deformation`.
     """
@@ -34,7 +34,7 @@ class DeformationField(nn.Module):
     def __init__(self, planes: HexPlane, trunk: MLP, heads: Mapping[str, MLP], key: int | None = None):
         super().__init__()
         self.planes, self.trunk, self.heads, self.key = planes, trunk, nn.ModuleDict(heads), key
-        self.unit = float(scene.deformation_unit(planes.box.numpy()))  #: of heads that are lengths, scene units
+        self.unit = float(scene.deformation_unit(planes.box.numpy()))  #: unit of LENGTH_HEADS, scene units
 
     # -- start values and arrays ---------------------------------------------------------------------------------------
 
@@ -42,8 +42,8 @@ class DeformationField(nn.Module):
     def fresh(
         config: DeformationConfig, box: np.ndarray, head_widths: dict[str, int], key: int | None = None, below: int = 0
     ) -> DeformationField:
-        """A new field with the heads that `config` names. head_widths: the output width of each; below: features of the
-        planes of the layer below, which the trunk reads too."""
+        """Returns an untrained field with the heads of `config`. head_widths: their output widths. below: the number of
+        features from the planes of the layer below, which the trunk reads too."""
         planes = HexPlane(box, [(side, side, side, times) for side, times in config.scales], config.channels)
         planes.start()
         trunk = MLP((below + config.features, config.width, config.width))
@@ -52,7 +52,7 @@ class DeformationField(nn.Module):
 
     @staticmethod
     def from_arrays(deformation: scene.Deformation, box: np.ndarray) -> DeformationField:
-        """The field of a decoded scene."""
+        """Returns the field of a decoded scene's deformation."""
         networks = {name: MLP.from_arrays(net) for name, net in deformation.networks.items()}
         trunk = networks.pop(scene.TRUNK)
         return DeformationField(HexPlane.from_arrays(box, deformation.planes), trunk, networks, deformation.key)
@@ -63,17 +63,17 @@ class DeformationField(nn.Module):
         return scene.Deformation(self.planes.arrays(), networks, self.key)
 
     def shape(self) -> dict[str, Any]:
-        """What a checkpoint needs beside the state to rebuild the field: see `arrays_of_state`."""
+        """Returns the values that `arrays_of_state` needs besides the state dictionary."""
         return {"resolutions": self.planes.layout.reso.tolist(), "key": self.key}
 
     @staticmethod
     def arrays_of_state(shape: dict[str, Any], state: Mapping[str, np.ndarray]) -> scene.Deformation:
-        """Arrays of a field's shapes, from its `shape` and state dictionary; the planes are 0. ValueError if the two do
-        not fit."""
+        """Returns arrays of a field's shapes, planes all 0, from its `shape` and state dictionary. Raises ValueError if
+        the two do not match."""
         n_cells, channels = state["planes.grid"].shape
         resolutions = shape["resolutions"]
         needed = sum(r[a] * r[b] for r in resolutions for _, a, b in scene.PLANES)
-        if needed != n_cells:  # before anything of that size is made
+        if needed != n_cells:  # checked before planes of that size are allocated
             raise ValueError(f"planes of {n_cells} cells, expected {needed} for the resolutions {resolutions}")
         planes = tuple(
             {plane: np.zeros((channels, r[b], r[a]), np.float32) for plane, a, b in scene.PLANES} for r in resolutions
@@ -89,38 +89,38 @@ class DeformationField(nn.Module):
 
     @property
     def features(self) -> list[nn.Parameter]:
-        """The parameters in the step of planes, on which `regularisers` and `rate` depend."""
+        """The parameters quantised in the step of planes; `regularisers` and `rate` depend on them."""
         return [self.planes.grid]
 
     @property
     def weights(self) -> list[nn.Parameter]:
-        """The other parameters, in the step of weights."""
+        """The other parameters, quantised in the step of weights."""
         return [*self.trunk.parameters(), *self.heads.parameters()]
 
     def head_layer(self, head: str) -> nn.Linear | None:
-        """The linear layer whose output is the residual `head`; None if the field lacks it."""
+        """Returns the linear layer whose output is the residual `head`, or None if the field lacks it."""
         return cast(MLP, self.heads[head]).layers[-1] if head in self.heads else None
 
     def confine(self, instants: int) -> None:
-        """Makes the features linear in time between so many evenly spaced instants, by least squares."""
+        """Makes the features linear in time between `instants` evenly spaced instants, by least squares."""
         self.planes.confine(instants)
 
     def spread_gradients(self, instants: int) -> None:
-        """Makes the gradients of the features, if there are any, those of confined ones, each instant's spread over the
-        cells between its neighbours."""
+        """Replaces the features' gradients, if any, by gradients of confined features: sums per instant, spread over
+        the cells between the neighbouring instants."""
         self.planes.spread_gradients(instants)
 
     def regularisers(self, features: Sequence[Tensor]) -> dict[str, Tensor]:
-        """The regularisers, unweighted, by name. features: those of the field, or others of their shapes."""
+        """Returns the regularisers, unweighted, by name. features: the field's, or others of the same shapes."""
         return plane_terms.regularisers(features[0], self.planes.layout)
 
     def rate(self, features: Sequence[Tensor], step: float) -> Tensor:
-        """A differentiable proxy for the bits of `features`, as in `regularisers`, at a quantisation step."""
+        """Returns a differentiable proxy for the bits of `features`, as in `regularisers`, at a quantisation step."""
         return plane_terms.proxy_bits(features[0], self.planes.layout, step)
 
     def bits(self, step: float) -> float:
-        """The sum of R(a) of the coded residuals of the features at a quantisation step: one Gaussian per channel of a
-        plane, as with `--priors gauss`."""
+        """Returns the sum of R(a) over the coded residuals of the features at a quantisation step, with one Gaussian
+        prior per channel of a plane, as with `--priors gauss`."""
         return plane_rate_bits(self.planes.arrays(), step)
 
     # -- residuals -----------------------------------------------------------------------------------------------------
@@ -139,11 +139,11 @@ class DeformationField(nn.Module):
         weight_step: float | None = None,
         kernels: bool = False,
     ) -> Tensor:
-        """rows [n, sum of widths] plus the residuals at time t in 0..1, lengths in scene units.
+        """Returns rows [n, sum of widths] plus the residuals at time t in 0..1, lengths in scene units.
 
-        features: by the time, what the trunk reads of the planes, [n, inputs]. widths: of all heads of the registry, in
-        the order of the columns; the columns of absent heads stay. weight_step: weights are rounded to multiples of it,
-        straight through. kernels: evaluate by them, as they can if `fusible`, else in plain torch.
+        features: time -> inputs of the trunk [n, inputs]. widths: of all heads of the registry, in column order; the
+        columns of absent heads stay. weight_step: the step of the weights, if they are rounded, straight through.
+        kernels: whether the kernels evaluate the field, which must be `fusible`; else plain torch does.
         """
         if not self.heads:
             return rows
@@ -173,11 +173,11 @@ class DeformationField(nn.Module):
         return found
 
     def _signed(self, t: float) -> list[tuple[float, float]]:
-        """The times at which F is evaluated, each with its sign."""
+        """Returns the times at which F is evaluated, each with its sign."""
         return [(t, 1.0)] if self.key is None else [(t, 1.0), (scene.instant(self.key), -1.0)]
 
     def _named_heads(self) -> list[tuple[str, MLP]]:
-        """The heads present, in the registry's order."""
+        """Returns the heads present, in the registry's order."""
         return [(name, cast(MLP, head)) for name, head in self.heads.items()]
 
     def _unit_of(self, head: str) -> float:

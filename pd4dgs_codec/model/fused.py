@@ -1,10 +1,9 @@
-"""The stages of `Model.gaussians` on the CPU by the kernels of `draw.gaussians`, each one autograd function.
+"""The stages of `Model.gaussians` on the CPU, as autograd functions of the kernels in `draw.gaussians`.
 
     pick     rows of the attributes, with noise or rounding      [n, 9 + D + 3 G]
     grow     the scaffold's networks: the Gaussians of anchors    [K, 14]
 
-A row's columns are the heads of a deformation in the registry's order.
-`reference` has the same stages in plain torch.
+A row's columns are the residual heads in the registry's order. `reference` has the same stages in plain torch.
 """
 
 from __future__ import annotations
@@ -35,8 +34,8 @@ def fusible(networks: Sequence[MLP]) -> bool:
 
 
 def pick(attributes: Sequence[Tensor], position: Tensor, rows: Tensor, quantisation: Quantisation) -> Tensor:
-    """[n, 9 + D + 3 G]: the anchors `rows` (int64 [n], none twice), with noise or rounded. attributes: feature [N, D],
-    offset [N, G, 3], scaling [N, 6]; position [N, 3]."""
+    """Returns [n, 9 + D + 3 G]: the anchors `rows` (int64 [n], none twice), with noise or rounded. attributes: feature
+    [N, D], offset [N, G, 3], scaling [N, 6]. position: [N, 3]."""
     row: Tensor = _Pick.apply(position, rows, quantisation, *attributes)  # type: ignore[no-untyped-call]
     return row
 
@@ -76,9 +75,9 @@ class _Pick(torch.autograd.Function):
 def grow(
     anchors: Tensor, mask: Tensor, eye: Tensor, networks: Sequence[MLP], step: float | None
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """(Gaussians [K, 14], their gates [K], opacities before the gate [n, G], the slots kept int64 [K]) of anchors under
-    mask [n], seen from eye [3]. networks: opacity, covariance, colour; step: of their weights, if rounded. Slots whose
-    gated opacity is below MIN_OPACITY are left out."""
+    """Evaluates anchors with gates mask [n], seen from eye [3]. Returns Gaussians [K, 14] before the gate, their gates
+    [K], opacities before the gate [n, G] and the kept slots int64 [K], whose gated opacity is at least MIN_OPACITY.
+    networks: opacity, covariance, colour. step: of their weights, if they are rounded."""
     parameters = [p for network in networks for layer in network.layers for p in (layer.weight, layer.bias)]
     found: tuple[Tensor, Tensor, Tensor, Tensor] = _Grow.apply(  # type: ignore[no-untyped-call]
         anchors, mask, eye, step, *parameters

@@ -1,8 +1,7 @@
 """HexPlane: a 4-D feature field as a product of six 2-D planes per scale.
 
 Per scale, the planes xy, xz, xt, yz, yt, zt are sampled bilinearly (align corners, border clamp) and multiplied; the
-scales are concatenated. A multi-resolution factor scales x, y, z and never t. On the CPU a numba kernel samples
-(`draw/hexplane.py`), elsewhere `sample_reference`, with torch's `grid_sample`.
+scales are concatenated. A numba kernel samples on the CPU (`draw/hexplane.py`), else `sample_reference` does.
 """
 
 from __future__ import annotations
@@ -24,9 +23,9 @@ from pd4dgs_codec.model.networks import round_straight_through, rounded
 from pd4dgs_codec.scene import PLANES, Planes, plane_sides
 from pd4dgs_codec.threads import kernel_threads
 
-#: Start values of spatial planes are drawn between these.
+#: Range of the start values of spatial planes.
 START = (0.5, 1.5)
-#: Cells between independent draws: few values, so that positions differ at the start.
+#: Cells between independent draws of start values.
 SPACING = 4
 
 
@@ -88,7 +87,7 @@ def sample_reference(grid: Tensor, layout: PlaneLayout, box: Tensor, points: Ten
 
 
 class HexPlane(nn.Module):
-    """Learnable planes, all in one parameter `grid` [cells, C]; `layout` says which cells are which plane.
+    """Learnable planes, all in one parameter `grid` [cells, C]; `layout` maps planes to cells.
 
     box: [2, 3] lower and upper corner, scene units; points are normalised by it and clamped to it. On an axis where
     the corners are equal, points up to it fall on the first cell and points above it on the last.
@@ -107,9 +106,9 @@ class HexPlane(nn.Module):
     def start(self, generator: torch.Generator | None = None) -> None:
         """Draws start values: time planes 1, spatial planes random in START.
 
-        Their products are then of the size of 1, as are the optimiser's steps in them; from 0.1..0.5, as public code
-        starts, features of about 0.03 told places and times apart so slowly that some runs never began to move. Draws
-        are independent every SPACING cells and linear in between, so that cells that no anchor reaches cost few bits.
+        Features, products of planes, then start near 1. The range 0.1..0.5 of public code gives features of about 0.03,
+        which separate places and times so slowly that some runs never learn motion. Draws are independent every SPACING
+        cells and linear in between, so that cells that no anchor reaches cost few bits.
         """
         for scale in self.layout.views(self.grid.fill_(1)):
             for name, _, b in PLANES:
@@ -122,10 +121,10 @@ class HexPlane(nn.Module):
         return self.grid.device.type == "cpu" and self.grid.shape[1] % LANES == 0
 
     def forward(self, points: Tensor, t: float, step: float | None = None) -> Tensor:
-        """Features [N, C * scales].
+        """Samples features [N, C * scales].
 
         points: [N, 3], scene units; outside the box they are clamped to it, NaN goes to the lower border.
-        t: normalised time, 0..1 and clamped to it.
+        t: normalised time, clamped to 0..1.
         step: if given, the planes are rounded to multiples of it; the gradient passes straight through.
         """
         points, box = points.to(self.grid.dtype), self.box.to(self.grid.dtype)
@@ -141,14 +140,14 @@ class HexPlane(nn.Module):
         self._mix_times(self.grid, instants, 0)
 
     def spread_gradients(self, instants: int) -> None:
-        """Replaces gradients by time planes, if there are any, by the sums at those instants, spread as a change of
-        their values would be."""
+        """Replaces the gradients of the time planes, if any, by sums per instant, spread over the cells as a change of
+        the instant's value would be."""
         if self.grid.grad is not None:
             self._mix_times(self.grid.grad, instants, 1)
 
     @torch.no_grad()
     def _mix_times(self, cells: Tensor, instants: int, which: int) -> None:
-        """Multiplies the time planes along time by that matrix of `_mixtures`; planes without more cells stay."""
+        """Multiplies time planes of more than `instants` cells, along time, by matrix `which` of `_mixtures`."""
         for scale in self.layout.views(cells):
             for plane in (scale[name] for name, _, b in PLANES if b == TIME_AXIS and len(scale[name]) > instants):
                 mixture = _mixtures(len(plane), instants)[which].to(plane)
@@ -156,7 +155,7 @@ class HexPlane(nn.Module):
 
     @torch.no_grad()
     def arrays(self) -> Planes:
-        """Per scale, plane name -> float32 [C, reso[b], reso[a]], as `scene.Deformation` holds them."""
+        """Returns per scale: plane name -> float32 [C, reso[b], reso[a]], as `scene.Deformation` holds them."""
         views = self.layout.views(self.grid.detach().float().cpu())
         return tuple({n: np.ascontiguousarray(p.permute(2, 0, 1).numpy()) for n, p in s.items()} for s in views)
 
@@ -173,8 +172,8 @@ class HexPlane(nn.Module):
 
 @lru_cache
 def _mixtures(cells: int, instants: int) -> tuple[Tensor, Tensor]:
-    """Two matrices [cells, cells], where H [cells, instants] interpolates evenly spaced values linearly: H H^+, and
-    H H^T with rows that sum to 1 on average."""
+    """Returns two matrices [cells, cells]: H H^+, and H H^T scaled so that its rows sum to 1 on average, where H
+    [cells, instants] interpolates evenly spaced values linearly."""
     place = torch.linspace(0, instants - 1, cells, dtype=torch.float64)
     hats = (1 - (place[:, None] - torch.arange(instants)).abs()).clamp(min=0)
     products = hats @ hats.T
@@ -182,7 +181,7 @@ def _mixtures(cells: int, instants: int) -> tuple[Tensor, Tensor]:
 
 
 def _start(shape: Sequence[int], generator: torch.Generator | None) -> Tensor:
-    """Start values [H, W, C] of a spatial plane, see `HexPlane.start`."""
+    """Draws start values [H, W, C] of a spatial plane, see `HexPlane.start`."""
     height, width, channels = shape
     draws = torch.empty(1, channels, -(-height // SPACING), -(-width // SPACING)).uniform_(*START, generator=generator)
     field = F.interpolate(draws, size=(height, width), mode="bilinear", align_corners=True)
