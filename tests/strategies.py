@@ -7,6 +7,9 @@ said otherwise, so that a test knows every symbol that must come back.
 from __future__ import annotations
 
 import math
+import tracemalloc
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
 
@@ -172,6 +175,24 @@ def small_file(layers: tuple[int, ...] = (0, 1, 2), **options: object) -> bytes:
     """make_scene(7) with twenty anchors as a file, encoded by the first test that asks and not while tests are
     collected."""
     return encode(make_scene(7, layers=layers, anchors=20), **{"layers": 2, "effort": 1, **options})
+
+
+def flipped(data: bytes, at: int, bits: int = 1) -> bytes:
+    """The file with these bits of its byte `at` the other way."""
+    changed = bytearray(data)
+    changed[at] ^= bits
+    return bytes(changed)
+
+
+@contextmanager
+def memory_below(limit: int) -> Iterator[None]:
+    """Checks that Python allocates fewer bytes at once in this block."""
+    tracemalloc.start()
+    try:
+        yield
+        assert tracemalloc.get_traced_memory()[1] < limit
+    finally:
+        tracemalloc.stop()
 
 
 def _subset(heads: dict[str, int]) -> st.SearchStrategy[dict[str, int]]:

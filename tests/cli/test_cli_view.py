@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import IO
 
 import pytest
+from strategies import flipped
 
 from pd4dgs_codec import decode, show
 from pd4dgs_codec.web.page import page as whole_page
@@ -68,11 +69,9 @@ def test_one_html_file_instead_of_a_server(cli, scene_pd4, tmp_path):
         assert done.code == 1 and done.out == b"" and says in done.err and len(done.error_lines) == 1
 
 
-def flipped(data: bytes) -> bytes:
-    return data[:-30] + bytes([data[-30] ^ 1]) + data[-29:]
-
-
-@pytest.mark.parametrize("change, says", [(lambda data: b"no scene", "checkpoint"), (flipped, "CRC")])
+@pytest.mark.parametrize(
+    "change, says", [(lambda data: b"no scene", "checkpoint"), (lambda data: flipped(data, -30), "CRC")]
+)
 def test_a_bad_file_is_said_here_and_not_in_the_page(cli, scene_pd4, tmp_path, change, says):
     (tmp_path / "scene.pd4").write_bytes(change(scene_pd4.read_bytes()))
     done = cli("view", tmp_path / "scene.pd4", "--no-browser")

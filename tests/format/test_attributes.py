@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 from pd4dgs_codec.entropy.channels import encode_channels
 from pd4dgs_codec.entropy.priors import K_MAX
-from pd4dgs_codec.entropy.varint import put_varint, put_zigzag
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.format import attributes as section
 from pd4dgs_codec.format.attributes import MAX_WEIGHT, read_attributes, write_attributes
@@ -95,25 +94,6 @@ def test_terms_that_would_break_a_limit_are_left_out():
     attributes[3, 0] = -MAX_SYMBOL
     assert abs(attributes[1]).max() > abs(attributes[0]).max() * MAX_WEIGHT >> 10
     np.testing.assert_array_equal(read_attributes(written_in_stages(attributes), WIDTHS, 4200)[1], attributes)
-
-
-def block(*, terms=None, counts=(1, 1, 1, 1, 1), split=(0,), lengths=(0,) * 7):
-    """A prediction block and no stages. terms: c -> (m, [(g, w)]); split: f and centres of Gaussian 0."""
-    out = bytearray([STAGED])
-    for c in range(1, 38):
-        number, own = (terms or {}).get(c, (0, []))
-        put_varint(out, number)
-        for gap, weight in own:
-            put_varint(out, gap)
-            put_zigzag(out, weight)
-    out += bytes(counts)
-    put_varint(out, split[0])
-    for centre in split[1:]:
-        put_zigzag(out, centre)
-    out += bytes(9)
-    for length in lengths:
-        put_varint(out, length)
-    return bytes(out)
 
 
 @pytest.mark.parametrize(("priors", "effort", "share"), [("best", 3, 0.97), ("best", 1, 0.9), ("gauss", 3, 0.9)])

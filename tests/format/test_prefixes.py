@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import LAYER_SETS, assert_same_scene, scenes, small_file
+from strategies import LAYER_SETS, assert_same_scene, flipped, scenes, small_file
 
 from pd4dgs_codec import decode, encode, open_stream
 from pd4dgs_codec.errors import BadSignature, ChecksumMismatch, DecodeError, Malformed, Truncated
@@ -63,10 +63,8 @@ def test_max_layer_does_not_look_beyond_its_prefix():
 
 
 def test_allow_partial_forgives_a_cut_and_nothing_else():
-    data = bytearray(small_file((0, 1)))
-    data[-10] ^= 1
     with pytest.raises(ChecksumMismatch):
-        decode(bytes(data), allow_partial=True)
+        decode(flipped(small_file((0, 1)), -10), allow_partial=True)
     with pytest.raises(Malformed, match="bytes follow"):
         decode(small_file((0, 1)) + b"\0", allow_partial=True)
 
@@ -87,11 +85,9 @@ def test_a_stream_does_not_depend_on_where_it_is_cut(layers, cuts):
 
 
 def test_a_fault_stays_and_earlier_layers_remain():
-    data = bytearray(small_file())
-    rows = info(bytes(data))["layers"]
-    data[rows[1]["end"] - 9] ^= 4
+    end = info(small_file())["layers"][1]["end"]
     stream = open_stream()
-    scenes_before = stream.feed(bytes(data))
+    scenes_before = stream.feed(flipped(small_file(), end - 9, 4))
     assert [s.layers for s in scenes_before] == [(0,)]
     for call in (lambda: stream.feed(b""), lambda: stream.feed(b"x"), stream.finish):
         with pytest.raises(ChecksumMismatch):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from strategies import small_file
+from strategies import flipped, small_file
 from vectors.blocks import later, line, make_file, make_layer, pattern
 
 import pd4dgs_codec
@@ -100,10 +100,8 @@ def test_the_command_prints_the_hashes_of_the_package(cli, tmp_path):
 
 
 def test_the_command_refuses_a_damaged_file_a_missing_one_and_other_arguments(tmp_path):
-    data = bytearray(small_file())
-    data[-9] ^= 4
     path = tmp_path / "scene.pd4"
-    path.write_bytes(data)
+    path.write_bytes(flipped(small_file(), -9, 4))
     for file, says in ((path, "ChecksumMismatch: "), (tmp_path / "none.pd4", "no such file")):
         done = run_node(PLAYER / "cli.mjs", "hashes", file)
         assert (done.returncode, done.stdout) == (1, "")

@@ -1,7 +1,6 @@
 """Every conformance vector against the package, its stream and the reference decoder."""
 
 import hashlib
-import importlib.util
 import json
 import re
 import subprocess
@@ -10,6 +9,7 @@ from pathlib import Path
 
 import make_vectors
 import pytest
+import refdec
 
 from pd4dgs_codec.errors import DecodeError
 from pd4dgs_codec.format.container import read_preamble
@@ -26,10 +26,6 @@ ERRORS = re.findall(r"^\| (\w+) \| ", TEXT.split("## 15 ")[1].split("## 16 ")[0]
 SLOW = {"valid/planes-products-over-2-53.pd4", *(v["file"] for v in MANIFEST if v["file"].startswith("dear/"))}
 #: Functions of the reference decoder that check on behalf of their callers.
 HELPERS = {"need", "limited", "registered", "shortest", "check_finite", "fields", "a_list", "reals", "real", "a_step"}
-
-_module = importlib.util.spec_from_file_location("refdec", SPEC / "refdec.py")
-refdec = importlib.util.module_from_spec(_module)
-_module.loader.exec_module(refdec)
 
 
 def read(vector):

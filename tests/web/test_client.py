@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 import pytest
 from faulty import Fault, FaultyServer
 from fuzzing.mutate import take_apart
-from strategies import assert_same_scene, small_file
+from strategies import assert_same_scene, flipped, small_file
 
 from pd4dgs_codec import decode, encode, open_stream
 from pd4dgs_codec.errors import (
@@ -55,9 +55,7 @@ class File:
 
     def damaged(self, layer: int) -> bytes:
         """One bit of the layer differs."""
-        data = bytearray(self.data)
-        data[self.ends[layer] - 30] ^= 1
-        return bytes(data)
+        return flipped(self.data, self.ends[layer] - 30)
 
 
 @pytest.fixture(scope="module")
