@@ -5,10 +5,10 @@
     stream = open_stream()                  # stream.feed(bytes) -> a Scene per layer it adds to
     show(scene)                             # in a notebook: the player
 
-Importing the package loads none of its modules; each name below loads what it needs at first use.
+Importing the package loads none of its modules; each name below imports its module at first use.
 """
 
-TYPE_CHECKING = False  # nothing is imported here: until `cli` is, an interrupt of a command would print a traceback
+TYPE_CHECKING = False  # no imports here: an interrupt of a command before `cli` is imported would print a traceback
 if TYPE_CHECKING:
     from pd4dgs_codec.format.decoder import decode, open_stream
     from pd4dgs_codec.format.encoder import encode

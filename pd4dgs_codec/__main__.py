@@ -24,7 +24,7 @@ VERBS = {
     "batch": "run a command on every scene of a library",
 }
 
-MODULES = {"import": "import_model"}  #: verbs that cannot be a module's name
+MODULES = {"import": "import_model"}  #: modules of verbs that are Python keywords
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -1,10 +1,10 @@
-"""Tensors from the files of torch and of TorchScript, read as data: nothing in a file is called.
+"""Reads tensors from torch and TorchScript files as data, without calling anything that a file names.
 
-Both are zip archives with a pickle `data.pkl` and one member per storage. The machine below knows the operations and
-the names that such pickles need and refuses all others. What it makes takes memory and time in proportion to the file:
-members that it reads are not compressed, tensors hold no more bytes than the file, lists, dicts and tensors have one
-place each, and keys are short texts or small numbers. `torch.load(weights_only=True)` has none of these
-bounds, and refuses TorchScript.
+Both formats are zip archives with a pickle `data.pkl` and one member per storage. `_Machine` implements only the pickle
+operations and globals that such files need, and refuses all others. Memory and time are linear in the size of the file:
+members must be uncompressed, tensors hold no more bytes than the file, each list, dict and tensor is used once, and
+keys are short strings or small numbers. `torch.load(weights_only=True)` has none of these bounds and refuses
+TorchScript.
 """
 
 import io
@@ -18,35 +18,35 @@ import numpy as np
 
 from pd4dgs_codec.errors import DataError, one_line
 
-#: Torch's names of storages and what they hold.
+#: numpy dtypes by torch's name of the storage class.
 STORAGES = dict(
     FloatStorage="<f4", DoubleStorage="<f8", HalfStorage="<f2", LongStorage="<i8", IntStorage="<i4", ShortStorage="<i2",
     CharStorage="i1", ByteStorage="u1", BoolStorage="?",
 )  # fmt: skip
 MAX_PICKLE = 1 << 21  #: bytes of data.pkl
-SHORT, FEW = 256, 4  #: most characters of a key, and of a text that a pickle refers to again; values of such a tuple
-MAX_KEY = 1 << 31  #: of numbers as keys: multiples of 2^61 - 1 have one hash, and a dict of them takes quadratic time
+SHORT, FEW = 256, 4  #: most characters of a key and of a reused string; most items of a reused tuple
+MAX_KEY = 1 << 31  #: of numbers as keys: multiples of 2^61 - 1 share a hash, and a dict of them takes quadratic time
 VALUES = {"BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT", "BINUNICODE", "SHORT_BINUNICODE"}
 CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
 TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
 
 
 class Name(NamedTuple):
-    """A name in a pickle, such as that of a class."""
+    """A global that a pickle names, such as a class."""
 
     module: str
     name: str
 
 
 class Module:
-    """A module of a TorchScript file. kind: the name of its class. members: by name."""
+    """A module of a TorchScript file. kind: the name of its class. members: values by name."""
 
     def __init__(self, kind: str):
         self.kind, self.members = kind, dict[str, Any]()
 
 
 class Refused(Exception):
-    """A file holds something else than tensors, or more than its bytes."""
+    """The file holds something other than tensors, or more data than its own size."""
 
 
 ORDERED = Name("collections", "OrderedDict")
@@ -54,9 +54,9 @@ TENSOR, PARAMETER = Name("torch._utils", "_rebuild_tensor_v2"), Name("torch._uti
 
 
 def read_tensors(raw: bytes, where: str, made: Callable[[np.ndarray], Any] = lambda array: array) -> Any:
-    """The content of a file: dicts, lists, tuples, scalars, modules, and tensors as `made` of a read-only array.
+    """Returns the content of a file: dicts, lists, tuples, scalars, Modules, and `made(array)` for each tensor.
 
-    Raises DataError, which begins with `where`, for anything else.
+    made: takes a read-only array. Raises DataError, whose message begins with `where`, for any other file.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(raw)) as archive:
@@ -69,7 +69,7 @@ def read_tensors(raw: bytes, where: str, made: Callable[[np.ndarray], Any] = lam
 
 
 class _Machine:
-    """Runs the pickle of an archive of so many bytes; `result` is what it makes."""
+    """Runs the pickle of an archive of `size` bytes and stores the value that it builds in `result`."""
 
     def __init__(self, archive: zipfile.ZipFile, size: int, made: Callable[[np.ndarray], Any]):
         members = archive.infolist()
@@ -91,7 +91,7 @@ class _Machine:
         (self.result,) = self.stack
 
     def _read(self, name: str) -> bytes:
-        """The bytes of a member. torch compresses none of these."""
+        """Returns the bytes of a member. Refuses a compressed member, which torch never writes."""
         member = self.archive.getinfo(f"{self.prefix}{name}")
         if member.compress_type != zipfile.ZIP_STORED or member.file_size != member.compress_size:
             raise Refused(f"member {name!r} is compressed")
@@ -130,7 +130,7 @@ class _Machine:
             raise Refused(f"the pickle has the operation {name}")
 
     def _taken(self, count: int | None) -> list[Any]:
-        """The last `count` values of the stack, or those since the last mark, which leave it."""
+        """Pops the last `count` values of the stack, or all values since the last mark if `count` is None."""
         start = self.marks.pop() if count is None else len(self.stack) - count
         if start < 0:
             raise Refused("a pickle that ends in its middle")
@@ -139,7 +139,7 @@ class _Machine:
         return values
 
     def _storage(self, kind: Any, dtype: Any, key: Any, _: Any, count: Any) -> np.ndarray:
-        """A storage as a 1-D array."""
+        """Returns a storage as a 1-D array; reads its member at first use."""
         if kind != "storage" or not isinstance(dtype, np.dtype) or not str(key).isdigit():
             raise Refused("a storage of an unknown kind")
         if key not in self.storages:
@@ -161,18 +161,18 @@ class _Machine:
         raise Refused("the pickle makes something of what is no class")
 
     def _build(self, state: Any) -> None:
-        """Members of a module; those of an OrderedDict are torch's own notes."""
+        """Sets the members of a module. Ignores those of an OrderedDict, which are torch's own metadata."""
         if isinstance(self.stack[-1], Module) and isinstance(state, dict):
             self.stack[-1].members.update(state)
         elif not isinstance(self.stack[-1], dict):
             raise Refused("the pickle gives members to what is no module, or no members")
 
     def _tensor(self, storage: np.ndarray, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: Any) -> Any:
-        """A tensor, a view of its storage."""
+        """Returns `made` of a view of the storage."""
         whole = all(type(v) is int and v >= 0 for v in (offset, *size, *stride)) and len(size) == len(stride)
         count = math.prod(size) if whole else -1
         last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True)) if whole and count else offset
-        # an axis is bounded even where another is empty: its length may become that of an array
+        # each axis is bounded even if another is empty: a caller may allocate an array of its length
         if not whole or count > len(storage) or (count and last >= len(storage)) or max(size, default=0) > self.size:
             raise Refused("a tensor that reaches beyond its storage")
         self.left -= count * storage.itemsize
@@ -183,7 +183,7 @@ class _Machine:
 
 
 def _known(module: str, name: str) -> Any:
-    """A name that files of tensors need."""
+    """Returns the dtype or Name of a global that tensor files need; refuses any other."""
     if module == "torch" and name in STORAGES:
         return np.dtype(STORAGES[name])
     found = Name(module, name)
@@ -193,7 +193,7 @@ def _known(module: str, name: str) -> Any:
 
 
 def _again(value: Any) -> Any:
-    """What a pickle refers to again: names, short texts and tuples of few; else few bytes would stand for gigabytes."""
+    """Returns a reused value: a number, name, short string or short tuple. Others could turn few bytes to gigabytes."""
     parts = value if isinstance(value, tuple) and len(value) <= FEW else (value,)
     if not all(isinstance(v, (int, float, np.dtype)) or isinstance(v, str) and len(v) <= SHORT for v in parts):
         raise Refused("a part that has two places")

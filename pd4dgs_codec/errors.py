@@ -1,4 +1,4 @@
-"""The one exception tree. No library's exception leaves the package's public functions.
+"""The package's exceptions. Public functions let no exception of another library through.
 
 Every message says what was found, what was expected, and where.
 """
@@ -6,14 +6,14 @@ Every message says what was found, what was expected, and where.
 from importlib import import_module
 from typing import Any
 
-LONGEST = 400  #: characters of a message; beyond, its middle is left out
+LONGEST = 400  #: most characters of a message; a longer one loses its middle
 
 
 def printable(text: str, kept: str = "\n") -> str:
-    """What somebody else may have written, fit for terminals, pages and logs. Characters that are not printable, such
-    as those that move the cursor, turn the direction of writing or are halves of pairs, become \\x1b and the like.
+    """Returns untrusted text in a form that is safe for terminals, pages and logs.
 
-    kept: those that stay.
+    kept: characters that stay. Other non-printable ones, such as cursor movements, changes of writing direction and
+    lone surrogates, become \\x1b and the like.
     """
     if text.isprintable():
         return text
@@ -21,24 +21,24 @@ def printable(text: str, kept: str = "\n") -> str:
 
 
 def one_line(text: str, longest: int = LONGEST) -> str:
-    """`printable` in one line, of at most so many characters."""
+    """Returns `printable` text on one line of at most `longest` characters."""
     line = printable(" ".join(text.split()))
     return line if len(line) <= longest else f"{line[: longest * 2 // 3]} … {line[-longest // 3 + 3 :]}"
 
 
 class Pd4Error(Exception):
-    """Base of every error this package raises on purpose: one line, which the commands print, exit 1."""
+    """Base of every error this package raises on purpose. Commands print its one line and exit with code 1."""
 
     def __init__(self, message: str):
         super().__init__(one_line(message))
 
 
 class DamageWarning(UserWarning):
-    """Somebody's file is damaged and could be read in part."""
+    """An input file is damaged and was read in part."""
 
 
 class DataError(Pd4Error):
-    """A dataset, an image, a camera or a checkpoint is missing, broken or not ours."""
+    """A dataset, image, camera, checkpoint or output path is missing, invalid or not supported."""
 
 
 class TrainError(Pd4Error):
@@ -50,7 +50,7 @@ class RenderError(Pd4Error):
 
 
 class NotFinite(RenderError):
-    """Colours or backgrounds to draw hold NaN or infinity: a step that diverged, where other refusals are mistakes."""
+    """Colours or the background hold NaN or infinity. In training this means that a step diverged."""
 
 
 class DeliveryError(Pd4Error):
@@ -84,9 +84,9 @@ class DecodeError(Pd4Error):
 
 
 class Truncated(DecodeError):
-    """The bytes end too early. Streaming waits on it; `allow_partial` turns it into the longest valid prefix.
+    """The bytes end too early. A stream waits for more; with `allow_partial` the longest valid prefix is returned.
 
-    needs: so many bytes of the file the step takes that found too few, 0 if unknown.
+    needs: bytes from the start of the file that the failed read requires, 0 if unknown.
     """
 
     def __init__(self, message: str, *, offset: int | None = None, chunk: int | None = None, needs: int = 0):
@@ -119,8 +119,8 @@ class LimitExceeded(DecodeError):
 
 
 def required(name: str, extra: str, what: str) -> Any:
-    """The module `name` of one of the package's extras, which `what` (a plural) need. Raises DataError if it cannot be
-    imported."""
+    """Returns the module `name` of the extra `extra`. Raises DataError if it is not installed.
+    what: who needs it, a plural noun for the message."""
     try:
         return import_module(name)
     except ImportError:

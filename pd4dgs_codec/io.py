@@ -1,8 +1,8 @@
-"""Output files that appear whole or not at all, and values that JSON can hold.
+"""Atomic writing of output files, checks of paths, and values that JSON can hold.
 
-A writer gets a path in a temporary folder beside its target. When it is done the file is flushed to the disk, gets the
-mode of the file that it replaces, and is renamed to the target in one step. The folder is removed after any failure or
-signal; a process that is killed by SIGKILL may leave it behind.
+A writer gets a path in a temporary folder beside its target. Then the file is flushed to disk, gets the mode of the
+file that it replaces, and is renamed to the target in one step. The folder is removed after any failure or signal; only
+SIGKILL may leave it behind.
 """
 
 import contextlib
@@ -21,21 +21,21 @@ from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.signals import held
 
 PREFIX = ".pd4dgs-"
-#: What begins as a URI does, which as a path would make a folder `s3:`. A drive has one letter, and most names with a
-#: colon, as `12:30.pd4`, are names.
+#: Matches the start of a URI, which as a path would make a folder `s3:`. Does not match a drive letter, nor a file name
+#: with a colon such as `12:30.pd4`.
 URI = re.compile(r"(?i)[a-z][a-z0-9+.-]+:(?:/|$)|(?:s3|gs|https?|file):")
-#: Temporary folders that there are.
+#: Temporary folders of this process that exist.
 _FOLDERS: set[Path] = set()
 
 
 def check_path(path: str | Path) -> None:
-    """Raises DataError for the URI of an output, instead of a path."""
+    """Raises DataError if an output path looks like a URI."""
     if URI.match(str(path)):
         raise DataError(f"{path}: looks like a URI, expected a path (./{path} is one)")
 
 
 def check_output(path: str | Path, overwrite: bool) -> None:
-    """Raises DataError, before any work, if the output is a URI, exists or its folder cannot be written to."""
+    """Raises DataError if the output is a URI or a folder, exists without `overwrite`, or cannot be written to."""
     check_path(path)
     target = Path(path)
     if target.is_dir():
@@ -57,10 +57,10 @@ def write_bytes(path: str | Path, data: bytes | memoryview, overwrite: bool) -> 
 
 @contextlib.contextmanager
 def whole_file(path: str | Path, overwrite: bool) -> Iterator[Path]:
-    """A temporary path to write to. It becomes `path` on success and is removed after any failure.
+    """Yields a temporary path to write to. It becomes `path` on success and is removed after any failure.
 
-    A symbolic link stays one, and a device or a pipe is written to directly. Raises DataError as check_output does,
-    and OSError naming `path` if the system refuses.
+    The target of a symbolic link is replaced, not the link; a device or a pipe is written to directly. Raises DataError
+    as check_output does, and OSError naming `path` if the system refuses.
     """
     check_output(path, overwrite)
     if is_device(Path(path)):  # renaming a file to /dev/null or a pipe would destroy it
@@ -77,8 +77,8 @@ def whole_file(path: str | Path, overwrite: bool) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def whole_files(names: Sequence[str], overwrite: bool, told: str | None = None) -> Iterator[list[Path]]:
-    """Temporary paths for outputs in one folder that appear together once all are written. The folder is made if
-    missing. An OSError names `told`, or the first of them."""
+    """Yields temporary paths for outputs in one folder, which appear together once all are written. Creates the folder
+    if missing. Raises DataError if an output exists without `overwrite`; an OSError names `told` or the first."""
     check_path(names[0])
     parent = Path(names[0]).parent
     for name in names:
@@ -129,7 +129,7 @@ def is_device(path: Path) -> bool:
 
 
 def finite(value: Any) -> Any:
-    """`value` as JSON can hold it: infinities and NaN become None, tuples become lists."""
+    """Returns `value` as JSON can hold it: infinities and NaN become None, tuples become lists."""
     if isinstance(value, dict):
         return {key: finite(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
@@ -139,7 +139,7 @@ def finite(value: Any) -> Any:
 
 @contextlib.contextmanager
 def _naming(path: str | Path) -> Iterator[None]:
-    """Errors name the output, not where it is written meanwhile, or nothing."""
+    """Makes an OSError name the output instead of its temporary path or no path."""
     try:
         yield
     except OSError as error:
@@ -148,7 +148,7 @@ def _naming(path: str | Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
-    """A new folder, in `parent` or where the system has them, that no failure and no signal leaves behind."""
+    """Yields a new folder in `parent`, or in the system's default place; failures and signals remove it too."""
     folder = None
     try:
         with held():
@@ -162,7 +162,7 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
 
 
 def remove_temporaries() -> None:
-    """Removes the temporary folders of this process that a signal cut the removal of."""
+    """Removes temporary folders of this process whose removal a signal interrupted."""
     while _FOLDERS:
         shutil.rmtree(_FOLDERS.pop(), ignore_errors=True)
 
@@ -173,9 +173,9 @@ def _flush(temporary: Path) -> None:
 
 
 def _move(temporary: Path, target: Path) -> None:
-    with contextlib.suppress(FileNotFoundError):  # a new file has the mode of new files
+    with contextlib.suppress(FileNotFoundError):  # a new file keeps the default mode
         before = target.stat()
-        with contextlib.suppress(PermissionError, AttributeError):  # only root may give files away, on Windows none
+        with contextlib.suppress(PermissionError, AttributeError):  # only root may change owners; no chown on Windows
             os.chown(temporary, before.st_uid, before.st_gid)
         os.chmod(temporary, stat.S_IMODE(before.st_mode))
     os.replace(temporary, target)

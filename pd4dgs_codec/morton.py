@@ -5,11 +5,11 @@ import numpy as np
 from pd4dgs_codec.errors import EncodeError
 
 AXIS_BITS = 21  #: bits per axis; three of them fit in one int64
-MAX_VOXEL = 1 << (AXIS_BITS - 1)  #: |voxel index| of an anchor along any axis, a limit of the format
+MAX_VOXEL = 1 << (AXIS_BITS - 1)  #: largest |voxel index| of an anchor along an axis, a limit of the format
 
 
 def spread_bits(values: np.ndarray) -> np.ndarray:
-    """Bit i of each value to bit 3i. values: int, 0 <= v < 2**21; returns int64 of the same shape."""
+    """Moves bit i of each value to bit 3i. values: int, 0 <= v < 2**21. Returns int64 of the same shape."""
     v = values.astype(np.int64)
     for shift, mask in (
         (32, 0x1F00000000FFFF),
@@ -24,7 +24,7 @@ def spread_bits(values: np.ndarray) -> np.ndarray:
 
 
 def join_bits(codes: np.ndarray) -> np.ndarray:
-    """Bit 3i of each code to bit i, the inverse of spread_bits; other bits are dropped. int64 -> int64."""
+    """Moves bit 3i of each code int64 to bit i and drops the other bits: the inverse of spread_bits, int64."""
     v = codes & 0x1249249249249249
     for shift, mask in (
         (2, 0x10C30C30C30C30C3),
@@ -38,7 +38,7 @@ def join_bits(codes: np.ndarray) -> np.ndarray:
 
 
 def morton_codes(cells: np.ndarray) -> np.ndarray:
-    """Codes int64 [N] of cells int [N, 3], relative to their minimum.
+    """Returns the codes int64 [N] of cells int [N, 3], relative to their minimum.
 
     Raises EncodeError if the shape is wrong or an axis spans more than 2**21 cells.
     """
@@ -59,8 +59,8 @@ def morton_codes(cells: np.ndarray) -> np.ndarray:
 
 
 def morton_order(cells: np.ndarray) -> np.ndarray:
-    """The permutation int64 [N] that sorts cells int [N, 3], all within ±MAX_VOXEL, by Morton code; equal cells keep
-    their order. From MAX_VOXEL down to its negative an axis takes one bit more than a code has."""
+    """Returns the permutation int64 [N] that sorts cells int [N, 3], all within ±MAX_VOXEL, by Morton code; equal cells
+    keep their order. An axis that spans the whole range takes one bit more than a code has."""
     offsets = cells.astype(np.int64) - cells.min(axis=0, initial=MAX_VOXEL)
     upper = offsets >> AXIS_BITS
     lower = [spread_bits(offsets[:, axis] & ((1 << AXIS_BITS) - 1)) << axis for axis in range(3)]

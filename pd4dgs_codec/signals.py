@@ -1,7 +1,7 @@
-"""How Ctrl-C, SIGTERM and a terminal that closes end a command: without a traceback, and with nothing left behind.
+"""Lets Ctrl-C, SIGTERM and SIGHUP (a closed terminal) end a command without a traceback or leftovers.
 
-Before `interruptible` and after it a program has nothing to clear up, and signals kill it (see `cli`). Within it they
-raise KeyboardInterrupt in the main thread, as Ctrl-C does in any Python program.
+Outside `interruptible` a program has nothing to clean up, and a signal kills it (see `cli`). Within it a signal raises
+KeyboardInterrupt in the main thread, as Ctrl-C does in any Python program.
 """
 
 import signal
@@ -13,12 +13,12 @@ from types import FrameType
 from typing import Any
 
 ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
-AGAIN_SECONDS = 0.01  #: until a signal is raised again that came where Python only prints exceptions
+AGAIN_SECONDS = 0.01  #: delay before a signal is raised again whose exception Python only printed
 UNHANDLED = (signal.SIG_DFL, signal.default_int_handler)
 
 
 class _State:
-    """held: blocks that signals wait for. waiting: one does. over: the command has ended by one; more are ignored."""
+    """held: open `held` blocks. waiting: a signal came in one. over: the command is ending; ignore signals."""
 
     held, waiting, over = 0, False, False
 
@@ -31,7 +31,7 @@ def _received(number: int, frame: FrameType | None) -> None:
 
 
 def _raise_again() -> None:
-    """In the main thread, whichever this one is: it may wait for the system."""
+    """Sends SIGINT to the main thread from any thread, so that it wakes from a blocking system call."""
     if hasattr(signal, "pthread_kill"):
         signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
     else:  # on Windows
@@ -40,7 +40,7 @@ def _raise_again() -> None:
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Lets signals wait until the block ends, if `interruptible` handles them. For moments, not for work."""
+    """Delays the signals that `interruptible` handles until the block ends. For short blocks only."""
     _State.held += 1
     try:
         yield
@@ -52,18 +52,18 @@ def held() -> Iterator[None]:
 
 
 def ignore_more() -> None:
-    """Ignores further signals until the end of `interruptible`: the command ends by the first."""
+    """Ignores further signals until `interruptible` ends, because the first one already ends the command."""
     _State.over = True
 
 
 @contextmanager
 def interruptible() -> Iterator[bool]:
-    """Within the block ENDING raise KeyboardInterrupt, but those that are ignored or that others handle. Gives whether
-    any does; in other threads than the main one, and within another such block, none does."""
+    """Within the block the signals ENDING raise KeyboardInterrupt unless they are ignored or have other handlers.
+    Yields whether any of them does; none does outside the main thread or in a nested block."""
     hook = sys.unraisablehook
 
     def lost(event: Any) -> None:
-        """Python prints what a callback of its own raises, also where a signal came, and goes on."""
+        """Raises an interrupt again that came during a callback, whose exceptions Python only prints."""
         if issubclass(event.exc_type, KeyboardInterrupt):
             threading.Timer(AGAIN_SECONDS, _raise_again).start()
         else:
@@ -82,8 +82,8 @@ def interruptible() -> Iterator[bool]:
 
 @contextmanager
 def stop_request() -> Iterator[threading.Event]:
-    """Gives what the first Ctrl-C or SIGTERM sets; every further one raises KeyboardInterrupt. Ignored signals stay
-    ignored, and in other threads than the main one nothing changes."""
+    """Yields an event that the first Ctrl-C or SIGTERM sets; every further one raises KeyboardInterrupt. Ignored
+    signals stay ignored, and outside the main thread nothing changes."""
     stop = threading.Event()
 
     def received(number: int, frame: FrameType | None) -> None:
@@ -97,8 +97,8 @@ def stop_request() -> Iterator[threading.Event]:
 
 @contextmanager
 def _handled(numbers: Iterable[int], by: Callable[..., None], replaced: Callable[[Any], bool]) -> Iterator[bool]:
-    """Within the block those of the signals whose handlers are to be `replaced` call `by`. Gives whether any does; none
-    outside of the main thread, where Python allows no handlers."""
+    """Within the block, signals whose current handler satisfies `replaced` call `by`. Yields whether any of them does;
+    none does outside the main thread, where Python allows no handlers."""
     main = threading.current_thread() is threading.main_thread()
     before = {number: signal.getsignal(number) for number in numbers if main}
     before = {number: handler for number, handler in before.items() if replaced(handler)}

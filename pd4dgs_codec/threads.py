@@ -1,22 +1,21 @@
-"""The one policy of threads for the whole process: how many, and how they wait. It imports no numpy, torch or numba.
+"""Number of threads and how they wait, for the whole process. Imports no numpy, torch or numba.
 
 | pool | threads | how they wait |
 |------|---------|---------------|
-| the kernels (`Sharer`) | as `configure` is told | asleep |
+| the kernels (`Sharer`) | as `configure` sets | asleep |
 | torch's operations (OpenMP) | the same; 1 in training | asleep |
 | the BLAS of numpy | 1 | |
 
-Every command calls `configure` before anything else is imported. As a library, rendering and training call it at the
-first kernel, and encoding limits numpy's BLAS to one thread while it lasts (`one_blas_thread`). Decoding has
-no threads.
+Every command calls `configure` before any other import. In a library, rendering and training call it at the first
+kernel, and encoding runs numpy's BLAS on one thread (`one_blas_thread`). Decoding starts no threads.
 
-The products of an encoder are small, and OpenBLAS's threads spin between them: beside another job, encoding took two to
-four times as long as with one thread. OPENBLAS_NUM_THREADS is read when numpy loads; the BLAS of a loaded numpy is
-limited with `threadpoolctl`, if installed.
+The encoder's matrix products are small, and OpenBLAS threads spin between them: beside another job, encoding took two
+to four times as long as with one thread. numpy reads OPENBLAS_NUM_THREADS when it loads; afterwards `threadpoolctl`, if
+installed, sets the limit.
 
-OpenMP threads that spin while they wait make a training step 5-20 times slower as soon as another process takes a core;
-`OMP_WAIT_POLICY=passive` (read when torch loads) avoids that. In training torch's operations are short: waking its
-threads for them made steps of small scenes a tenth slower.
+OpenMP threads that spin while they wait make a training step 5 to 20 times slower as soon as another process uses a
+core; `OMP_WAIT_POLICY=passive` (read when torch loads) avoids this. torch's operations in training are short: waking
+its threads for them made steps of small scenes a tenth slower.
 """
 
 from __future__ import annotations
@@ -41,16 +40,17 @@ _kernel_threads: int | None = None
 
 
 def available() -> int:
-    """CPUs that this process may use."""
+    """Returns the number of CPUs that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def configure(threads: int | None = None) -> int:
     """Sets the wait policy and the number of threads; returns that number.
 
-    threads: 1 .. available CPUs, or None for OMP_NUM_THREADS if set, else all. Best called before numpy and torch are
-    imported; afterwards it still sets the threads of torch, the kernels and, with threadpoolctl, numpy's BLAS, but not
-    the wait policy of a loaded OpenMP. Start processes by spawn, not by fork: OpenMP kills forked children.
+    threads: 1 .. available CPUs, or None for OMP_NUM_THREADS if set, else all. Raises RenderError out of this range.
+    Call it before numpy and torch are imported: afterwards it still sets the threads of torch, the kernels and, with
+    threadpoolctl, numpy's BLAS, but not the wait policy of a loaded OpenMP. Start processes by spawn, not by fork:
+    OpenMP kills forked children.
     """
     if threads is None:
         asked = os.environ.get("OMP_NUM_THREADS", "")
@@ -69,18 +69,18 @@ def configure(threads: int | None = None) -> int:
 
 
 def set_kernel_threads(threads: int) -> None:
-    """Sets the threads of the CPU kernels from the next call on."""
+    """Sets the number of threads of the CPU kernels from their next call on."""
     global _kernel_threads
     _kernel_threads = threads
 
 
 def kernel_threads() -> int:
-    """Threads of the CPU kernels: as `configure` set them, else OMP_NUM_THREADS, else all available CPUs."""
+    """Returns the number of threads of the CPU kernels; calls `configure` if it has not been set."""
     return configure(None) if _kernel_threads is None else _kernel_threads
 
 
 def _limit_blas() -> Any:
-    """Limits numpy's BLAS to one thread; returns what restores it, or None without threadpoolctl."""
+    """Limits numpy's BLAS to one thread; returns the limiter, which can undo it, or None without threadpoolctl."""
     try:
         from threadpoolctl import threadpool_limits
     except ImportError:
@@ -116,7 +116,7 @@ def keep_freed_memory() -> None:
     """Lets glibc reuse large blocks instead of returning each to the system; without glibc it does nothing.
 
     A training step allocates and frees hundreds of megabytes, and the page faults of fresh blocks made element-wise
-    operations several times slower. Work done once only takes more memory: 5 % in encoding a million anchors.
+    operations several times slower. One-off work gains nothing and takes more memory: encoding a million anchors, 5 %.
     """
     mmap_threshold, trim_threshold = -3, -1  # glibc's M_MMAP_THRESHOLD, M_TRIM_THRESHOLD
     try:
@@ -127,7 +127,7 @@ def keep_freed_memory() -> None:
         pass
 
 
-#: Imported by numba if installed, for matrix products and line counts of kernels. Our kernels have neither.
+#: Packages that numba imports if installed, for matrix products and code coverage of kernels. Our kernels use neither.
 _BESIDE_NUMBA = ("scipy", "coverage")
 
 
@@ -147,29 +147,28 @@ def load_numba() -> None:
 
 # -- sharing work ------------------------------------------------------------------------------------------------------
 
-#: Most parts of a kernel's tasks per thread. Threads take parts one after the other: if another process delays one of
-#: them, or its tasks take longer, the others do the rest.
+#: Most parts per thread into which a kernel's tasks are divided. Threads fetch parts one by one: if another process
+#: delays a thread, or its tasks take longer, the others do the rest.
 PARTS_PER_THREAD = 4
-#: Seconds that all tasks must take for each part of a thread beyond the first: after each it waits for the
-#: interpreter's lock.
+#: Seconds of all tasks for each further part per thread: after each part a thread waits for the interpreter's lock.
 WORTH_PART = 2e-3
-#: Seconds that all tasks must take to be shared; waking helpers takes about a tenth of it.
+#: Least seconds of all tasks for which helpers are woken, which takes about a tenth of this.
 WORTH_HELP = 2e-4
 
 Work = Callable[[tuple[int, int]], None]
 
 
 class Sharer:
-    """Runs the tasks of one kernel on all kernel threads, or on the caller's alone if they took little time lately.
+    """Runs the tasks of one kernel on all kernel threads, or in the caller alone if they took little time last time.
 
-    Any thread may call it, several at once too. Nobody waits for a helper that has not begun: it may be busy elsewhere.
+    Several threads may call it at once. No caller waits for a helper that has not begun: it may be busy elsewhere.
     """
 
     def __init__(self) -> None:
         self._seconds = 0.0  # per task; the first call, which may compile, is not shared
 
     def share(self, tasks: int, work: Work) -> None:
-        """Calls work((first, end)) for ranges that make up 0..tasks; `work` releases the interpreter's lock."""
+        """Calls work((first, end)) for ranges that together cover 0 .. tasks - 1. `work` must release the GIL."""
         threads, begin = min(kernel_threads(), tasks), perf_counter()
         if self._seconds * tasks < WORTH_HELP:
             threads = min(threads, 1)
@@ -198,7 +197,7 @@ def aside(work: Callable[[], T]) -> Callable[[], T]:
     """Begins `work` on a helper thread if kernels have more than one thread. The function returned waits for it and
     returns its result or raises its exception; work that no helper has begun by then runs in the caller.
 
-    Both threads run Python in turns: this pays for work that mostly waits for kernels.
+    Only one thread runs Python at a time, so this helps only work that mostly waits for kernels.
     """
     if kernel_threads() < 2:
         return work
@@ -208,7 +207,7 @@ def aside(work: Callable[[], T]) -> Callable[[], T]:
 
 @cache
 def _helpers() -> ThreadPoolExecutor:
-    """The helper threads, started as they are needed."""
+    """Returns the pool of helper threads, which starts them as needed."""
     from concurrent.futures import ThreadPoolExecutor
 
     return ThreadPoolExecutor(max(1, available() - 1), thread_name_prefix="kernel")
