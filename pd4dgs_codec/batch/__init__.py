@@ -1,1 +1,1 @@
-"""Libraries of scenes: one command over the lines of a manifest, on this machine, on Ray or on Slurm."""
+"""Runs one command on all scenes of a manifest: on this machine, on Ray or on Slurm."""

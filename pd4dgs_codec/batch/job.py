@@ -1,7 +1,7 @@
-"""The lines of a manifest, and the one function that every engine runs: a line from its source to its finished output.
+"""Reads manifests, and takes one line from its source to its finished output, the function that all engines run.
 
-A manifest has a JSON object per line, `{"source": ..., "output": ..., "options": {...}}`, for one operation: a command
-of the package that runs on each source. A broken line is reported and the others go on.
+A manifest has a JSON object per line, `{"source": ..., "output": ..., "options": {...}}`. One operation, a command of
+the package, runs on each source. Invalid lines are reported, and the others run.
 """
 
 import json
@@ -22,7 +22,7 @@ from pd4dgs_codec.errors import DataError, Pd4Error, one_line
 from pd4dgs_codec.io import remove_temporaries, temporary_folder
 from pd4dgs_codec.signals import ignore_more, interruptible
 
-LOG_BYTES = 1 << 16  #: kept of a command's log
+LOG_BYTES = 1 << 16  #: limit of a command's log, whose end is kept
 DONE, ALREADY, FAILED = "done", "already", "failed"
 #: Runs a command: (verb, argv) -> (exit code, its stdout, its stderr).
 Command = Callable[[str, list[str]], tuple[int, str, str]]
@@ -67,8 +67,8 @@ class Line:
 
 
 class Manifest:
-    """The valid lines of a manifest, and its broken ones as (number, found and expected). Raises
-    OSError or DataError if it cannot be read or is empty.
+    """Reads the valid lines of a manifest, and the faults of the others as (number, message). Raises OSError or
+    DataError if it cannot be read or is empty.
 
     check: raises DataError for options that the command does not take.
     """
@@ -89,7 +89,7 @@ class Manifest:
                     self.lines.append(line)
                 except DataError as error:
                     self.faults.append((number, str(error)))
-                except Exception as error:  # what no check foresaw is this line's alone
+                except Exception as error:  # an error that no check foresaw fails this line only
                     self.faults.append((number, one_line(f"{type(error).__name__}: {error}")))
         if not (self.lines or self.faults):
             raise DataError(f"{place}: holds no lines, expected a JSON object for each scene")
@@ -152,10 +152,10 @@ def arguments(verb: str, source: str, output: str, options: dict[str, Any]) -> l
 
 
 def scan(folder: str, verb: str | None) -> Iterator[dict[str, str]]:
-    """The lines of a manifest of the sources in a folder, a path or a URI.
+    """Yields the lines of a manifest for the sources in a folder, a path or a URI.
 
-    verb: one of OPS; None for the one whose sources the folder holds. Raises DataError if it holds none, or sources of
-    several kinds.
+    verb: one of OPS, None to choose it by the sources found. Raises DataError for a folder without sources, or with
+    sources of several kinds.
     """
     names = store.names(folder)
 
@@ -181,7 +181,7 @@ def scan(folder: str, verb: str | None) -> Iterator[dict[str, str]]:
 
 @dataclass(frozen=True)
 class Job:
-    """A line with the settings of the batch. version: of the package that began the batch."""
+    """A line with the settings of the batch. version: of the package that started the batch."""
 
     line: Line
     verb: str
@@ -195,8 +195,8 @@ class Job:
 class Outcome:
     """The result of a job.
 
-    state: "done" now, "already" before, or "failed". final: another try would end the same. log: the command's stderr.
-    cpu: CPU seconds in all, work: of the command alone. peak: memory of the worker so far, bytes.
+    state: "done" now, "already" before, or "failed". final: a retry would fail too. log: the command's stderr. cpu: CPU
+    seconds in all, work: of the command alone. peak: largest memory of the worker so far, bytes.
     """
 
     state: str
@@ -218,8 +218,8 @@ class CommandFailed(Exception):
 
 
 def run_job(job: Job, command: Command) -> Outcome:
-    """Does a job unless its output is finished. Every failure is an outcome, and so is a signal, but in the process
-    that runs the batch, which a signal ends."""
+    """Runs a job unless its output is finished. Failures and signals become outcomes, except that a signal to the
+    process that runs the batch ends it."""
     cpu = time.process_time()
     with interruptible() as outermost:
         try:
@@ -272,8 +272,8 @@ def _done_once(job: Job, command: Command) -> Outcome:
 
 
 def _fetched(place: str, folder: Path) -> str:
-    """The argument for the command. The path of a copy is relative to the folder, so that no temporary name gets into
-    outputs."""
+    """Fetches a source and returns the command's argument. The path of a copy is relative to the folder, so that no
+    temporary name gets into outputs."""
     if place.startswith(SYNTHETIC):
         return place
     path = store.fetch(place, folder)
@@ -283,7 +283,7 @@ def _fetched(place: str, folder: Path) -> str:
 def _run(
     job: Job, command: Command, sources: dict[str, str], folder: Path
 ) -> tuple[dict[str, Path], dict[str, Any], float]:
-    """Runs the command: (its output's files by name, the numbers that it reported, CPU seconds)."""
+    """Runs the command and returns (output files by name, numbers that it reported, CPU seconds)."""
     op, output = OPS[job.verb], Path("output") / ("result" + OPS[job.verb].suffix)
     output.parent.mkdir()
     options = job.line.options | {name: text for name, text in sources.items() if name}
@@ -308,7 +308,7 @@ def _run(
 
 @contextmanager
 def _temporary_folder() -> Iterator[Path]:
-    """A new folder, the working folder meanwhile."""
+    """Makes a temporary folder the working folder within the block."""
     before = os.getcwd()
     with temporary_folder() as folder:
         os.chdir(folder)

@@ -1,7 +1,7 @@
-"""A batch: jobs on an engine, failed ones tried again, and a summary.
+"""Runs the jobs of a batch on an engine, retries failed ones and sums up the results.
 
-An engine runs jobs as tasks: a pool of processes on this machine, Ray, or Slurm through submitit. The loop, the
-retries and the time limit are the same for all.
+An engine is a pool of processes on this machine, Ray, or Slurm through submitit. All share the loop and the retries;
+Slurm enforces the time limit itself.
 """
 
 import contextlib
@@ -28,7 +28,7 @@ from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.io import remove_temporaries
 
 Work = Callable[[Job], Outcome]
-GRACE_SECONDS = 5.0  #: that a process has to clear up before it is killed
+GRACE_SECONDS = 5.0  #: for a process to clean up before it is killed
 POLL_SECONDS = 1.0  #: between looks at Slurm's results
 MAX_ARRAY = 1000  #: jobs of a Slurm array; the usual limit (MaxArraySize) is 1001
 
@@ -58,7 +58,7 @@ class Engine:
     timeout: float | None = None
 
     def start(self, jobs: list[Job]) -> list[Future[Outcome]]:
-        """Begins jobs. A future with an exception is of a job whose worker was lost."""
+        """Starts jobs. The future of a job whose worker was lost has an exception."""
         raise NotImplementedError
 
     def kill(self, future: Future[Outcome]) -> None:
@@ -78,11 +78,11 @@ def run(
 ) -> dict[str, Any]:
     """Runs all jobs on an engine: "local", "ray" or "slurm".
 
-    A job that fails is tried again `retries` times behind all others, unless that would end the same. report: called
-    with each job that is over, its last outcome and its tries. Raises DataError if the engine cannot run.
+    A failed job is retried up to `retries` times, behind all others, unless its failure is final. report: called with
+    each finished job, its last outcome and its number of tries. Raises DataError if the engine cannot run.
 
-    Returns the figures of the command's JSON: counts of lines, and over all tries bytes, CPU seconds (work: of the
-    commands alone) and the memory of the largest worker, bytes.
+    Returns numbers for the command's JSON: counts of lines, and over all tries bytes, CPU seconds (work: of the
+    commands alone) and the largest memory of a worker, bytes.
     """
     summary: dict[str, Any] = dict.fromkeys(("done", "already", "retried", "bytes", "peak_memory"), 0)
     summary |= dict.fromkeys(("seconds", "cpu_seconds", "work_cpu_seconds"), 0.0)
@@ -107,7 +107,7 @@ def run(
 
 
 def _outcomes(engine: Engine, waiting: deque[Job]) -> Iterator[tuple[Job, Outcome]]:
-    """Each job as it ends, until none waits or runs."""
+    """Yields each job with its outcome as it ends, until none waits or runs."""
     running: dict[Future[Outcome], tuple[Job, float]] = {}
     while True:
         new = [waiting.popleft() for _ in range(min(len(waiting), engine.room - len(running)))]
@@ -132,7 +132,7 @@ def _outcomes(engine: Engine, waiting: deque[Job]) -> Iterator[tuple[Job, Outcom
 
 
 class Local(Engine):
-    """Pools of one process each, as a process that dies breaks its whole pool; without workers this process alone."""
+    """Runs jobs in pools of one process, since a process that dies breaks its pool; with 0 workers, in this process."""
 
     def __init__(self, work: Work, settings: Settings):
         self.work, self.inline, self.timeout = work, settings.workers == 0, settings.timeout
@@ -142,7 +142,7 @@ class Local(Engine):
         self.busy: dict[Future[Outcome], tuple[ProcessPoolExecutor, Future[int]]] = {}
 
     def start(self, jobs: list[Job]) -> list[Future[Outcome]]:
-        """In this process, in pools that are free, or in new ones."""
+        """Starts jobs in this process, in free pools, or in new ones."""
         self.busy = {future: pool for future, pool in self.busy.items() if not future.done()}
         return [self._begun(job) for job in jobs]
 
@@ -167,7 +167,7 @@ class Local(Engine):
         self._end([future])
 
     def _end(self, futures: list[Future[Outcome]]) -> None:
-        """By SIGTERM, so that it removes what it was writing; by SIGKILL if it is still there after GRACE_SECONDS."""
+        """Ends jobs by SIGTERM, on which they remove partial files, and after GRACE_SECONDS by SIGKILL."""
         pools = {future: self.busy.pop(future) for future in futures}
         for number, patience in ((signal.SIGTERM, GRACE_SECONDS), (signal.SIGKILL, 0.0)):
             for future in (future for future in futures if not future.done()):
@@ -179,7 +179,7 @@ class Local(Engine):
             pool[0].shutdown(wait=False, cancel_futures=True)
 
     def close(self) -> None:
-        """Ends the processes at work and dismisses the others."""
+        """Ends busy processes and shuts down the others."""
         self._end([future for future in self.busy if not future.done()])
         for executor, _ in self.pools:
             executor.shutdown(wait=False)
@@ -187,8 +187,8 @@ class Local(Engine):
 
 
 def _follow_parent(folder: str) -> None:
-    """Lets a process ignore Ctrl-C, which its parent handles, and end with its parent. Its temporary files are in
-    `folder`, so that its parent removes them if it is killed, and it removes them if its parent is."""
+    """Makes a worker ignore Ctrl-C, which its parent handles, and end with its parent. If one of the two is killed, the
+    other removes `folder`, which holds the worker's temporary files."""
     tempfile.tempdir = folder
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
@@ -207,7 +207,7 @@ def _follow_parent(folder: str) -> None:
 
 
 class Ray(Engine):
-    """Tasks of Ray Core on the cluster at `address` (RAY_ADDRESS if None, else a new one on this machine)."""
+    """Runs jobs as Ray Core tasks on the cluster at `address` (None: RAY_ADDRESS, else a new one on this machine)."""
 
     def __init__(self, work: Work, settings: Settings):
         address = settings.address or os.environ.get("RAY_ADDRESS")
@@ -226,11 +226,11 @@ class Ray(Engine):
             wanted = " and ".join(f"{count:g} {kind}" for kind, count in needed.items() if count)
             raise DataError(f"no node of the Ray cluster has the {wanted} that a scene takes")  # Ray would wait for one
         self.room = settings.workers or int(ray.cluster_resources().get("CPU", 1) // settings.threads) or 1
-        # `run` tries lost jobs again: one bound for all retries
+        # `run` retries lost jobs itself, with one limit for all retries
         self.task = ray.remote(num_cpus=settings.threads, num_gpus=settings.gpus, max_retries=0)(_call)
         self.references: dict[Future[Outcome], Any] = {}
         self.quiet = contextlib.ExitStack()
-        self.quiet.enter_context(contextlib.redirect_stdout(sys.stderr))  # Ray prints of dead workers; stdout is JSON's
+        self.quiet.enter_context(contextlib.redirect_stdout(sys.stderr))  # Ray prints dead workers; stdout is for JSON
 
     def start(self, jobs: list[Job]) -> list[Future[Outcome]]:
         started = {(reference := self.task.remote(self.work, job)).future(): reference for job in jobs}
@@ -246,7 +246,7 @@ class Ray(Engine):
 
 
 def _call(work: Work, job: Job) -> Outcome:
-    """A task of Ray is a function; `work` may be any callable."""
+    """Calls `work`, which may be any callable, while a Ray task must be a function."""
     return work(job)
 
 
@@ -266,8 +266,8 @@ def _check_listens(address: str | None) -> None:
 
 
 class Slurm(Engine):
-    """Array jobs of Slurm, through submitit, whose time limit is Slurm's own; `cluster=local` in `slurm` runs them as
-    processes of this machine."""
+    """Submits array jobs to Slurm through submitit; Slurm enforces the time limit. `cluster=local` in `slurm` runs them
+    as processes of this machine."""
 
     def __init__(self, work: Work, settings: Settings):
         import submitit
@@ -302,7 +302,7 @@ class Slurm(Engine):
         return list(started)
 
     def _watch(self) -> None:
-        """Gives each future its outcome, as soon as submitit finds one, or an exception."""
+        """Sets the outcome or the exception of each future as soon as submitit has it."""
         while True:
             for future, task in list(self.tasks.items()):
                 try:

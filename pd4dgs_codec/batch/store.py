@@ -1,6 +1,6 @@
-"""Sources and outputs: paths and the URIs that fsspec knows (s3, gs, https, memory, ...).
+"""Reads sources and writes outputs at paths and at URIs that fsspec knows (s3, gs, https, memory, ...).
 
-An output is its files and a record, `OUTPUT.done.json`, which is written last and says that the output is finished.
+An output has files and a record, `OUTPUT.done.json`, which is written last and marks the output as finished.
 Each file appears whole or not at all: on a disk by a rename, in object stores by their own design.
 """
 
@@ -23,17 +23,17 @@ RECORD = ".done.json"
 PROBE = ".pd4dgs-batch"
 #: Fields of a file's entry in a store that change with the file; the first one present is used.
 STAMPS = ("ETag", "etag", "md5Hash", "generation", "LastModified", "Last-Modified", "mtime")
-#: What the file systems of stores call a file's media type when they write one.
+#: Keyword by which the file systems of stores take the media type of a file.
 TYPED = {"s3": "ContentType", "gs": "content_type"}
-#: Not empty, and no URI of a local file whose path is relative: fsspec would read its host as a folder.
+#: Matches all but the empty string and local URIs with a relative path, whose host fsspec would read as a folder.
 _ABSOLUTE = re.compile(r"(?!(?:file|local):(?://)?(?!/)).", re.DOTALL)
-#: Errors that another try would meet again.
+#: Errors that a retry would meet again.
 FINAL = (FileNotFoundError, FileExistsError, PermissionError, IsADirectoryError, NotADirectoryError)
 
 
 def absolute(place: str) -> str:
-    """An absolute path, for workers in other folders; URIs stay, and nothing is asked of their store. Raises DataError
-    for an unknown scheme."""
+    """Makes a path absolute, for workers in other folders. URIs stay, and their store is not contacted. Raises
+    DataError for an unknown scheme."""
     required("fsspec", "cluster", "batches")
     from fsspec import available_protocols
     from fsspec.core import split_protocol
@@ -48,7 +48,7 @@ def absolute(place: str) -> str:
 
 
 def _system(place: str) -> tuple[Any, str, bool]:
-    """(file system, path in it, whether it is this machine's)."""
+    """Returns (file system, path in it, whether it is this machine's)."""
     required("fsspec", "cluster", "batches")
     from fsspec.core import url_to_fs
     from fsspec.implementations.local import LocalFileSystem
@@ -75,7 +75,7 @@ def _naming(place: str) -> Iterator[None]:
 
 @contextmanager
 def opened(place: str) -> Iterator[IO[bytes]]:
-    """A file to read. Raises OSError, and DataError for a device."""
+    """Opens a file to read. Raises OSError, and DataError for a device."""
     system, path, local = _system(place)
     if local and Path(path).exists():
         check_source(path)
@@ -86,7 +86,7 @@ def opened(place: str) -> Iterator[IO[bytes]]:
 
 
 def names(folder: str) -> list[str]:
-    """Relative paths of all files below a folder, except those with a part that begins with a dot. Raises OSError."""
+    """Lists the relative paths of all files below a folder without a part that begins with a dot. Raises OSError."""
     system, path, _ = _system(folder)
     with _naming(folder):
         found = system.find(path)
@@ -97,8 +97,8 @@ def names(folder: str) -> list[str]:
 
 
 def stamp(place: str) -> str:
-    """A text that changes with a file, or with any file of a folder, found without reading them. Raises OSError, and
-    DataError for what a reader could wait for."""
+    """Returns a text that changes with a file, or any file of a folder, without reading them. Raises OSError, and
+    DataError for a pipe or a device."""
     system, path, local = _system(place)
     if local and is_device(Path(path)):
         raise DataError(f"{place}: is a pipe or a device, expected a file or a folder")
@@ -113,7 +113,7 @@ def stamp(place: str) -> str:
 
 
 def fetch(place: str, folder: Path) -> Path:
-    """A source as a path: itself if it is on this machine, else a copy in `folder`. Raises OSError."""
+    """Returns the path of a source on this machine, or else of a copy that it makes in `folder`. Raises OSError."""
     system, path, local = _system(place)
     if local:
         if not Path(path).exists():
@@ -138,7 +138,7 @@ class Root:
         self.schemes = (schemes,) if isinstance(schemes, str) else schemes
 
     def check(self) -> None:
-        """Raises DataError, before any work, if the place takes no output."""
+        """Raises DataError, before any work, if nothing can be written to the place."""
         try:
             self._put(PROBE, b"")
         except OSError as error:
@@ -147,7 +147,7 @@ class Root:
             self.system.rm_file(self._at(PROBE))
 
     def record(self, output: str, overwrite: bool) -> dict[str, Any] | None:
-        """The record of a finished output, else None. Raises DataError for another file, unless it may be replaced."""
+        """Reads the record of a finished output, else None. Raises DataError for any other file unless `overwrite`."""
         raw = self._ask("cat_file", output + RECORD)
         if raw is None:
             return None
@@ -163,7 +163,7 @@ class Root:
         raise DataError(f"{self.place}/{output}{RECORD}: is not a record of a batch; --overwrite replaces it")
 
     def holds(self, output: str, record: dict[str, Any]) -> bool:
-        """Whether all files of a record are there, with their sizes."""
+        """Whether all files of a record exist with their recorded sizes."""
         found = {name: self._ask("info", _file(output, name)) for name in record["files"]}
         return all(found[name] and found[name]["size"] == file["bytes"] for name, file in record["files"].items())
 
@@ -171,8 +171,8 @@ class Root:
         """Writes the files of an output (name -> local path; "" is the output itself), then its record with their
         sizes, digests and media types. Returns the bytes of the files.
 
-        replace: other content may be replaced. Raises DataError if there is any and it may not, OSError if the store
-        fails.
+        replace: whether to replace files with other content; if False, such a file raises DataError. Raises OSError if
+        the store fails.
         """
         entries: dict[str, dict[str, Any]] = {}
         for name, path in files.items():
@@ -188,7 +188,7 @@ class Root:
         return sum(entry["bytes"] for entry in entries.values())
 
     def _ask(self, question: str, name: str) -> Any:
-        """The answer of a method of the file system on a file, None if the file does not exist."""
+        """Calls a method of the file system on a file. Returns None if the file does not exist."""
         with suppress(FileNotFoundError), _naming(f"{self.place}/{name}"):
             return getattr(self.system, question)(self._at(name))
         return None
