@@ -72,7 +72,7 @@ class Placed:
 
 
 def place(bodies: Sequence[Body], t: float) -> list[Placed]:
-    """All bodies at time t."""
+    """Places all bodies at time t."""
     poses = [b.pose(t) for b in bodies]
     return [Placed(b, A, c, np.linalg.inv(A)) for b, (A, c) in zip(bodies, poses, strict=True)]
 
@@ -216,8 +216,8 @@ def shade(placed: Sequence[Placed], own: int, world: np.ndarray, t: float) -> np
 class Motion:
     """The motion of a scene over t = 0..1. Amplitudes in radians or shares, rates in turns (cycles) over that time."""
 
-    sway: float = 0.0  #: turning of the platform with all that stands on it
-    heave: float = 0.0  #: its rise, scene units
+    sway: float = 0.0  #: rotation of the platform and the bodies on it
+    heave: float = 0.0  #: rise of the platform, scene units
     swing: float = 0.0  #: the arm on the column
     swing_rate: float = 2.0
     pulse: float = 0.0  #: stretching of the ball
@@ -228,7 +228,7 @@ class Motion:
 
 
 Size = Sequence[float]  #: of three axes
-#: Rotation [3, 3], shift [3] and stretch per axis [3] of a body at an instant, on top of its place.
+#: Rotation [3, 3], shift [3] and stretch per axis [3] of a body at an instant, relative to its place.
 Local = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 MOTIONS = {
@@ -249,7 +249,7 @@ def _turn(axis: int, angle: float) -> np.ndarray:
 
 
 class Painter:
-    """Paints that depend on a seed."""
+    """Makes paints from a seed."""
 
     def __init__(self, seed: int):
         self.rng = np.random.default_rng(seed)
@@ -285,7 +285,7 @@ class RoomBuilder(Painter):
         return _turn(2, angle), np.array([0, 0, m.heave * np.sin(np.pi * t) ** 2])
 
     def fixed(self, shape: str, size: Size, at: Size, *look: Any, casts: bool = False, **more: Any) -> Body:
-        """A body that never moves. look, more: of its paint. casts: False for floor and wall."""
+        """A body that never moves. look, more: arguments of `paint`. casts: False for floor and wall."""
         pose = np.diag(np.asarray(size, float)), np.asarray(at, float)
         return Body(shape, lambda t: pose, self.paint(size, *look, **more), casts)
 
@@ -324,7 +324,7 @@ class RoomBuilder(Painter):
         ]
 
     def bodies(self) -> list[Body]:
-        """All bodies, the still ones first."""
+        """All bodies, the fixed ones first."""
         m = self.motion
         one, still = np.ones(3), np.eye(3)
 
@@ -370,13 +370,13 @@ class RoomBuilder(Painter):
 # -- scenes on white ---------------------------------------------------------------------------------------------------
 
 Point = tuple[float, float, float]
-GONE = 1e-4  #: the stretch of a body that is not there
+GONE = 1e-4  #: the stretch of an absent body
 pi = np.pi
 
 
 @dataclass(frozen=True)
 class Thing:
-    """A body of a scene on white: half sizes, centre, turning and stretching, over t = 0..1 where they change."""
+    """A body of a scene on white: half sizes, centre, rotation and stretch, as functions of t = 0..1 if they change."""
 
     shape: str
     size: Point
@@ -385,7 +385,7 @@ class Thing:
     stretch: Callable[[float], float | Point] = lambda t: 1.0
 
     def pose(self, t: float) -> Pose:
-        """Its place at an instant."""
+        """A and c at an instant."""
         at = self.at(t) if callable(self.at) else self.at
         return self.turn(t) @ np.diag(np.multiply(self.size, self.stretch(t))), np.asarray(at, float)
 
@@ -403,7 +403,7 @@ def _slice(k: int) -> Thing:
     return Thing("box", (0.28, 0.28, 0.085), at, turn, lambda t: (w := 1 + 0.25 * np.sin(6 * pi * t - 0.4 * k), w, 1.0))
 
 
-#: What stands alone on white, within 1.2 of the origin.
+#: The bodies of the scenes on white, within 1.2 of the origin.
 THINGS: dict[str, tuple[Thing, ...]] = {
     "flyby": (  # a ball flies past a cube
         Thing("box", (0.4, 0.4, 0.4), (0.0, 0.1, -0.2)),
@@ -443,8 +443,8 @@ THINGS: dict[str, tuple[Thing, ...]] = {
 
 
 def bodies(name: str, seed: int) -> list[Body]:
-    """All bodies of a scene of MOTIONS or THINGS, the still ones of a room first. On white the seed changes paints and
-    the direction that the scene faces."""
+    """All bodies of a scene of MOTIONS or THINGS, the fixed ones of a room first. On white the seed changes the paints
+    and rotates the scene."""
     if name in MOTIONS:
         return RoomBuilder(name, seed).bodies()
     painter = Painter(seed)

@@ -104,7 +104,7 @@ def world_to_camera(rotation: np.ndarray, center: np.ndarray) -> np.ndarray:
 
 
 def distort(x: np.ndarray, y: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """OpenCV's models on normalised pinhole coordinates: (xd, yd), and bool where they are one to one."""
+    """Applies OpenCV's models to normalised pinhole coordinates: (xd, yd, bool: the model is one to one there)."""
     r = np.hypot(x, y)
     if lens.fisheye is not None:
         angle = np.arctan(r)
@@ -122,7 +122,7 @@ def _growth(r: np.ndarray, k: Sequence[float]) -> np.ndarray:
 
 
 def _turning_point(k: Sequence[float]) -> float:
-    """The least r > 0 at which r times `_growth` stops to grow; beyond, the lens would show the image twice."""
+    """The least r > 0 at which r times `_growth` stops growing; beyond it, the lens would show points twice."""
     roots = np.roots([(2 * i + 1) * c for i, c in enumerate((1.0, *k))][::-1])  # of the derivative, by r^2
     real = roots.real[(roots.imag == 0) & (roots.real > 0)]
     return float(np.sqrt(real.min(initial=np.inf)))
@@ -130,7 +130,7 @@ def _turning_point(k: Sequence[float]) -> float:
 
 @lru_cache(maxsize=8)
 def _warp(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Coordinates in the stored image of each ideal pinhole pixel (u, v float64 [H, W]), and bool: it is inside."""
+    """(u, v float64 [H, W], the place of each ideal pinhole pixel in the stored image; bool [H, W]: it is valid)."""
     u, v = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     x, y = (u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy
     with np.errstate(all="ignore"):
@@ -141,7 +141,7 @@ def _warp(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def rectify(image: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
-    """Resamples uint8 [H, W, 3] bilinearly to the ideal pinhole, and bool [H, W]: False for unseen pixels, black."""
+    """(uint8 [H, W, 3] resampled bilinearly to the ideal pinhole; bool [H, W]: False for unseen pixels, black)."""
     u, v, seen = _warp(lens)
     fu, fv = np.where(seen, u, 0.5) - 0.5, np.where(seen, v, 0.5) - 0.5
     u0, v0 = np.minimum(fu.astype(int), lens.width - 2), np.minimum(fv.astype(int), lens.height - 2)

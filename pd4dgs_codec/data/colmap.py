@@ -2,8 +2,8 @@
 
 Poses are world to camera with OpenCV axes, pixel centres at +0.5. Pictures are in `images/`, else in the folder itself;
 videos, named as the pictures of the model (`cam00.png` and `cam00.mp4`), in `videos/`, else in the folder itself.
-`times.txt`, a line `NAME SECONDS` per picture, gives their times; without it the last number in a name does, else their
-order.
+Times come from `times.txt`, with a line `NAME SECONDS` per picture, else from the last number in each name, else from
+the order of the names.
 """
 
 import struct
@@ -43,7 +43,7 @@ Image = tuple[str, int, list[float]]
 
 
 def read_colmap(folder: Path, downscale: int, holdout: int, background: Color | None) -> Dataset:
-    """Reads a folder with a COLMAP model (see `dataset.load`). Of videos the first camera is held out."""
+    """Reads a folder with a COLMAP model (see `dataset.load`). With videos, the first camera is held out."""
     places = ((folder / place, kind) for place in COLMAP for kind in (".bin", ".txt"))
     model, kind = next((p, k) for p, k in places if all((p / f"{n}{k}").exists() for n in ("cameras", "images")))
     cameras, points = _registered(model, kind)
@@ -94,8 +94,8 @@ def _with_video(model: Path, camera: UnreadView, video: Path, i: int) -> UnreadV
 
 
 def _registered(model: Path, kind: str) -> tuple[list[UnreadView], np.ndarray | None]:
-    """The pictures of a model by name, each with its name in the model as `image` and time 0; points float32 [M, 3], or
-    None."""
+    """(the pictures of a model, sorted by name, with that name as `image` and time 0; points float32 [M, 3], or
+    None)."""
     read = _Binary if kind == ".bin" else _Text
     lenses = dict(read(model / f"cameras{kind}").cameras())
     images = sorted(read(model / f"images{kind}").images())
@@ -117,7 +117,7 @@ def _registered(model: Path, kind: str) -> tuple[list[UnreadView], np.ndarray | 
 
 
 def _times(folder: Path, names: list[str]) -> list[float]:
-    """The time of each picture: from times.txt, else the last number in its name, else its place."""
+    """The time of each picture: from times.txt, else the last number in its name, else its index."""
     path = folder / "times.txt"
     if not path.is_file():
         return [float(n) for n in last_numbers(map(Path, names)) or range(len(names))]
@@ -149,13 +149,13 @@ def _lens(model: str, width: int, height: int, values: list[float], where: str) 
 
 
 class _Binary:
-    """One of the binary files."""
+    """A binary file of a model."""
 
     def __init__(self, path: Path):
         self.path, self.data, self.at = path, read_file(path), 0
 
     def cameras(self) -> Iterator[tuple[int, Lens]]:
-        """Lenses with their numbers."""
+        """Yields the number and the lens of each camera."""
         for _ in range(self._take("Q")[0]):
             key, model, width, height = self._take("iiQQ")
             where = f"{self.path}: camera {key}"
@@ -165,7 +165,7 @@ class _Binary:
             yield key, _lens(name, width, height, list(self._take(f"{len(keys)}d")), where)
 
     def images(self) -> Iterator[Image]:
-        """The registered pictures."""
+        """Yields the registered pictures."""
         for _ in range(self._take("Q")[0]):
             _, *pose, camera = self._take("i7di")
             end = self.data.find(b"\0", self.at)
@@ -177,14 +177,14 @@ class _Binary:
             yield name, camera, pose
 
     def points(self) -> Iterator[tuple[float, ...]]:
-        """Rows x y z."""
+        """Yields rows x y z."""
         for _ in range(self._take("Q")[0]):
             _, x, y, z, *_, track = self._take("Q3d3BdQ")
             self._skip(8 * track)
             yield x, y, z
 
     def _take(self, layout: str) -> tuple[Any, ...]:
-        """The next values of a little-endian layout."""
+        """Reads the next values of a little-endian `struct` layout."""
         start = self.at
         self._skip(struct.calcsize(f"<{layout}"))
         return struct.unpack_from(f"<{layout}", self.data, start)
@@ -196,7 +196,7 @@ class _Binary:
 
 
 class _Text:
-    """One of the text files."""
+    """A text file of a model."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -204,7 +204,7 @@ class _Text:
 
     @property
     def lines(self) -> Iterator[tuple[int, str]]:
-        """Numbers of lines and what they hold, without comments."""
+        """(number, text) of each line, without comments."""
         return ((i, line.strip()) for i, line in enumerate(self.raw, 1) if not line.startswith("#"))
 
     def cameras(self) -> Iterator[tuple[int, Lens]]:
@@ -219,7 +219,7 @@ class _Text:
                 yield number, _lens(model, width, height, values, where)
 
     def images(self) -> Iterator[Image]:
-        """The registered pictures: two lines each, the second with the matched features."""
+        """Yields the registered pictures, which have two lines each, the second with the features."""
         for i, line in islice(dropwhile(lambda line: not line[1], self.lines), 0, None, 2):
             words = line.split(maxsplit=9)
             if not words:

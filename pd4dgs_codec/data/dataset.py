@@ -136,7 +136,7 @@ def _read(source: str | Path, downscale: int, holdout: int, background: Color | 
                     return reader.read(folder, downscale, holdout, background)
             except (DataError, ImportError, MemoryError):
                 raise
-            except Exception as error:  # what no check foresaw in somebody else's files
+            except Exception as error:  # faults of foreign files that no check foresaw
                 found = f"{type(error).__name__}: {error}"
                 raise DataError(f"{folder}: cannot be read as {reader.name}: {one_line(found, 160)}") from error
     found = "other files" if any(folder.iterdir()) else "an empty folder"
@@ -145,7 +145,7 @@ def _read(source: str | Path, downscale: int, holdout: int, background: Color | 
 
 
 def _without_blind_views(dataset: Dataset, source: str | Path) -> Dataset:
-    """The dataset without views that have no valid pixel: they teach nothing, and any picture would match them."""
+    """The dataset without views that have no valid pixel: they train nothing, and any picture would match them."""
 
     def sees(view: View) -> bool:
         return view.mask is None or bool(view.mask.any())

@@ -24,12 +24,12 @@ LARGEST = 1e9
 Color = tuple[float, float, float]  #: RGB 0..1
 WHITE = (1.0, 1.0, 1.0)
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
-FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")  #: of pictures; one of Pillow's others runs programs
-#: Bytes that a compressed file of any size may unpack to, and more for each byte of its own.
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")  #: of pictures; another format of Pillow runs programs
+#: A compressed file may unpack to FREE_BYTES, and INFLATES more for each of its bytes.
 FREE_BYTES, INFLATES = 1 << 20, 16
-#: Pixels that pictures of any size may have, and more for each byte of theirs: blank ones of 4K are read.
+#: A picture may have FREE_PIXELS, which admits blank 4K ones, and PIXELS_PER_BYTE more for each byte of its file.
 FREE_PIXELS, PIXELS_PER_BYTE = 1 << 24, 256
-#: Passes of a progressive JPEG over all of its pixels: usual are ten, and a few bytes make one more.
+#: Scans of a progressive JPEG, each over all pixels: ten are usual, and a few bytes add one.
 MAX_SCANS, SCAN = 100, b"\xff\xda"
 #: Pillow's pixel modes with one obvious conversion to RGB; others (CMYK, LAB, floats) are refused.
 GREY16_MODES = {"I;16", "I;16L", "I;16B"}
@@ -38,13 +38,13 @@ ORIENTATION, UPRIGHT = 0x0112, 1  #: EXIF's orientation tag, and its value for p
 GAMMA = (0.40, 0.51)  #: exponents that PNG files give for sRGB: 1/2.2 as encoders round it
 
 
-#: The folder of the dataset that is being read, without links.
+#: The folder of the dataset that is being read, with links resolved.
 _FOLDER: ContextVar[Path | None] = ContextVar("_FOLDER", default=None)
 
 
 @contextlib.contextmanager
 def staying_inside(folder: Path) -> Iterator[None]:
-    """Within the block no file is read to which a link leads out of this folder, whoever chose its name."""
+    """Within the block, `check_regular` refuses files outside this folder, also behind links."""
     before = _FOLDER.set(folder.resolve())
     try:
         yield
@@ -53,8 +53,8 @@ def staying_inside(folder: Path) -> Iterator[None]:
 
 
 def check_regular(path: Path) -> None:
-    """Raises DataError for pipes and devices, whose end may never come, and for what lies outside the dataset that is
-    being read; OSError or ValueError for odd names."""
+    """Raises DataError for pipes and devices, which may never end, and for files outside the dataset that is being
+    read; OSError or ValueError for invalid names."""
     if path.exists() and not path.is_file():
         raise DataError(f"{path}: is not a regular file")
     folder = _FOLDER.get()
@@ -63,7 +63,7 @@ def check_regular(path: Path) -> None:
 
 
 def read_file(path: Path) -> bytes:
-    """All bytes of a regular file. Raises DataError."""
+    """Reads all bytes of a regular file. Raises DataError."""
     try:
         check_regular(path)
         return path.read_bytes()
@@ -72,7 +72,7 @@ def read_file(path: Path) -> bytes:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The JSON object in a file."""
+    """Reads the JSON object in a file. Raises DataError."""
     raw = read_file(path)
     try:
         value = json.loads(raw.decode("utf-8"))
@@ -86,7 +86,7 @@ def read_json(path: Path) -> dict[str, Any]:
 
 
 def read_npy(raw: bytes, where: str) -> np.ndarray:
-    """The numbers in the bytes of a .npy file, of any shape."""
+    """Parses the bytes of a .npy file: numbers in an array of any shape. Raises DataError."""
     try:
         found = np.load(io.BytesIO(raw), allow_pickle=False)
     except Exception:  # numpy parses the header as Python, which raises errors of many kinds
@@ -97,7 +97,7 @@ def read_npy(raw: bytes, where: str) -> np.ndarray:
 
 
 def number(value: Any, where: str, *, positive: bool = False, largest: float = LARGEST) -> float:
-    """`value` as a float of at most `largest` in magnitude (greater than zero if `positive`)."""
+    """`value` as a float of at most `largest` in magnitude, and > 0 if `positive`. Raises DataError."""
     expected = "a number" + (" > 0" if positive else "")
     if isinstance(value, bool) or not isinstance(value, (int, float)):
         raise DataError(f"{where} is {one_line(repr(value), 60)}, expected {expected}")
@@ -107,7 +107,7 @@ def number(value: Any, where: str, *, positive: bool = False, largest: float = L
 
 
 def whole_number(value: Any, where: str, low: int = 0, largest: float = LARGEST) -> int:
-    """`value` as an integer >= low; 2.0 is one."""
+    """`value` as an integer >= low; 2.0 is one. Raises DataError."""
     result = number(value, where, largest=largest)
     if result != int(result) or result < low:
         raise DataError(f"{where} is {result:g}, expected a whole number >= {low}")
@@ -115,7 +115,7 @@ def whole_number(value: Any, where: str, low: int = 0, largest: float = LARGEST)
 
 
 def array(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
-    """`value` as a float64 array of the given shape, its numbers at most LARGEST in magnitude."""
+    """`value` as a float64 array of the given shape. Raises DataError, also for numbers beyond LARGEST in magnitude."""
     if value is None:
         raise DataError(f"{where} is missing, expected an array of shape {shape}")
     try:
@@ -133,9 +133,9 @@ def array(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
 def split_options(
     text: str, source: str, value: Callable[[str, str], Any], examples: Mapping[str, str]
 ) -> tuple[str, dict[str, Any]]:
-    """NAME and the options of `NAME?key=value&key=value`, whose keys are those of `examples`.
+    """Splits `NAME?key=value&key=value` into NAME and its options, whose keys must be in `examples`.
 
-    value: (key, text) -> value, or ValueError. Raises DataError that begins with `source` and shows the key's example.
+    value: parses (key, text) or raises ValueError. Raises DataError, which names `source` and shows the key's example.
     """
     name, _, query = text.partition("?")
     values: dict[str, Any] = {}
@@ -155,8 +155,8 @@ def split_options(
 
 
 def inside(folder: Path, name: str) -> Path:
-    """The path of `name`, as a file of a dataset gives it, in `folder`. Raises DataError if it leads out of it, also by
-    a link; it need not exist."""
+    """The path in `folder` of `name`, which a file of the dataset gives; it need not exist. Raises DataError if the
+    path leads out of `folder`, also through a link."""
     path = folder / name
     with contextlib.suppress(OSError, ValueError, RuntimeError):  # a NUL, a circle of links, a name that is too long
         if folder.resolve() in path.resolve().parents:
@@ -165,13 +165,13 @@ def inside(folder: Path, name: str) -> Path:
 
 
 def last_numbers(paths: Iterable[Path]) -> list[int] | None:
-    """The last number in each name without its suffix, None if a name has none."""
+    """The last number in each file name without suffix; None if any name has none."""
     found = [re.findall(r"\d{1,15}", path.stem) for path in paths]
     return [int(numbers[-1]) for numbers in found] if all(found) else None
 
 
 def find_image(folder: Path, name: str) -> Path:
-    """The image file of a `file_path` written with or without its extension."""
+    """The image file of a `file_path` written with or without its extension. Raises DataError if it is missing."""
     for suffix in IMAGE_SUFFIXES:
         path = inside(folder, name + suffix)
         with contextlib.suppress(OSError):  # a name too long for the system
@@ -181,17 +181,17 @@ def find_image(folder: Path, name: str) -> Path:
 
 
 def check_pixels(count: int, files: Iterable[Path], where: str) -> None:
-    """Raises DataError for pictures of more pixels than files of this size hold: a few kB can unpack to gigabytes."""
+    """Raises DataError for pictures of more pixels than files of their size hold: a few kB can unpack to gigabytes."""
     try:
         held = FREE_PIXELS + PIXELS_PER_BYTE * sum(file.stat().st_size for file in files)
     except OSError:
-        return  # whoever reads the file says why it cannot be read
+        return  # reading the file reports the error
     if count > held:
         raise DataError(f"{where}: {count:,} pixels, expected {held:,} at most in pictures of so few bytes")
 
 
 def _open(path: Path, what: str = "image", size: tuple[int, int] | None = None) -> Picture:
-    """The picture in a file, its pixels not decoded yet. size: the (W, H) to expect."""
+    """Opens a picture without decoding its pixels. size: the expected (W, H). Raises DataError."""
     from PIL import Image  # of the extra `train`
 
     try:
@@ -227,7 +227,7 @@ def _has_alpha(image: Picture) -> bool:
 
 
 def _check_readable(image: Picture, where: str) -> None:
-    """Refuses pictures that Pillow would not show as their makers saw them."""
+    """Raises DataError for pictures that Pillow would not decode as their makers saw them."""
     found = None
     if getattr(image, "is_animated", False):  # Pillow takes quadratic time to count the pictures of a TIFF file
         found = "holds several pictures, expected one"
@@ -245,7 +245,7 @@ def _check_readable(image: Picture, where: str) -> None:
 
 
 def _srgb(image: Picture, where: str) -> Picture:
-    """The picture with its colour profile, if it names one, applied."""
+    """Converts the picture to sRGB if its colour profile is another one."""
     profile = image.info.get("icc_profile")
     if not profile:
         return image
@@ -309,7 +309,7 @@ def read_mask(path: Path, size: tuple[int, int], *, downscale: int = 1) -> np.nd
 
 
 def check_downscale(size: tuple[int, int], downscale: int, where: str) -> None:
-    """Refuse a downscale that leaves no pixel."""
+    """Raises DataError for a downscale that leaves no pixel."""
     if min(size) // downscale < 1:
         raise DataError(f"{where}: downscale {downscale} leaves nothing of {size[0]}x{size[1]} pixels")
 
@@ -339,11 +339,11 @@ SCALARS = {
     "double": "<f8", "float64": "<f8",
 }  # fmt: skip
 END = b"end_header"
-DIGITS = 12  #: of a count; Python itself refuses to read thousands
+DIGITS = 12  #: of a count; Python refuses to parse thousands
 
 
 def _header(path: Path, raw: bytes) -> tuple[str, int, np.dtype, int]:
-    """Format, vertex count, vertex properties, and the place of the body."""
+    """(format, vertex count, dtype of a vertex, byte at which the body starts). Raises DataError."""
     stop = raw.find(END)
     if not raw.startswith(b"ply") or stop < 0:
         raise DataError(f"{path}: not a PLY file (expected it to start with 'ply' and hold an end_header line)")
@@ -400,13 +400,13 @@ def read_vertices(path: Path, raw: bytes | None = None) -> np.ndarray:
 
 
 def read_only_ply(folder: Path) -> np.ndarray | None:
-    """`read_ply` of the PLY file of a folder that holds exactly one, else None."""
+    """`read_ply` of the only PLY file in a folder; None if there is none or more than one."""
     found = list(folder.glob("*.ply"))
     return read_ply(found[0]) if len(found) == 1 else None
 
 
 def read_ply(path: Path) -> np.ndarray:
-    """Points float32 [M, 3], without those that are not finite or beyond LARGEST."""
+    """Points float32 [M, 3], without points that are not finite or beyond LARGEST."""
     vertices = read_vertices(path)
     points = np.stack([vertices[c] for c in "xyz"], axis=1)
     return np.asarray(points[(np.abs(points) <= LARGEST).all(axis=1)], np.float32)  # without NaN, too

@@ -143,7 +143,7 @@ def read_cameras(folder: str | Path) -> CameraFiles:
 
 
 def read_iphone(folder: Path, downscale: int, holdout: int, background: Color | None) -> Dataset:
-    """Reads rgb/{factor}x (see `dataset.load`). The split files decide, whatever `holdout` is."""
+    """Reads rgb/{factor}x (see `dataset.load`). The dataset's split decides, and `holdout` is ignored."""
     files = read_cameras(folder)
     frames = [*files.train, *files.test]
     box, depth = _box_and_depth(files, frames, folder)
@@ -173,7 +173,7 @@ def read_iphone(folder: Path, downscale: int, holdout: int, background: Color | 
 def _box_and_depth(
     files: CameraFiles, frames: list[UnreadView], folder: Path
 ) -> tuple[np.ndarray, tuple[float, float] | None]:
-    """The scene box, and near and far of scene.json, which are in scene units."""
+    """The scene box, and (near, far) of scene.json, scene units, or None."""
     box = cameras_box(frames) if files.points is None else points_box(files.points)
     if files.extra.get("bbox") is not None:
         where = f"{folder / 'extra.json'}: bbox"

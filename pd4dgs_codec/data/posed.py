@@ -1,4 +1,4 @@
-"""From frames with poses to a dataset: split, times, scene box, depth range and background, for all readers."""
+"""Makes a dataset of posed frames, for all readers: split, times, scene box, depth range and background."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,13 +11,13 @@ from pd4dgs_codec.data.files import WHITE, Color, check_pixels, image_info
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError
 
-#: Files hold the first and the last time as binary32; their difference may change by this share of itself.
+#: Files hold the first and the last time as binary32; their difference may change by SPAN_TOLERANCE.
 LARGEST_TIME, SPAN_TOLERANCE = float(np.finfo(np.float32).max), 1e-3
 #: Half the side of D-NeRF's box of initial points (1.3) over the distance of its cameras (4).
 BOX_OVER_DISTANCE = 1.3 / 4.0
 #: A border is one colour if this share of it lies within this many 8-bit levels of its median.
 BORDER_SHARE, BORDER_LEVELS = 0.99, 3
-USES = 4  #: of a picture, such as for training and for testing
+USES = 4  #: of a picture at most, such as for training and for testing
 T = TypeVar("T")
 Posed = TypeVar("Posed", UnreadView, View)
 
@@ -51,9 +51,9 @@ def posed_dataset(
 ) -> Dataset:
     """The dataset of these frames.
 
-    points: float32 [M, 3], or None. depth: near and far, box: float32 [2, 3], if known.
-    background: what lies behind pictures with alpha, None for white; without alpha it is the colour of the images'
-    border. composite: False drops alpha (photographs), and `background` is the scene's, None for the border's colour.
+    points: float32 [M, 3], or None. depth: near and far, box: float32 [2, 3], if known. background: RGB 0..1 behind
+    pictures with alpha, None for white; if the first one has no alpha, the colour of the images' border is the scene's
+    background. composite: False drops alpha (photographs); `background` is the scene's, None for the border's colour.
     """
     frames, under = [*train, *test], (background or WHITE) if composite else None
     files = {frame.image for frame in frames}
@@ -81,7 +81,7 @@ def geometry(
     depth: tuple[float, float] | None,
     box: np.ndarray | None = None,
 ) -> dict[str, Any]:
-    """The fields of a Dataset that follow from its frames and points, see `posed_dataset`; none is masked."""
+    """The fields of a Dataset that follow from its frames and points, see `posed_dataset`."""
     if points is not None and not len(points):
         points = None
     if box is None:
@@ -123,7 +123,7 @@ def normalised_times(raw: Sequence[float], where: str) -> tuple[list[float], flo
 def seconds_range(start: float, stop: float) -> tuple[float, float]:
     """Seconds at normalised time 0 and 1 of a scene from start to stop; (0, 1) if they are equal.
 
-    Files hold both as binary32. A span that would be lost behind a large start, such as the time of day, begins at 0.
+    Files hold both as binary32. A span that a large start, such as the time of day, would round away begins at 0.
     """
     span = stop - start
     with np.errstate(over="ignore"):
@@ -136,7 +136,7 @@ def seconds_range(start: float, stop: float) -> tuple[float, float]:
 def points_box(points: np.ndarray) -> np.ndarray:
     """float32 [2, 3]: the 0.5th to the 99.5th percentile of the points, padded by 10 % of the extent on each side.
 
-    The percentiles keep stray triangulations out; the padding makes room for moving things, which have no points.
+    The percentiles keep stray triangulations out; the padding makes room for moving objects, which have no points.
     """
     low, high = np.percentile(points.astype(np.float64), [0.5, 99.5], axis=0)
     pad = np.maximum(0.1 * (high - low), 0.01 * max(float((high - low).max()), 1e-6))

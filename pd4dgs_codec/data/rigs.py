@@ -37,8 +37,8 @@ def read_neu3d(folder: Path, downscale: int, holdout: int, background: Color | N
     """Reads LLFF's poses_bounds.npy with a synchronised video `cam*.mp4` per camera (see `dataset.load`).
 
     Row i belongs to the i-th video by name: three rows of [R | t | (height, width, focal)], the columns of R pointing
-    down, right and backwards in the world; then the nearest and the farthest depth. The first camera is held out, none
-    for holdout 0.
+    down, right and backwards in the world; then the nearest and the farthest depth. The first camera is held out
+    unless holdout is 0.
     """
     videos, poses = sorted(folder.glob("cam*.mp4")), _poses(folder / POSES)
     if len(videos) != len(poses):
@@ -50,7 +50,7 @@ def read_neu3d(folder: Path, downscale: int, holdout: int, background: Color | N
 
 
 def _poses(path: Path) -> np.ndarray:
-    """float64 [cameras, 17]."""
+    """Reads float64 [cameras, 17]. Raises DataError."""
     poses = read_npy(read_file(path), str(path))
     fits = poses.ndim == 2 and poses.shape[1] == 17 and 1 <= len(poses) <= MAX_CAMERAS
     if not fits or not (np.abs(poses) <= LARGEST).all():  # also true of NaN
@@ -84,7 +84,7 @@ def read_panoptic(folder: Path, downscale: int, holdout: int, background: Color 
 
     The meta files hold `w` and `h` and, by instant and camera, `k` (3x3), `w2c` (4x4, OpenCV axes), `fn` (a picture in
     ims/) and `cam_id`; init_pt_cld.npz may hold `data`: rows of x y z r g b and more. Without test_meta.json the first
-    camera is held out, none for holdout 0.
+    camera is held out, unless holdout is 0.
     """
     train = _panoptic_frames(folder, folder / META)
     if (folder / TEST_META).is_file():

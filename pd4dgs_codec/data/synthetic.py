@@ -1,8 +1,8 @@
-"""`synthetic:NAME[?seed=n&size=WxH&frames=N&path=pass|sweeps|jump]`: ray-cast dynamic scenes; `bodies` has their names.
+"""`synthetic:NAME[?seed=n&size=WxH&frames=N&path=pass|sweeps|jump]`: ray-cast dynamic scenes, named in `bodies`.
 
 In a room one camera moves along an arc (60 training frames); two fixed cameras off that arc give the test views, with
 exact covisibility masks. On white the camera jumps on the upper hemisphere, as D-NeRF's does (150 frames without
-points); two cameras that stand still see all instants. Another size keeps the vertical field of view; more frames
+points); two fixed cameras see all instants. Another size keeps the vertical field of view; more frames
 repeat the same motion more densely. The content depends on the source string alone.
 """
 
@@ -32,8 +32,8 @@ EXAMPLES = {
     "frames": f"frames=300, {FRAMES[0]} to {FRAMES[-1]}",
     "path": "path=pass, sweeps or jump",
 }
-#: How often the camera goes to and fro; None: it is at a random place at each instant. If it passes each place once,
-#: place and time are the same, and a static scene with a view-dependent look explains every motion.
+#: Cycles of the camera along its path; None: it is at a random place at each instant. If it passes each place once,
+#: the place determines the time, and a static scene with view-dependent colours explains every motion.
 PATHS = {"pass": 0.5, "sweeps": 2.5, "jump": None}
 NEAR, FAR = 0.5, 12.0
 POINTS = 5000
@@ -53,13 +53,13 @@ ROOM_TARGET = np.array([0.0, 0.1, 0.5])
 
 
 def room_viewmat(phase: float, s: float) -> np.ndarray:
-    """The moving camera in the room after `phase` times to and fro; s 0..1 decides height and distance."""
+    """The viewmat of the moving camera in the room after `phase` cycles; s 0..1 decides height and distance."""
     azimuth = 40 * np.sin(2 * np.pi * phase - np.pi / 2)
     return _look(ROOM_TARGET, np.radians(azimuth), 3.9 + 0.15 * np.cos(7 * s), 1.15 + 0.2 * np.sin(9 * s))
 
 
 def white_viewmat(phase: float, s: float) -> np.ndarray:
-    """The camera after `phase` turns around a scene on white, at D-NeRF's distance; s 0..1 is evenly spread over the
+    """The viewmat after `phase` turns around a scene on white, at D-NeRF's distance; s 0..1 is evenly spread over the
     upper hemisphere without its pole."""
     z = 0.05 + 0.9 * s
     return _look(np.zeros(3), 2 * np.pi * phase, 4 * np.sqrt(1 - z * z), 4 * z)
@@ -67,11 +67,11 @@ def white_viewmat(phase: float, s: float) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Stage:
-    """What the scenes of one kind have in common.
+    """The settings that the scenes of one kind share.
 
-    viewmat: of the moving camera, from the phase of its path and s 0..1. fixed: viewmats of the test cameras.
-    instants: about so many test views of each of them; 0 for all. capture: whether there are covisibility masks and
-    initial points.
+    viewmat: the moving camera's, by the phase of its path and s 0..1. fixed: viewmats of the test cameras.
+    instants: about how many test views each test camera has; 0: one per instant. capture: whether there are
+    covisibility masks and initial points.
     """
 
     lens: Lens
@@ -137,7 +137,7 @@ class Take:
         return [i / (self.frames - 1) for i in range(self.frames)]
 
     def viewmats(self) -> list[np.ndarray]:
-        """Those of the training frames."""
+        """The viewmats of the training frames."""
         turns = PATHS[self.path]
         if turns is not None:
             return [self.stage.viewmat(turns * t, t) for t in self.times]
@@ -193,7 +193,7 @@ def _render(bodies: list[Body], viewmat: np.ndarray, t: float, lens: Lens, backg
 
 
 def _surface(bodies: list[Body], viewmat: np.ndarray, t: float, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
-    """Of the surface behind each pixel centre: body index [n], and material point [3, n], for the sky its direction."""
+    """(body index [n], material point [3, n]) of the surface behind each pixel centre; for the sky, the direction."""
     eye, (xs, ys) = Eye(place(bodies, t), viewmat), _grid(lens)
     depth, index = (a.ravel() for a in eye.first_hits(xs, ys))
     x, y = (a.ravel() for a in np.meshgrid(xs, ys))
@@ -286,7 +286,7 @@ def _dataset(take: Take) -> Dataset:
 
 
 def read_synthetic(source: str, downscale: int = 1) -> Dataset:
-    """The scene named by `source`; rendered once per process and kept in memory."""
+    """The scene that `source` names, rendered once per process and kept in memory."""
     take = parse(source)
     check_downscale(take.size, downscale, source)
     full = _dataset(take)

@@ -63,7 +63,7 @@ def _focal(get: Callable[[str], Any], axis: str, size: int, where: str) -> float
 
 
 def _lens(file: dict[str, Any], frame: dict[str, Any], size: Callable[[], tuple[int, int]], where: str) -> Lens:
-    """Intrinsics of one frame; its own keys go before the file's. size: of its image, as (width, height)."""
+    """Intrinsics of one frame; its own keys override the file's. size: of its image, as (width, height)."""
 
     def get(key: str) -> Any:
         return frame.get(key, file.get(key))
@@ -139,7 +139,7 @@ def _stored_depth(folder: Path, file: dict[str, Any]) -> tuple[float, float] | N
 
 
 def read_transforms(folder: Path, downscale: int, holdout: int, background: Color | None) -> Dataset:
-    """Reads a folder with transforms*.json (see `dataset.load`); a test or val file decides before `holdout`."""
+    """Reads a folder with transforms*.json (see `dataset.load`); a test or val file overrides `holdout`."""
     train_file, test_file = _choose(folder)
     frames, file = _frames(folder, train_file)
     train, test = held_out(frames, holdout) if test_file is None else (frames, _frames(folder, test_file)[0])

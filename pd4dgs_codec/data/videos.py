@@ -1,8 +1,8 @@
 """Videos: decoding by the ffmpeg of imageio-ffmpeg, a cache of decoded frames, and datasets of synchronised videos.
 
-The cache keeps each frame without loss, readable without the others: differences between neighbours in a row,
-compressed by zstd. It lies in the folder that PD4DGS_CACHE names, else in ~/.cache/pd4dgs-frames, and holds up to
-PD4DGS_CACHE_GIB (default 20); the videos that were used least recently leave first.
+The cache stores each frame losslessly and on its own: differences between neighbours in a row, compressed by zstd. Its
+folder is PD4DGS_CACHE, by default ~/.cache/pd4dgs-frames. It holds up to PD4DGS_CACHE_GIB (default 20) and removes the
+least recently used videos first.
 """
 
 import errno
@@ -31,11 +31,11 @@ from pd4dgs_codec.io import temporary_folder
 
 #: Largest width or height, and frames per second: beyond them the header is wrong.
 MAX_SIDE, MAX_FPS = 16_384, 10_000.0
-#: A damaged video is short if it lacks this share of the frames that its header speaks of, and one more.
+#: A damaged video is refused if it lacks more than this share of the frames that its header promises, and one.
 SHORT = 0.01
 LAST_BYTES = 4096  #: of ffmpeg's errors that are read
 FOLDER, SIZE, DEFAULT_GIB = "PD4DGS_CACHE", "PD4DGS_CACHE_GIB", 20.0
-#: Of the layout of cache files: frames, the index as JSON, and the length of the index in LENGTH bytes.
+#: Version of the layout of cache files: frames, the index as JSON, and the length of the index in LENGTH bytes.
 VERSION, LENGTH = 2, 8
 ZSTD_LEVEL = 1  #: higher levels gain little on pictures
 #: Cache files that this process reads from; they are not removed.
@@ -49,8 +49,8 @@ _IN_USE: set[Path] = set()
 class Video:
     """An open video.
 
-    size: (width, height) as displayed, after the rotation in its header. fps: frames per second. pictures: uint8
-    [height, width, 3], or [height, width] in grey, once.
+    size: (width, height) as displayed, after the rotation in its header. fps: frames per second. pictures: iterates
+    once over uint8 [height, width, 3], or [height, width] in grey.
     """
 
     path: Path
@@ -62,21 +62,21 @@ class Video:
 def open_video(path: Path, *, grey: bool = False, output: Sequence[str] = ()) -> Video:
     """Opens a video without decoding a frame. output: further options of ffmpeg, such as a filter.
 
-    Raises DataError of one line if it cannot be opened, and so do the pictures if they cannot be decoded, or end before
-    the frames that the header speaks of. Other damage is a warning.
+    Raises DataError if it cannot be opened. Iterating over its pictures raises DataError if they cannot be decoded, or
+    if far fewer come than the header promises. Other damage causes a DamageWarning.
     """
     if not path.exists():
         raise DataError(f"{path}: found no file, expected a video")
     check_regular(path)
     from imageio_ffmpeg import read_frames  # of the extra `train`
 
-    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)  # else it warns of rotated and scaled ones
+    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)  # else it warns of rotated and scaled videos
     reader = read_frames(str(path), output_params=list(output))
     try:
         with closing(reader):
             meta: dict[str, Any] = next(reader, {})
         (width, height), fps, seconds = meta["size"], float(meta["fps"]), float(meta["duration"])
-    except Exception as error:  # of many kinds, with all that ffmpeg prints of a header; its last line names the cause
+    except Exception as error:  # of any type, with all that ffmpeg prints; the last line names the cause
         said = str(error).strip().rpartition("\n")[2]
         raise DataError(f"{path}: cannot be decoded: {one_line(said, 120)}") from None
     if not (1 <= min(width, height) <= max(width, height) <= MAX_SIDE and 0 < fps < MAX_FPS):
@@ -93,7 +93,7 @@ def video_size(path: Path) -> tuple[int, int]:
 
 
 def _pictures(path: Path, shape: tuple[int, ...], output: Sequence[str], promised: float) -> Iterator[np.ndarray]:
-    """promised: the frames that the header speaks of, about; 0 if it does not say."""
+    """Decodes the pictures. promised: about how many frames the header promises; 0 if unknown."""
     pixels, size, count = "gray" if len(shape) == 2 else "rgb24", math.prod(shape), 0
     arguments = ["-i", str(path), "-pix_fmt", pixels, *output, "-f", "rawvideo", "-"]
     with ffmpeg(arguments, stdout=subprocess.PIPE) as run:
@@ -117,7 +117,7 @@ class Ffmpeg:
     errors: IO[bytes]
 
     def end(self) -> tuple[int, str]:
-        """Waits for its end: (its exit code, the last error that it wrote, if any)."""
+        """Waits for its end. Returns (exit code, the last error that it wrote, or an empty string)."""
         code = self.process.wait()
         self.errors.seek(max(0, self.errors.seek(0, os.SEEK_END) - LAST_BYTES))
         lines = self.errors.read().decode("utf-8", "replace").strip().splitlines()
@@ -143,7 +143,7 @@ def ffmpeg(arguments: Sequence[str], **pipes: Any) -> Iterator[Ffmpeg]:
 
 @dataclass(frozen=True, eq=False)
 class StoredFrames:
-    """The frames of a video in the cache. offsets: n + 1 bytes in the file; shape: of each frame."""
+    """The frames of a video in the cache. offsets: n + 1 offsets in the file, bytes. shape: of each frame."""
 
     path: Path
     offsets: Sequence[int]
@@ -154,7 +154,7 @@ class StoredFrames:
         return len(self.offsets) - 1
 
     def read(self, index: int) -> np.ndarray:
-        """uint8 [H, W, 3] of one frame. Raises DataError if its file has left the cache."""
+        """Reads a frame, uint8 [H, W, 3]. Raises DataError if its file is missing or broken."""
         import zstandard
 
         start, stop = self.offsets[index : index + 2]
@@ -188,8 +188,8 @@ class StoredView(View):
 def stored_frames(path: Path, how: str, treat: Callable[[np.ndarray], np.ndarray]) -> StoredFrames:
     """The frames of a video after `treat`, decoded now unless the cache has them.
 
-    how: tells different functions `treat` apart. Raises DataError for a video that cannot be decoded or holds no frame,
-    and if the cache has no room.
+    how: identifies `treat` in the cache. Raises DataError for a video that cannot be decoded or holds no frame, and if
+    the cache has no room.
     """
     folder = Path(os.environ.get(FOLDER) or Path.home() / ".cache" / "pd4dgs-frames")
     try:
@@ -268,7 +268,7 @@ def _limit() -> float:
 
 
 def _make_room(cache: Path, limit: float) -> int:
-    """Removes the least recently used files, until the others take `limit` bytes or are in use; bytes of the others."""
+    """Removes the least recently used files until the rest takes `limit` bytes or is in use. Returns its bytes."""
     files = sorted(cache.glob("*.frames"), key=lambda file: file.stat().st_mtime)
     total = sum(file.stat().st_size for file in files)
     for file in files:
@@ -289,9 +289,9 @@ def synchronised_dataset(
     holdout: int,
     depth: tuple[float, float] | None = None,
 ) -> Dataset:
-    """The dataset of cameras that stand still, each with its video as its image.
+    """The dataset of fixed cameras, each with its video as `image`.
 
-    The first camera is held out, none for holdout 0. depth: near and far, if known.
+    The first camera is held out, unless holdout is 0. depth: near and far, if known.
     """
     views: list[StoredView] = []
     count, fps = 0, 0.0

@@ -1,1 +1,1 @@
-"""From a recording to a folder that can be trained on: frames, camera poses, a report."""
+"""Makes a folder to train on from a recording: frames, camera poses, a report."""

@@ -18,7 +18,7 @@ Progress = Callable[[int | None, str, str], AbstractContextManager[Advance]]
 
 #: Largest width at which sharpness and change are measured, pixels.
 LOOK_WIDTH = 640
-#: A frame is blurred below this share of the median sharpness of this many frames on either side.
+#: A frame is blurred if its sharpness is below BLURRED times the median of AROUND frames on either side.
 BLURRED, AROUND = 0.4, 15
 #: A frame repeats the one before if their mean difference is below this, 8-bit levels. Video coding causes less.
 SAME = 0.3
@@ -59,13 +59,13 @@ class VideoFile:
         self.path, self.size, self.fps = path, video.size, video.fps
 
     def looks(self) -> Iterator[np.ndarray]:
-        """Every frame, small and grey, uint8 [h, w]."""
+        """Yields every frame, small and grey, uint8 [h, w]."""
         width = min(self.size[0], LOOK_WIDTH)
         scale = f"scale={width}:{max(1, round(self.size[1] * width / self.size[0]))}:flags=area"
         return open_video(self.path, grey=True, output=self._filters(f",{scale}")).pictures
 
     def pictures(self, indices: Sequence[int]) -> Iterator[np.ndarray]:
-        """uint8 [H, W, 3] of these frames. indices: ascending."""
+        """Yields uint8 [H, W, 3] of these frames. indices: ascending."""
         wanted = set(indices)
         for k, picture in enumerate(open_video(self.path, output=self._filters()).pictures):
             if k in wanted:
@@ -74,11 +74,11 @@ class VideoFile:
                 return
 
     def time(self, index: int) -> float:
-        """Seconds of a frame."""
+        """The time of a frame, seconds."""
         return index / self.fps
 
     def _filters(self, more: str = "") -> list[str]:
-        """The frames nearest in time: cfr of ffmpeg may be more than a frame late."""
+        """Options that select the frames nearest in time: ffmpeg's cfr may be more than a frame late."""
         return ["-vf", f"fps={self.fps:.6f}{more}", "-fps_mode", "passthrough"]
 
 
@@ -102,12 +102,12 @@ class FrameFolder:
             yield read_image(file, self.size, downscale=k).mean(axis=2).astype(np.uint8)
 
     def pictures(self, indices: Sequence[int]) -> Iterator[np.ndarray]:
-        """uint8 [H, W, 3] of these frames."""
+        """Yields uint8 [H, W, 3] of these frames."""
         for k in indices:
             yield read_image(self.files[k], self.size)
 
     def time(self, index: int) -> float:
-        """Seconds of a frame after the first one."""
+        """The time of a frame after the first one, seconds."""
         return (self.places[index] - self.places[0]) / self.fps
 
 
@@ -115,7 +115,7 @@ Recording = VideoFile | FrameFolder
 
 
 def open_recording(path: Path, fps: float) -> Recording:
-    """A video, or a folder of frames at `fps` per second. Raises DataError for anything else."""
+    """Opens a video, or a folder of frames at `fps` per second. Raises DataError for anything else."""
     if path.is_dir():
         return FrameFolder(path, fps)
     if not path.exists():
@@ -124,7 +124,7 @@ def open_recording(path: Path, fps: float) -> Recording:
 
 
 def look(recording: Recording, advance: Advance) -> list[Look]:
-    """Measures every frame."""
+    """Measures every frame. Raises DataError for too few or too many."""
     looks: list[Look] = []
     before: np.ndarray | None = None
     for index, small in enumerate(recording.looks()):
@@ -150,7 +150,7 @@ def sharpness(picture: np.ndarray) -> float:
 
 
 def choose(looks: Sequence[Look], count: int) -> Choice:
-    """The sharpest frame of each of `count` equal stretches of time; all usable frames for count 0."""
+    """Chooses the sharpest usable frame of each of `count` equal stretches; all usable frames for count 0."""
     sharp = np.array([frame.sharpness for frame in looks])
     usual = np.array([np.median(sharp[max(0, i - AROUND) : i + AROUND + 1]) for i in range(len(sharp))])
     is_blurred = sharp < BLURRED * usual

@@ -1,5 +1,5 @@
 """Camera poses by COLMAP's incremental mapping (Schönberger and Frahm, CVPR 2016), through pycolmap, and the features
-on moving things, found by epipolar residuals.
+on moving objects, found by epipolar residuals.
 
 Every step resumes from the contents of its database after an interruption. Residuals need no learnt weights, but miss
 motion along the epipolar line.
@@ -26,11 +26,11 @@ BATCH, PAIRS_BATCH = 4, 50
 MOST_PIXELS, MOST_FEATURES = 1600, 2048
 #: Each frame is matched with the NEAR next ones and those at powers of two; every EVERY-th with all other such frames.
 NEAR, EVERY = 4, 10
-#: All frames are adjusted anew whenever there are so many times more of them, and this often.
+#: Growth of the model at which all frames are adjusted again, and the most refinements of an adjustment.
 GROWTH, ROUNDS = 1.5, 2
 #: The camera stands still if no pair's features are farther apart than this, pixels of a picture 1000 wide.
 STILL = 5.0
-#: CPU seconds of a megapixel of a frame, of a frame, and of a pair, with the most features: other pictures take less.
+#: CPU seconds per megapixel, per frame and per pair of frames, with MOST_FEATURES; fewer features take less.
 MEGAPIXEL_SECONDS, FRAME_SECONDS, PAIR_SECONDS = 2.3, 1.0, 0.11
 #: A model must hold this share of the frames.
 LEAST_SHARE = 0.5
@@ -39,14 +39,14 @@ SEED = 0
 OFF = 4.0
 #: A feature moves if this share of its matches is off; it needs so many matches.
 LEAST_MATCHES, MOVING_SHARE = 3, 0.6
-#: Features within this share of the picture's width vote as well.
+#: Features within this share of the picture's width vote on whether one moves.
 REACH = 0.03
 
 
 def colmap() -> Any:
-    """pycolmap, without its log and with a fixed seed. Raises DataError if it is not installed."""
+    """Imports pycolmap, with its log off and a fixed seed. Raises DataError if it is not installed."""
     module = required("pycolmap", "prepare", "camera poses")
-    for number in ENDING:  # its C++ prints a stack where SIGTERM comes
+    for number in ENDING:  # its C++ would print a stack trace at SIGTERM
         if (handler := signal.getsignal(number)) is not None:
             signal.signal(number, handler)
     module.logging.minloglevel = int(module.logging.Level.FATAL)
@@ -62,14 +62,14 @@ def pairs(count: int) -> list[tuple[int, int]]:
 
 
 def estimate(count: int, size: tuple[int, int], threads: int) -> float:
-    """Seconds that the poses of so many frames of (width, height) pixels take at most, about."""
+    """About the longest time, seconds, that the poses of `count` frames of `size` (width, height) take."""
     megapixels = size[0] * size[1] / 1e6 * min(1.0, MOST_PIXELS / max(size)) ** 2
     work = count * (MEGAPIXEL_SECONDS * megapixels + FRAME_SECONDS) + len(pairs(count)) * PAIR_SECONDS
     return work / threads
 
 
 def extract(database: Path, images: Path, names: Sequence[str], model: str, threads: int, advance: Advance) -> None:
-    """Features of every picture; all are of one camera, of this model."""
+    """Extracts the features of every picture. All pictures share one camera, of COLMAP's camera model `model`."""
     pycolmap = colmap()
     options = pycolmap.FeatureExtractionOptions()
     options.use_gpu, options.num_threads, options.max_image_size = False, threads, MOST_PIXELS
@@ -113,7 +113,7 @@ def match(database: Path, names: Sequence[str], listed: Sequence[tuple[int, int]
 
 
 def reconstruct(database: Path, images: Path, folder: Path, threads: int, advance: Advance) -> Any | None:
-    """The largest model that incremental mapping finds, a pycolmap.Reconstruction; None if it finds none."""
+    """The largest model of incremental mapping, a pycolmap.Reconstruction, or None. Raises DataError if it fails."""
     pycolmap = colmap()
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = threads, SEED
@@ -129,13 +129,13 @@ def reconstruct(database: Path, images: Path, folder: Path, threads: int, advanc
 
 
 def write(model: Any, folder: Path) -> None:
-    """Writes a model into a folder. Raises DataError unless it can be read again: COLMAP does not say when a disk is
-    full."""
+    """Writes a model into a folder. Raises DataError unless it can be read again, since COLMAP does not report a full
+    disk."""
     folder.mkdir(parents=True, exist_ok=True)
     model.write(folder)
     try:
         found = colmap().Reconstruction(folder).num_points3D()
-    except Exception:  # of pycolmap's own kinds
+    except Exception:  # pycolmap raises its own types
         found = -1
     if found != model.num_points3D():
         raise DataError(f"{folder}: the model could not be written whole; expected room on the disk")
@@ -152,7 +152,7 @@ def upright(model: Any) -> None:
         return
     down /= np.linalg.norm(down)
     ahead -= down * (down @ ahead)
-    if np.linalg.norm(ahead) < 1e-6:  # all around: any direction will do
+    if np.linalg.norm(ahead) < 1e-6:  # the views face all around: any direction will do
         ahead = np.cross(down, np.eye(3)[np.argmin(np.abs(down))])
     ahead /= np.linalg.norm(ahead)
     rotation = np.stack([np.cross(down, ahead), down, ahead])
@@ -161,7 +161,7 @@ def upright(model: Any) -> None:
 
 
 def moving_features(database: Path, model: Any) -> dict[str, Verdicts]:
-    """The counts of matches for the features of each picture with a pose."""
+    """By name of each picture with a pose, the match counts of its features."""
     pycolmap = colmap()
     verdicts, normalised, poses = {}, {}, {}
     camera = next(iter(model.cameras.values()))
@@ -178,7 +178,7 @@ def moving_features(database: Path, model: Any) -> dict[str, Verdicts]:
 
 
 def leave_out(model: Any, moving: Mapping[str, np.ndarray]) -> None:
-    """Removes these features, bool [n] by picture, from the model, and adjusts what is left."""
+    """Removes the features `moving`, bool [n] by picture name, from the model, and adjusts the rest."""
     pycolmap = colmap()
     for image in list(model.images.values()):
         for index in np.flatnonzero(moving.get(image.name, ())):
@@ -194,8 +194,8 @@ def leave_out(model: Any, moving: Mapping[str, np.ndarray]) -> None:
 
 
 def travel(database: Path) -> float:
-    """How far features are apart in two pictures, the median over those of a pair, of the pair with the largest;
-    pixels, -1 without pairs."""
+    """The median distance between the places of matched features in two pictures, pixels, of the pair where it is
+    largest; -1 without pairs."""
     pycolmap, largest = colmap(), -1.0
     with pycolmap.Database.open(database) as stored:
         places = {image.image_id: stored.read_keypoints(image.image_id)[:, :2] for image in stored.read_all_images()}
@@ -213,7 +213,7 @@ def travel(database: Path) -> float:
 
 @dataclass
 class Verdicts:
-    """The features of a picture: places float64 [n, 2], pixels; int64 [n] counts of matches, and of those off."""
+    """The features of a picture. places: float64 [n, 2], pixels. matched, off: int64 [n], matches, and matches off."""
 
     places: np.ndarray
     matched: np.ndarray = field(init=False)
@@ -229,7 +229,7 @@ class Verdicts:
         return np.asarray(self.matched >= LEAST_MATCHES)
 
     def moving(self, width: int) -> np.ndarray:
-        """bool [n]: the majority of the known features within REACH moves."""
+        """bool [n]: most of the known features within REACH move. width: of the picture, pixels."""
         known = self.known
         votes, voters = np.where(self.off >= MOVING_SHARE * self.matched, 1, -1)[known], self.places[known]
         result = np.zeros(len(self.places), bool)

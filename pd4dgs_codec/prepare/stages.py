@@ -1,4 +1,4 @@
-"""`prepare`: from a recording to a folder with pictures, times, a COLMAP model and a report, stage by stage.
+"""`prepare` turns a recording into a folder with pictures, times, a COLMAP model and a report, stage by stage.
 
 Work is done in `FOLDER.partial`, which becomes FOLDER at the end. After an interruption the same call resumes from it;
 a failure removes it.
@@ -47,8 +47,8 @@ POINTS, SHOWN = 2000, 6
 class Choices:
     """Options of `prepare`.
 
-    frames: the most, 0 for all. fps: of a folder of frames. downscale: side of the blocks that pictures are averaged
-    over, pixels. camera: COLMAP's model. threads: -1 for all cores.
+    frames: most frames to choose, 0 for all. fps: of a folder of frames. downscale: side of the blocks over which
+    pictures are averaged, pixels. camera: COLMAP's model. threads: -1 for all cores.
     """
 
     frames: int = 120
@@ -66,8 +66,8 @@ def prepare(
     overwrite: bool = False,
     tell: Callable[[str], None] = lambda line: None,
 ) -> dict[str, Any]:
-    """Writes the folder `output`; returns its report. tell: takes an estimate of the time before the poses are sought.
-    Raises DataError, one line, and leaves nothing, without poses."""
+    """Writes the folder `output` and returns its report. tell: called with a time estimate before the poses.
+    Raises DataError, and leaves nothing behind, if no poses are found."""
     poses.colmap()  # raises now if it is not installed
     check_folder(output, overwrite)
     recording = open_recording(source, choices.fps)
@@ -130,7 +130,7 @@ def _begin(work: Path, source: Path, choices: Choices) -> None:
 def _frames(
     work: Path, recording: Recording, choices: Choices, progress: Progress
 ) -> tuple[list[Look], Choice, dict[str, float]]:
-    """Measurements of all frames, the choice, and seconds by file name; the pictures are in images/."""
+    """Writes the chosen frames to images/ once. Returns (measurements of all frames, choice, seconds by file name)."""
     done = work / "frames.json"
     if done.is_file():
         stored = json.loads(done.read_text())
@@ -154,7 +154,7 @@ def _frames(
 
 
 def _poses(work: Path, times: dict[str, float], choices: Choices, progress: Progress) -> Findings:
-    """The model without moving features, in sparse/0."""
+    """Estimates the poses and writes the model without moving features to sparse/0."""
     names, images, database = sorted(times), work / "images", work / "colmap.db"
     with progress(len(names), "frames", "features") as advance:
         poses.extract(database, images, names, choices.camera, choices.threads, advance)
@@ -174,14 +174,14 @@ def _poses(work: Path, times: dict[str, float], choices: Choices, progress: Prog
 
 
 def _check_moves(travel: float, width: int) -> None:
-    """Raises DataError for a camera on a tripod; without any pair of frames `_checked` tells more."""
+    """Raises DataError for a camera on a tripod; without any pair of frames, `_checked` reports more."""
     if 0 <= travel < poses.STILL * width / 1000:
         found = f"static things are {travel:.1f} pixels apart in two frames at most"
         raise DataError(f"the camera stands still: {found}; expected a camera that walks around them")
 
 
 def _checked(model: Any | None, count: int) -> Any:
-    """The model. Raises DataError if it has too few of `count` frames."""
+    """Returns the model. Raises DataError if it has poses of too few of `count` frames."""
     found = 0 if model is None else model.num_reg_images()
     if model is None or found < max(FEWEST_FRAMES, poses.LEAST_SHARE * count):
         raise DataError(
@@ -215,8 +215,8 @@ def _finish(
 
 @dataclass(frozen=True)
 class Findings:
-    """A pycolmap.Reconstruction; and by name of the pictures with poses, the counts of their features and bool [n]: the
-    feature moves."""
+    """model: a pycolmap.Reconstruction. verdicts, moving: by name of each picture with a pose, the match counts of its
+    features, and bool [n]: whether a feature moves."""
 
     model: Any
     verdicts: Mapping[str, Verdicts]
