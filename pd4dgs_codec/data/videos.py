@@ -173,7 +173,7 @@ class StoredView(View):
     """A view whose picture is read from the cache at each access."""
 
     def __init__(self, frames: StoredFrames, index: int, **fields: Any) -> None:
-        """fields: those of a View but `image`, `width` and `height`."""
+        """fields: all fields of a View but `image`, `width` and `height`."""
         height, width, _ = frames.shape
         for name, value in {**fields, "width": width, "height": height, "_frames": frames, "_index": index}.items():
             object.__setattr__(self, name, value)

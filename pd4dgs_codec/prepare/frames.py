@@ -43,7 +43,7 @@ class Look:
 
 @dataclass(frozen=True)
 class Choice:
-    """Ascending indices of the chosen frames, and of those left out as blurred or repeated."""
+    """Ascending indices of the frames that are chosen, left out as blurred, and left out as repeated."""
 
     chosen: tuple[int, ...]
     blurred: tuple[int, ...]

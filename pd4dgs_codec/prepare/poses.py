@@ -24,7 +24,7 @@ from pd4dgs_codec.signals import ENDING
 BATCH, PAIRS_BATCH = 4, 50
 #: Longest side of pictures for feature detection, and the most features. More cost time and hardly change the poses.
 MOST_PIXELS, MOST_FEATURES = 1600, 2048
-#: Each frame is matched with the NEAR next ones and those at powers of two; every EVERY-th with all other such frames.
+#: Frames are matched at distances 1..NEAR and powers of two, and every EVERY-th frame with all other such frames.
 NEAR, EVERY = 4, 10
 #: Growth of the model at which all frames are adjusted again, and the most refinements of an adjustment.
 GROWTH, ROUNDS = 1.5, 2
@@ -263,7 +263,7 @@ def count_off(
     width: int,
     matches: Iterable[tuple[int, int, np.ndarray]],
 ) -> None:
-    """Counts the matches of each feature, and those that are off.
+    """Counts the matches of each feature, and its matches that are off.
 
     normalised: float64 [n, 2] per picture, undistorted; poses: float64 [3, 4] per picture, world to camera; focal and
     width: pixels; matches: (picture, picture, int [m, 2] indices of features).

@@ -134,7 +134,7 @@ class TrainConfig:
     """The configuration of a run, without its data. Raises TrainError for a value out of its option's range."""
 
     preset: str = option("small", help="model size", choices=tuple(DEFAULT_ITERATIONS))
-    source: str = ""  #: what `data.load` was given; stored so that a resumed run reads the same data
+    source: str = ""  #: the source given to `data.load`, stored so that a resumed run reads the same data
     feature_width: int = option(
         32, help=f"numbers of an anchor's feature, 1 to {MAX_FEATURE}", metavar="N", least=1, most=MAX_FEATURE
     )

@@ -45,8 +45,8 @@ class ModelLoss:
         self._neighbours: Neighbours | None = None
 
     def begin(self, model: Model, level: int, schedule: Schedule, position: int) -> Callable[[], Terms]:
-        """Starts to compute the terms of a step at `position` and returns a function that waits for them. Until it
-        returns, nothing else may draw from the generator or change the model."""
+        """Starts to compute the terms of a step at `position` and returns a function that waits for them. Until that
+        function returns, nothing else may draw from the generator or change the model."""
         fields = {layer: field for layer, field in model.deformations.items() if layer <= level}
         parameters = [getattr(model, name) for name in PER_ANCHOR]
         parameters += [feature for field in fields.values() for feature in field.features]

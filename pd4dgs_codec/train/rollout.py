@@ -24,7 +24,7 @@ from pd4dgs_codec.train.state import TrainingView, TrainState
 
 #: Share of the steps after the coarse phase that train level 0, and the share of these near the key instant.
 STILL_ODDS, NEAR_ODDS = 0.15, 1 / 3
-#: The views near the key instant: this share of all, but at least so many.
+#: The views near the key instant: a share of all, and the fewest.
 NEAR_SHARE, NEAR_VIEWS = 1 / 12, 4
 #: Motion changes a pixel if a colour differs by at least this between level 0 and the highest level.
 STILL_CONTRAST = 0.15

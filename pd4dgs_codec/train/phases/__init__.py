@@ -1,4 +1,4 @@
-"""The phases of a training run, one module each: what a run does to its model once or a few times, between steps."""
+"""The phases of a training run, one module each: changes of the model, once or a few times in a run, between steps."""
 
 from collections.abc import Mapping
 from typing import Any

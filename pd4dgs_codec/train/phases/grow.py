@@ -1,4 +1,4 @@
-"""Growing and pruning of anchors as in Scaffold-GS: grow where image gradients are large, prune what is transparent."""
+"""Growing and pruning of anchors as in Scaffold-GS: grow where image gradients are large, prune transparent ones."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pd4dgs_codec.train.state import TrainState, fresh_statistics
 CELLS = (16, 4, 1)
 #: An anchor is pruned when its mean summed opacity per visit is below this ...
 MIN_MEAN_OPACITY = 0.005
-#: ... over at least this many visits; a Gaussian's gradient counts after at least so many.
+#: ... over at least MIN_ANCHOR_VISITS; a Gaussian's gradient counts after at least MIN_SLOT_VISITS.
 MIN_ANCHOR_VISITS = 40
 MIN_SLOT_VISITS = 10
 

@@ -23,7 +23,7 @@ from pd4dgs_codec.train.initialise import TIED
 from pd4dgs_codec.train.optimiser import Optimiser
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
-#: One training view in so many is held back until levels are selected, if there are enough of them.
+#: One in EVERY training views is held back until levels are selected, if these are at least MIN_VIEWS.
 EVERY = 16
 MIN_VIEWS = 4
 #: Level 1 stays if its gain and that of a removed level 2, which also shows motion, sum to MIN_GAIN_1 dB. Level 2 stays
@@ -31,7 +31,7 @@ MIN_VIEWS = 4
 MIN_GAIN_1, SHARE_2, MIN_GAIN_2 = 1.1, 0.15, 0.5
 #: A gain counts the pixels in which the level changes a colour by MIN_CONTRAST; if there are fewer than this, it is 0.
 MIN_CONTRAST, MIN_PIXELS = 0.02, 32
-#: Steps for which the level below is trained before: a share of the run, and so many at least.
+#: Steps for which the level below is trained before: a share of the run, and the fewest.
 PRACTICE, MIN_PRACTICE = 1 / 10, 75
 
 #: A timed run of fewer steps keeps its levels: fast motion is not learnt by then, and nobody asked for so few.

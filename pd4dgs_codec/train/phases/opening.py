@@ -22,9 +22,9 @@ from pd4dgs_codec.train.state import TrainState
 FIRST, TRIAL = 1 / 12, 1 / 6
 #: (share, instants): the planes have so many instants while the window is below the share.
 FEW_INSTANTS = ((0.3, 3), (0.5, 5), (0.7, 9), (1.0, 17))
-#: Steps of the trial: a share of the run, and so many at least.
+#: Steps of the trial: a share of the run, and the fewest.
 TRIAL_SHARE, MIN_TRIAL = 1 / 15, 75
-#: Motion predicts if it gains so many dB over the static level 0 in whole pictures, so that missed motion counts, ...
+#: Motion predicts if it gains MIN_GAIN dB over the static level 0 in whole pictures, so that missed motion counts, ...
 MIN_GAIN = 4.2
 #: ... over at most VIEWS views whose distance from the key instant is BEYOND, from and to, times the window.
 VIEWS, BEYOND = 12, (1.5, 2.0)
