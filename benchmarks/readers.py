@@ -22,6 +22,29 @@ from pathlib import Path
 
 import numpy as np
 from common import ROOT
+from PIL import Image
+
+from pd4dgs_codec import decode
+from pd4dgs_codec.archives import read_tensors
+from pd4dgs_codec.batch.job import OPS, Manifest
+from pd4dgs_codec.data import colmap
+from pd4dgs_codec.data.dataset import load
+from pd4dgs_codec.data.files import image_info, read_image, read_npy
+from pd4dgs_codec.data.rigs import _panoptic_points
+from pd4dgs_codec.data.videos import open_video
+from pd4dgs_codec.errors import Pd4Error
+from pd4dgs_codec.format import canonical
+from pd4dgs_codec.format.container import read_preamble, write_chunk, write_preamble
+from pd4dgs_codec.format.header import scene_id_of
+from pd4dgs_codec.interchange import runs
+from pd4dgs_codec.interchange.formats import fourdgs_bytes, read_splats
+from pd4dgs_codec.interchange.splats import Splats
+from pd4dgs_codec.interchange.teacher import read_model
+from pd4dgs_codec.model import checkpoint
+from pd4dgs_codec.quality.movie import write_mp4
+from pd4dgs_codec.web.client import SceneClient
+from pd4dgs_codec.web.package import library
+from pd4dgs_codec.web.server import Server
 
 MEGABYTE = 1 << 20
 VECTORS = ROOT / "spec" / "vectors"
@@ -62,8 +85,6 @@ def zipped_array(zeros: int) -> bytes:
 
 def blank_png(width: int, height: int) -> bytes:
     """A picture of one colour."""
-    from PIL import Image
-
     stream = io.BytesIO()
     Image.new("1", (width, height)).save(stream, "png")
     return stream.getvalue()
@@ -71,8 +92,6 @@ def blank_png(width: int, height: int) -> bytes:
 
 def many_scans(side: int) -> bytes:
     """A progressive JPEG of one grey with as many passes over its pixels as are read."""
-    from PIL import Image
-
     stream = io.BytesIO()
     Image.new("L", (side, side), 128).save(stream, "jpeg", progressive=True)
     raw = stream.getvalue()[:-2]
@@ -81,8 +100,6 @@ def many_scans(side: int) -> bytes:
 
 def blank_film(side: int, frames: int) -> bytes:
     """A video of one colour."""
-    from pd4dgs_codec.quality.movie import write_mp4
-
     with tempfile.TemporaryDirectory() as folder:
         write_mp4((np.zeros((side, side, 3), np.uint8) for _ in range(frames)), Path(folder) / "x.mp4", 30)
         return (Path(folder) / "x.mp4").read_bytes()
@@ -106,9 +123,6 @@ def compressed_ply(points: int) -> bytes:
 
 def equal_gaussians(count: int) -> bytes:
     """A .4dgs file of Gaussians that are all one."""
-    from pd4dgs_codec.interchange.formats import fourdgs_bytes
-    from pd4dgs_codec.interchange.splats import Splats
-
     ones = [np.ones((count, *shape), np.float32) for shape in ((3,), (4,), (3,), (), (1, 3))]
     return fourdgs_bytes([(0.0, Splats(*ones), np.arange(count))], 1.0)
 
@@ -121,10 +135,6 @@ def npy(head: str) -> bytes:
 
 def endless(size: int) -> bytes:
     """A file whose layer 0 has so many bytes, all of them zero, and a wrong checksum."""
-    from pd4dgs_codec.format import canonical
-    from pd4dgs_codec.format.container import read_preamble, write_chunk, write_preamble
-    from pd4dgs_codec.format.header import scene_id_of
-
     known = canonical.unpack(read_preamble((VECTORS / "valid" / "layers-0-1.pd4").read_bytes()).header)
     header = canonical.pack({**known, 1: [[0, size]]})
     return write_preamble(header) + write_chunk(0, 0, scene_id_of(header), bytes(size))[:-4] + bytes(4)
@@ -132,122 +142,44 @@ def endless(size: int) -> bytes:
 
 def read_scene(path: Path) -> None:
     """A .pd4 file."""
-    from pd4dgs_codec import decode
-
     decode(path.read_bytes())
 
 
 def read_url(path: Path) -> None:
     """The same from a server, which is measured as well."""
-    from pd4dgs_codec.web.client import SceneClient
-    from pd4dgs_codec.web.server import Server
-
     with Server(path.parent) as server, server.running(), SceneClient(f"{server.url}{path.name}") as client:
         list(client.scenes())
 
 
-def read_teacher(path: Path) -> None:
-    """Gaussians over time, at one time."""
-    from pd4dgs_codec.interchange.teacher import read_model
-
-    read_model(str(path), 30).splats(0.5)
-
-
-def read_cameras(path: Path) -> None:
-    """The cameras of a run of another trainer."""
-    from pd4dgs_codec.interchange import runs
-
-    runs.read_cameras(path)
-
-
-def read_options(path: Path) -> None:
-    """The options of a run of another trainer."""
-    from pd4dgs_codec.interchange.runs import Config
-
-    Config.of(path.parent).flag("no_dx", "False")
-
-
-def read_array(path: Path) -> None:
-    """Poses, and cached frames."""
-    from pd4dgs_codec.data.files import read_npy
-
-    read_npy(path.read_bytes(), str(path))
-
-
-def read_checkpoint(path: Path) -> None:
-    """As pd4dgs-encode reads it."""
-    from pd4dgs_codec.model import checkpoint
-
-    checkpoint.load(path)
-
-
 def read_import(path: Path) -> None:
-    """As pd4dgs-import reads a model."""
-    from pd4dgs_codec.archives import read_tensors
-
+    """A model as pd4dgs-import reads it."""
     read_tensors(path.read_bytes(), str(path))
 
 
-def read_splats(path: Path) -> None:
-    """PLY and SPZ."""
-    from pd4dgs_codec.interchange import formats
-
-    formats.read_splats(path)
+def read_teacher(path: Path) -> None:
+    """Gaussians over time, at one time."""
+    read_model(str(path), 30).splats(0.5)
 
 
-def read_points(path: Path) -> None:
-    """Panoptic's points."""
-    from pd4dgs_codec.data.rigs import _panoptic_points
-
-    _panoptic_points(path)
-
-
-def read_frames(path: Path) -> None:
-    """A transforms.json."""
-    from pd4dgs_codec.data.dataset import load
-
-    load(path.parent)
-
-
-def read_model(path: Path) -> None:
+def read_colmap(path: Path) -> None:
     """COLMAP's points and images."""
-    from pd4dgs_codec.data.colmap import _Binary, _Text
-
-    reader = (_Text if path.suffix == ".txt" else _Binary)(path)
+    reader = (colmap._Text if path.suffix == ".txt" else colmap._Binary)(path)
     list(reader.points() if "points" in path.name else reader.images())
 
 
 def read_picture(path: Path) -> None:
     """A picture."""
-    from pd4dgs_codec.data.files import image_info, read_image
-
     read_image(path, image_info(path)[:2])
 
 
 def read_film(path: Path) -> None:
     """Every frame of a video, one at a time."""
-    from pd4dgs_codec.data.videos import open_video
-
     for _ in open_video(path).pictures:
         pass
 
 
-def read_library(path: Path) -> None:
-    """The index of a package."""
-    from pd4dgs_codec.web.package import library
-
-    library(path.parent.parent)
-
-
-def read_manifest(path: Path) -> None:
-    """A manifest of a batch."""
-    from pd4dgs_codec.batch.job import OPS, Manifest
-
-    Manifest(str(path), OPS["encode"], lambda options: None)
-
-
 #: Name of the row -> (name of the file, its content, its reader).
-CASES: dict[str, tuple[str, Callable[[], bytes], Callable[[Path], None]]] = {
+CASES: dict[str, tuple[str, Callable[[], bytes], Callable[[Path], object]]] = {
     ".pd4: symbols, the file that takes most memory": (
         "x.pd4", (VECTORS / "dear" / "memory-0.pd4").read_bytes, read_scene
     ),
@@ -255,24 +187,24 @@ CASES: dict[str, tuple[str, Callable[[], bytes], Callable[[Path], None]]] = {
         "x.pd4", (VECTORS / "dear" / "seconds-0.pd4").read_bytes, read_scene
     ),
     ".pd4 from a server: zeros": ("x.pd4", lambda: endless(64 * MEGABYTE), read_url),
-    "checkpoint: empty dicts": ("m.pt", lambda: checkpoint_with(b"](" + b"}" * MEGABYTE + b"e"), read_checkpoint),
+    "checkpoint: empty dicts": ("m.pt", lambda: checkpoint_with(b"](" + b"}" * MEGABYTE + b"e"), checkpoint.load),
     "checkpoint: one tuple again and again": (
-        "m.pt", lambda: checkpoint_with(b"((K\1K\1K\1tq\0](" + b"h\0" * (MEGABYTE // 2) + b"et"), read_checkpoint
+        "m.pt", lambda: checkpoint_with(b"((K\1K\1K\1tq\0](" + b"h\0" * (MEGABYTE // 2) + b"et"), checkpoint.load
     ),
-    "checkpoint: lists in lists": ("m.pt", lambda: checkpoint_with(b"](" * 400_000 + b"e" * 400_000), read_checkpoint),
+    "checkpoint: lists in lists": ("m.pt", lambda: checkpoint_with(b"](" * 400_000 + b"e" * 400_000), checkpoint.load),
     "checkpoint: deflated": (
-        "m.pt", lambda: archive(b"}", zipfile.ZIP_DEFLATED, bytes(256 * MEGABYTE)), read_checkpoint
+        "m.pt", lambda: archive(b"}", zipfile.ZIP_DEFLATED, bytes(256 * MEGABYTE)), checkpoint.load
     ),
     "checkpoint: keys of one hash": (
         "m.pt",
         lambda: checkpoint_with(b"}(" + b"".join(number(k * (2**61 - 1)) + b"N" for k in range(1, 99_000)) + b"u"),
-        read_checkpoint,
+        checkpoint.load,
     ),
     "model to import: modules": (
         "m.pt", lambda: archive(b"](c__torch__.a\nb\nq\0)\x81" + b"h\0)\x81" * (MEGABYTE // 4) + b"e"), read_import
     ),
     "model to import: members": ("m.pt", lambda: archive(b"}", members=20_000), read_import),
-    "points (.npz): zeros": ("x.npz", lambda: zipped_array(512 * MEGABYTE), read_points),
+    "points (.npz): zeros": ("x.npz", lambda: zipped_array(512 * MEGABYTE), _panoptic_points),
     "points (.ply): as text": (
         "x.ply",
         lambda: b"ply\nformat ascii 1.0\nelement vertex 170000\n" + b"".join(b"property float %c\n" % c for c in b"xyz")
@@ -284,26 +216,36 @@ CASES: dict[str, tuple[str, Callable[[], bytes], Callable[[Path], None]]] = {
     "Gaussians (.4dgs): equal ones": ("x.4dgs", lambda: equal_gaussians(45_000), read_teacher),
     "Gaussians (.4dgs): too many equal ones": ("x.4dgs", lambda: equal_gaussians(300_000), read_teacher),
     "run of another trainer: cameras.json": (
-        "cameras.json", lambda: b"[" + b"{}," * (MEGABYTE // 3) + b"{}]", read_cameras
+        "cameras.json", lambda: b"[" + b"{}," * (MEGABYTE // 3) + b"{}]", runs.read_cameras
     ),
-    "run of another trainer: cfg_args": ("cfg_args", lambda: b"no_dx=a" * (MEGABYTE // 7), read_options),
+    "run of another trainer: cfg_args": (
+        "cfg_args",
+        lambda: b"no_dx=a" * (MEGABYTE // 7),
+        lambda path: runs.Config.of(path.parent).flag("no_dx", "False"),
+    ),
     "array (.npy): 2^40 numbers": (
-        "x.npy", lambda: npy("{'descr': '<f8', 'fortran_order': False, 'shape': (1099511627776,), }"), read_array
+        "x.npy",
+        lambda: npy("{'descr': '<f8', 'fortran_order': False, 'shape': (1099511627776,), }"),
+        lambda path: read_npy(path.read_bytes(), str(path)),
     ),
     "transforms.json: empty lists": (
-        "transforms.json", lambda: b'{"frames": [' + b"[]," * (MEGABYTE // 3) + b"0]}", read_frames
+        "transforms.json", lambda: b'{"frames": [' + b"[]," * (MEGABYTE // 3) + b"0]}", lambda path: load(path.parent)
     ),
-    "COLMAP: blank lines": ("images.txt", lambda: b"\n" * MEGABYTE, read_model),
-    "COLMAP: points as text": ("points3D.txt", lambda: b"1 0 0 0 0 0 0 0\n" * (MEGABYTE // 16), read_model),
+    "COLMAP: blank lines": ("images.txt", lambda: b"\n" * MEGABYTE, read_colmap),
+    "COLMAP: points as text": ("points3D.txt", lambda: b"1 0 0 0 0 0 0 0\n" * (MEGABYTE // 16), read_colmap),
     "COLMAP: points, binary": (
-        "points3D.bin", lambda: (MEGABYTE // 51).to_bytes(8, "little") + bytes(51 * (MEGABYTE // 51)), read_model
+        "points3D.bin", lambda: (MEGABYTE // 51).to_bytes(8, "little") + bytes(51 * (MEGABYTE // 51)), read_colmap
     ),
     "picture: 16 megapixels (PNG)": ("x.png", lambda: blank_png(4096, 4096), read_picture),
     "picture: 177 megapixels (PNG)": ("x.png", lambda: blank_png(16384, 10800), read_picture),
     "picture: 16 megapixels in 100 scans (JPEG)": ("x.jpg", lambda: many_scans(4096), read_picture),
     "video: 30 blank frames of 2048 x 2048": ("x.mp4", lambda: blank_film(2048, 30), read_film),
-    "library: lists in lists": ("a/index.json", lambda: b"[" * MEGABYTE, read_library),
-    "manifest: broken lines": ("m.jsonl", lambda: b"{}\n" * (MEGABYTE // 12), read_manifest),
+    "library: lists in lists": ("a/index.json", lambda: b"[" * MEGABYTE, lambda path: library(path.parent.parent)),
+    "manifest: broken lines": (
+        "m.jsonl",
+        lambda: b"{}\n" * (MEGABYTE // 12),
+        lambda path: Manifest(str(path), OPS["encode"], lambda options: None),
+    ),
 }  # fmt: skip
 
 
@@ -314,14 +256,6 @@ def peak() -> int:
 
 def measure(name: str, path: Path) -> None:
     """Prints seconds, bytes of memory and the answer of one reader, as JSON."""
-    import torch  # noqa: F401 - and all else that a reader imports, before the measurement
-
-    from pd4dgs_codec import batch, data, interchange, model, web  # noqa: F401
-    from pd4dgs_codec.data import colmap, rigs, transforms, videos  # noqa: F401
-    from pd4dgs_codec.errors import Pd4Error
-    from pd4dgs_codec.interchange import formats  # noqa: F401
-    from pd4dgs_codec.model import checkpoint  # noqa: F401
-
     before, begin, answer = peak(), time.process_time(), "read"
     try:
         CASES[name][2](path)
