@@ -36,11 +36,6 @@ def recent_node():
         pytest.skip(f"node {version.strip()}, the player's tests need {OLDEST} or later")
 
 
-@pytest.fixture
-def tools(monkeypatch):
-    monkeypatch.syspath_prepend(str(ROOT / "tools"))
-
-
 def run_node(*arguments: object, **options) -> subprocess.CompletedProcess[str]:
     command = [str(NODE), *map(str, arguments)]
     return subprocess.run(command, capture_output=True, text=True, timeout=280, cwd=PLAYER, **options)
@@ -109,14 +104,3 @@ def test_the_command_refuses_a_damaged_file_a_missing_one_and_other_arguments(tm
     for arguments in ([], ["hashes"], ["dance", path], ["hashes", path, "-n"]):
         done = run_node(PLAYER / "cli.mjs", *arguments)
         assert (done.returncode, done.stdout) == (2, "") and done.stderr.startswith("usage: ")
-
-
-def test_the_speed_tool_compares_the_two(tools, tmp_path, capsys):
-    import player_speed
-
-    path = tmp_path / "scene.pd4"
-    path.write_bytes(small_file())
-    assert player_speed.main([str(path), "--runs", "3", "--json", str(tmp_path / "times.json")]) == 0
-    (row,) = json.loads((tmp_path / "times.json").read_text())
-    assert row["runs"] == 3 and row["node_cpu_s"] > 0 and row["python_cpu_s"] > 0
-    assert "| scene.pd4 |" in capsys.readouterr().out
