@@ -17,38 +17,36 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import multiprocessing
 import random
 import sys
-import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path[:0] = [str(ROOT), str(ROOT / "tools")]
-
-from fuzzing.check import (  # noqa: E402
+from fuzzing.check import (
+    ROOT,
     Decoder,
     Finding,
     JavaScript,
-    Reference,
     check_memory,
     check_package,
     compare,
     python_decoder,
+    reference_decoder,
 )
-from fuzzing.legal import Seed, seeds  # noqa: E402
-from fuzzing.mutate import make_case  # noqa: E402
+from fuzzing.legal import Seed, seeds
+from fuzzing.mutate import make_case
 
-DECODERS = ("python", "refdec", "javascript")
+#: The package's first. They are made in the process that asks them.
+DECODERS: dict[str, Callable[[], Decoder]] = {
+    "python": lambda: python_decoder, "refdec": lambda: reference_decoder, "javascript": JavaScript
+}  # fmt: skip
 COMPARED = {"refdec": 10, "javascript": 2}  #: every so many inputs, and every legal one
 MEASURED = 25  #: every so many inputs the peak memory is traced, which takes twice the time
 STUCK_SECONDS = 300.0  #: of wall time on one input, on a busy machine; then the process is ended
-BATCH = 500  #: inputs of a process
 
 
 @dataclass
@@ -66,14 +64,9 @@ class Figures:
 
     def add(self, other: Figures) -> None:
         """Count another part of the run as well."""
-        self.inputs += other.inputs
-        self.legal += other.legal
-        self.sealed += other.sealed
-        self.outcomes += other.outcomes
-        self.compared += other.compared
-        self.differences += other.differences
-        self.memory = max(self.memory, other.memory)
-        self.findings += other.findings
+        for name, value in vars(other).items():
+            own = getattr(self, name)
+            setattr(self, name, max(own, value) if name == "memory" else own + value)
 
     def text(self) -> str:
         """A table."""
@@ -83,92 +76,68 @@ class Figures:
         rows += [(f"compared with {name}", count) for name, count in self.compared.items()]
         rows += [("another name for a fault", self.differences.total()), ("memory, of its bound", f"{self.memory:.0%}")]
         lines = [
-            "| figure | value |",
-            "|---|---|",
+            "| figure | value |\n|---|---|",
             *(f"| {n} | {v} |" for n, v in [*rows, ("findings", len(self.findings))]),
         ]
         lines += [f"{count} × {name}" for name, count in self.differences.most_common(10)]
-        return "\n".join(
-            [*lines, *(f"{r['input']} {r['kind']}: {r['message']} ({r['recipe']})" for r in self.findings[:20])]
-        )
+        lines += [f"{r['input']} {r['kind']}: {r['message']} ({r['recipe']})" for r in self.findings[:20]]
+        return "\n".join(lines)
 
 
-def run_inputs(
-    files: Sequence[Seed], run: int, inputs: Sequence[int], decoders: dict[str, Decoder], place: Any = None
-) -> Figures:
-    """Examine these inputs in this process. place.value: the one at work."""
-    figures = Figures()
-    for index in inputs:
-        if place is not None:
-            place.value = index
-        case = make_case(files, run, index)
-        legal = case.meaning is not None
-        figures.inputs += 1
-        figures.legal += legal
-        figures.sealed += case.sealed and not legal
-        every = legal or len(inputs) == 1
-        asked = {n: d for n, d in decoders.items() if every or index % COMPARED.get(n, 1) == 0}
-        try:
-            figures.outcomes[check_package(case, random.Random(~index))] += 1
-            figures.compared.update(set(asked) - {"python"})
-            if difference := compare(case.data, asked, case.meaning):
-                figures.differences[difference] += 1
-            if index % MEASURED == 0:
-                figures.memory = max(figures.memory, check_memory(case.data))
-        except Finding as finding:
-            row = {"input": index, "kind": finding.kind, "message": str(finding), "recipe": case.recipe}
-            figures.findings.append(row)
+def examine(files: Sequence[Seed], run: int, index: int, decoders: dict[str, Decoder], every: bool = False) -> Figures:
+    """Examines one input. every: by all of `decoders`, also where it is not their turn."""
+    case = make_case(files, run, index)
+    legal = case.meaning is not None
+    figures = Figures(inputs=1, legal=legal, sealed=case.sealed and not legal)
+    asked = {n: d for n, d in decoders.items() if every or legal or index % COMPARED.get(n, 1) == 0}
+    try:
+        figures.outcomes[check_package(case, random.Random(~index))] += 1
+        figures.compared.update(set(asked) - {"python"})
+        if difference := compare(case.data, asked, case.meaning):
+            figures.differences[difference] += 1
+        if index % MEASURED == 0:
+            figures.memory = check_memory(case.data)
+    except Finding as finding:
+        figures.findings.append(_row(index, finding.kind, str(finding), case.recipe))
     return figures
+
+
+def _row(index: int, kind: str, message: str, recipe: str) -> dict[str, Any]:
+    return {"input": index, "kind": kind, "message": message, "recipe": recipe}
 
 
 def make_decoders(names: Sequence[str]) -> dict[str, Decoder]:
-    """The decoders of these names, the package's first."""
-    kinds: dict[str, Any] = {"python": lambda: python_decoder, "refdec": Reference, "javascript": JavaScript}
-    return {name: kinds[name]() for name in DECODERS if name in names}
+    """The decoders of these names."""
+    return {name: make() for name, make in DECODERS.items() if name in names}
 
 
-def _child(writer: Any, files: Sequence[Seed], run: int, inputs: range, names: Sequence[str], place: Any) -> None:
-    writer.send(run_inputs(files, run, inputs, make_decoders(names), place))
+def _child(writer: Any, files: Sequence[Seed], run: int, inputs: range, names: Sequence[str]) -> None:
+    decoders = make_decoders(names)
+    for index in inputs:
+        writer.send(examine(files, run, index, decoders))
 
 
-def run_safely(files: Sequence[Seed], run: int, inputs: range, names: Sequence[str]) -> Figures:
-    """Examine inputs in child processes: one that crashes or gets stuck is a finding, and the run goes on behind it."""
-    context, figures = multiprocessing.get_context("fork"), Figures()
+def run_safely(files: Sequence[Seed], run: int, inputs: range, names: Sequence[str]) -> Iterator[Figures]:
+    """Examines inputs in a child process, and behind one at which it crashes or gets stuck, which is a finding, in
+    another."""
+    context = multiprocessing.get_context("fork")
     while inputs:
         reader, writer = context.Pipe(duplex=False)
-        place, seen, since = context.RawValue("q", inputs[0]), -1, time.monotonic()
-        child = context.Process(target=_child, args=(writer, files, run, inputs, names, place))
+        child = context.Process(target=_child, args=(writer, files, run, inputs, names), daemon=True)
         child.start()
         writer.close()
-        while not reader.poll(1.0):
-            if place.value != seen:
-                seen, since = place.value, time.monotonic()
-            elif time.monotonic() - since > STUCK_SECONDS:
+        for index in inputs:
+            if not reader.poll(STUCK_SECONDS):
                 child.kill()
-        try:
-            figures.add(reader.recv())
-            inputs = range(0)
-        except EOFError:
-            child.join()
-            lost = place.value  # the inputs before it, which were counted in the child, are examined again
-            figures.add(run_safely(files, run, range(inputs[0], lost), names))
-            message = f"the process ended with {child.exitcode}"
-            row = {"input": lost, "kind": "crash", "message": message, "recipe": make_case(files, run, lost).recipe}
-            figures.findings.append(row)
-            figures.inputs += 1
-            inputs = range(lost + 1, inputs[-1] + 1)
+            try:
+                yield reader.recv()
+            except EOFError:
+                child.join()
+                message, recipe = f"the process ended with {child.exitcode}", make_case(files, run, index).recipe
+                yield Figures(inputs=1, findings=[_row(index, "crash", message, recipe)])
+                break
         child.join()
-    return figures
-
-
-def _keep(figures: Figures, files: Sequence[Seed], args: argparse.Namespace) -> None:
-    """Saves what was found so far."""
-    for row in figures.findings:
-        args.out.mkdir(parents=True, exist_ok=True)
-        path = args.out / f"{args.seed}-{row['input']}-{row['kind']}.pd4"
-        path.write_bytes(make_case(files, args.seed, row["input"]).data)
-    if args.json:
-        args.json.write_text(json.dumps(vars(figures), indent=1) + "\n")
+        inputs = range(index + 1, inputs.stop)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -181,23 +150,22 @@ def main(argv: Sequence[str] | None = None) -> int:
     p.add_argument("--decoders", default=",".join(DECODERS), help="of python,refdec,javascript (default: all)")
     p.add_argument("--input", type=int, metavar="I", help="examine input I alone, in this process")
     p.add_argument("--out", type=Path, default=ROOT / "out" / "fuzz", help="folder for findings (default: out/fuzz)")
-    p.add_argument("--json", type=Path, metavar="FILE", help="write the figures, also of the batches so far")
     args = p.parse_args(argv)
     names = args.decoders.split(",")
     if unknown := set(names) - set(DECODERS):
         p.error(f"--decoders: expected some of {', '.join(DECODERS)}, found {', '.join(sorted(unknown))}")
-    files = seeds(args.files)
+    files, figures = seeds(args.files), Figures()
     if args.input is not None:
         print(make_case(files, args.seed, args.input).recipe)
-        figures = run_inputs(files, args.seed, [args.input], make_decoders(names))
+        figures = examine(files, args.seed, args.input, make_decoders(names), every=True)
     else:
-        figures = Figures()
         with contextlib.suppress(KeyboardInterrupt):
-            for first in range(0, args.inputs, BATCH):
-                batch = range(first, min(first + BATCH, args.inputs))
-                figures.add(run_safely(files, args.seed, batch, names))
-                _keep(figures, files, args)
-    _keep(figures, files, args)
+            for found in run_safely(files, args.seed, range(args.inputs), names):
+                figures.add(found)
+    for row in figures.findings:
+        args.out.mkdir(parents=True, exist_ok=True)
+        path = args.out / f"{args.seed}-{row['input']}-{row['kind']}.pd4"
+        path.write_bytes(make_case(files, args.seed, row["input"]).data)
     print(figures.text())
     return 1 if figures.findings else 0
 

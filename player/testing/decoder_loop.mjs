@@ -1,8 +1,5 @@
-// Decodes the file that each line on stdin holds, and answers with a line of JSON: for programs that compare.
-//
-//     {"hashes": BASE64} -> {"hashes": [...]} or {"error": kind, "message", "offset", "chunk"}
-//
-// An exception that is no DecodeError ends in {"crash": stack}.
+// Decodes the file that each line on stdin holds as base64, for programs that compare, and answers with a line of JSON:
+// {"hashes": [...]}, {"error": kind, "message", "offset", "chunk"}, or {"crash": stack} of any other exception.
 
 import { createInterface } from "node:readline";
 
@@ -11,7 +8,7 @@ import { DecodeError, hashes } from "../decode/index.js";
 for await (const line of createInterface({ input: process.stdin })) {
   let answer;
   try {
-    answer = { hashes: hashes(Buffer.from(JSON.parse(line).hashes, "base64")) };
+    answer = { hashes: hashes(Buffer.from(line, "base64")) };
   } catch (error) {
     if (error instanceof DecodeError) {
       const { kind, message, offset, chunk } = error;

@@ -7,10 +7,10 @@ and memory stay within bounds. The three decoders accept the same files, with th
 from __future__ import annotations
 
 import base64
-import importlib.util
 import json
 import random
 import subprocess
+import sys
 import time
 import tracemalloc
 import warnings
@@ -33,6 +33,10 @@ from pd4dgs_codec.format.registry import BY_CHUNK_TYPE
 from .mutate import Case
 
 ROOT = Path(__file__).resolve().parents[2]
+sys.path.append(str(ROOT / "spec"))  # one file that can be carried alone, in no package
+
+import refdec  # noqa: E402
+
 MAX_SECONDS = 2.0  #: of processor time, per input
 #: Peak memory of decoding is at most these times the symbols declared, the bytes given, and a constant, a larger one
 #: where a layer has several slices (clause 15).
@@ -175,25 +179,16 @@ def python_decoder(data: bytes) -> tuple[str, Any]:
         return outcome(hashes, data)
 
 
-class Reference:
-    """The reference decoder of the specification."""
-
-    def __init__(self) -> None:
-        spec = importlib.util.spec_from_file_location("refdec", ROOT / "spec" / "refdec.py")
-        assert spec is not None and spec.loader is not None
-        self.module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(self.module)
-
-    def __call__(self, data: bytes) -> tuple[str, Any] | None:
-        """As python_decoder; None for an input that would take long."""
-        if declared(data)[0] > REFERENCE_SYMBOLS:
-            return None
-        try:
-            return DECODED, self.module.hashes(data)
-        except self.module.Fault as fault:
-            return fault.name, fault
-        except Exception as error:
-            return f"crash, {type(error).__name__}: {error}", error
+def reference_decoder(data: bytes) -> tuple[str, Any] | None:
+    """That of the specification, as python_decoder; None for an input that would take long."""
+    if declared(data)[0] > REFERENCE_SYMBOLS:
+        return None
+    try:
+        return DECODED, refdec.hashes(data)
+    except refdec.Fault as fault:
+        return fault.name, fault
+    except Exception as error:
+        return f"crash, {type(error).__name__}: {error}", error
 
 
 class JavaScript:
@@ -211,7 +206,7 @@ class JavaScript:
         except DecodeError:
             pass
         assert self._process.stdin is not None and self._process.stdout is not None
-        self._process.stdin.write(json.dumps({"hashes": base64.b64encode(data).decode()}) + "\n")
+        self._process.stdin.write(base64.b64encode(data).decode() + "\n")
         self._process.stdin.flush()
         line = self._process.stdout.readline()
         found = json.loads(line) if line else {"crash": f"the process ended with {self._process.wait()}"}
