@@ -55,12 +55,8 @@ def wrapped(markdown: str) -> str:
 
 
 def shortened(value: Any) -> Any:
-    """`value` with every float rounded to DIGITS significant digits."""
-    if isinstance(value, dict):
-        return {key: shortened(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [shortened(item) for item in value]
-    return float(f"{value:.{DIGITS}g}") if isinstance(value, float) else value
+    """`value` as JSON has it, with every float rounded to DIGITS significant digits."""
+    return json.loads(json.dumps(value), parse_float=lambda text: float(f"{float(text):.{DIGITS}g}"))
 
 
 def lines(figures: Row) -> str:

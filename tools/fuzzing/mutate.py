@@ -16,6 +16,7 @@ from typing import Any
 
 from vectors.blocks import varint
 
+from pd4dgs_codec.entropy.varint import VARINT_MAX, ByteReader
 from pd4dgs_codec.errors import DecodeError, EncodeError
 from pd4dgs_codec.format import canonical
 from pd4dgs_codec.format.container import read_chunk, read_preamble, write_chunk, write_preamble
@@ -101,7 +102,7 @@ def set_varint(rng: random.Random, data: bytearray, other: bytes) -> None:
     at = end = _place(rng, data)
     while end < len(data) and data[end] & 0x80:
         end += 1
-    data[at : end + 1] = varint(min(rng.choice(INTEGERS) << rng.randrange(2), (1 << 35) - 1))
+    data[at : end + 1] = varint(min(rng.choice(INTEGERS) << rng.randrange(2), VARINT_MAX))
 
 
 CHANGES = (flip, flip, burst, splice, splice, insert, delete, set_integer, set_varint, set_varint)
@@ -225,43 +226,32 @@ def put_together(parts: Parts, header: bytes | None = None) -> bytes:
 
 def stages_of(section: bytes, number: int, header: dict[int, Any], meta: dict[int, Any]) -> tuple[bytes, list[bytes]]:
     """(all before the lengths of the stages, the stages) of a valid section of form 1 or 2, else (the section, [])."""
-    at = 1
+    reader = ByteReader(section)
+    form, graded, (feature, slots, _) = reader.byte("a form"), 3 in header, header[15]
 
-    def number_at() -> int:
-        nonlocal at
-        value, shift = 0, 0
-        while True:
-            byte = section[at]
-            value, shift, at = value | (byte & 127) << shift, shift + 7, at + 1
-            if byte < 128:
-                return value
+    def numbers(count: int) -> list[int]:
+        return [reader.varint(VARINT_MAX, "a number") for _ in range(count)]
 
-    graded, (feature, slots, _) = 3 in header, header[15]
-    if number == ATTRIBUTES and section[0] in (1, 2):
+    if number == ATTRIBUTES and form in (1, 2):
         count = 8
         if graded:
-            length = number_at()
-            at += length
-        if section[0] == 1:
+            reader.take(*numbers(1))
+        if form == 1:
             for _ in range(1, feature + 6):
-                for _ in range(2 * number_at()):
-                    number_at()
-            for _ in range(5 + graded):
-                number_at()
+                numbers(2 * numbers(1)[0])
+            numbers(5 + graded)
             for _ in range(slots):
-                split = number_at()
-                for _ in range((split > 0) + (split > 1)):
-                    number_at()
-    elif number == PLANES and section[0] == 1:
+                (split,) = numbers(1)
+                numbers((split > 0) + (split > 1))
+    elif number == PLANES and form == 1:
         count = max(1, (meta[4][0][0] - 1).bit_length())
-        for _ in range(count - 1):
-            number_at()
+        numbers(count - 1)
     else:
         return section, []
-    block = section[:at]
-    lengths = [number_at() for _ in range(count - 1)]
-    bounds = [*itertools.accumulate(lengths, initial=at), len(section)]
-    return block, [section[start:end] for start, end in itertools.pairwise(bounds)]
+    block = section[: reader.offset]
+    bounds = list(itertools.accumulate(numbers(count - 1), initial=0))
+    rest = bytes(reader.rest())
+    return block, [rest[start:end] for start, end in itertools.pairwise([*bounds, len(rest)])]
 
 
 def _layer(rng: random.Random, parts: Parts) -> Chunk | None:
@@ -278,7 +268,7 @@ def section_bytes(rng: random.Random, parts: Parts, other: Parts, names: list[st
     section = chunk.sections[number]
     try:
         block, stages = stages_of(section, number, parts.header, chunk.meta)
-    except (LookupError, TypeError, ValueError):  # changed before
+    except (DecodeError, LookupError, TypeError, ValueError):  # changed before
         block, stages = section, []
     names.append(f"section {number}")
     if not stages:

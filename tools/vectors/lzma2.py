@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -186,34 +186,28 @@ class _Encoder:
         self._bit((kind, "choice", 0), group > 0)
         if group:
             self._bit((kind, "choice", 1), group > 1)
-        self._tree((kind, group, 0 if group == 2 else low), code - 8 * group, 8 if group == 2 else 3)
+        self._tree((kind, group, 0 if group == 2 else low), code - 8 * group, range(7 if group == 2 else 2, -1, -1))
 
     def _distance(self, code: int, length_state: int) -> None:
         """Distance - 1."""
         bits = max(code.bit_length() - 2, 0)  # below the two leading ones
         slot = code if code < 4 else 2 * (bits + 1) + (code >> bits & 1)
-        self._tree(("slot", length_state), slot, 6)
+        self._tree(("slot", length_state), slot, range(5, -1, -1))
         if code < 4:
             return
         if slot < 14:
-            self._reverse_tree(("distance", slot), code, bits)
+            self._tree(("distance", slot), code, range(bits))
             return
         for shift in range(bits - 1, 3, -1):
             self._range >>= 1
             self._low += self._range * (code >> shift & 1)
             self._normalise()
-        self._reverse_tree(("align",), code, 4)
+        self._tree(("align",), code, range(4))
 
-    def _tree(self, name: tuple, value: int, bits: int) -> None:
+    def _tree(self, name: tuple, value: int, shifts: Iterable[int]) -> None:
+        """The bits of `value` at these shifts, each by the probability that belongs to those before it."""
         symbol = 1
-        for shift in range(bits - 1, -1, -1):
-            bit = value >> shift & 1
-            self._bit((*name, symbol), bit)
-            symbol = symbol << 1 | bit
-
-    def _reverse_tree(self, name: tuple, value: int, bits: int) -> None:
-        symbol = 1
-        for shift in range(bits):
+        for shift in shifts:
             bit = value >> shift & 1
             self._bit((*name, symbol), bit)
             symbol = symbol << 1 | bit
