@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -15,6 +13,7 @@ from typing import Any
 from browser import PATIENCE_MS, launched
 from common import ONE, TWO, Benchmark, Row, Run, Scene, command, levels, number, seconds_at, table
 
+from pd4dgs_codec.bench.latency import _python
 from pd4dgs_codec.bench.report import drawing
 from pd4dgs_codec.errors import DataError
 
@@ -132,18 +131,11 @@ NOTE = """window.noted = [];
 @contextmanager
 def served(folder: Path, *options: str) -> Iterator[str]:
     """The URL of a folder served by `pd4dgs-serve`. Raises DataError if it does not start."""
-    words = [sys.executable, "-m", "pd4dgs_codec", "serve", str(folder), "--port", "0", *options]
-    process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    try:
-        with process.stdout as lines:
-            url = lines.readline().strip()
-            if not url:
-                raise DataError("pd4dgs-serve did not start")
-            yield url
-    finally:
-        process.terminate()
-        process.wait()
+    with _python("-m", "pd4dgs_codec", "serve", str(folder), "--port", "0", *options) as lines:
+        url = lines.readline().strip()
+        if not url:
+            raise DataError("pd4dgs-serve did not start")
+        yield url
 
 
 def measure_player(run: Run, scene: Scene) -> list[Row]:

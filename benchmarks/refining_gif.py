@@ -9,7 +9,6 @@ then follow the other slices of layer 0, and the layers above it.
 from __future__ import annotations
 
 import argparse
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +16,6 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.errors import Pd4Error
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.io import whole_file
 from pd4dgs_codec.quality.frames import own_frames
@@ -39,11 +37,11 @@ BAYER = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]])
 DITHER = 8
 
 
-def draw(data: bytes, path: Path, width: int = WIDTH) -> int:
-    """Writes the GIF of the file `data`; returns its bytes. Raises Pd4Error if the file has no camera."""
+def draw(data: bytes, path: Path) -> None:
+    """Writes the GIF of the file `data`. Raises Pd4Error if the file has no camera."""
     ends = [(row["layer"], part["end"]) for row in info(data)["layers"] for part in row["slices"]]
     shown = [load_levels(data, max_bytes=end, last_only=True)[-1] for _, end in ends]
-    camera = widened(own_frames(shown[-1].model.info, 1)[0].camera, width)
+    camera = widened(own_frames(shown[-1].model.info, 1)[0].camera, WIDTH)
     for colours, rate in TRIED:
         pictures, second = [], 0.0
         for (layer, end), level in zip(ends, shown, strict=True):
@@ -56,7 +54,6 @@ def draw(data: bytes, path: Path, width: int = WIDTH) -> int:
             write(pictures, temporary, colours, rate)
         if path.stat().st_size <= LIMIT:
             break
-    return path.stat().st_size
 
 
 def widened(camera: Camera, width: int) -> Camera:
@@ -99,21 +96,15 @@ def write(pictures: Sequence[np.ndarray], path: Path, colours: int, rate: float)
     first.save(path, format="GIF", save_all=True, append_images=rest, duration=round(1000 / rate), loop=0)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+def main() -> None:
+    """The GIF of the file that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("file", type=Path, help="a .pd4 file with a camera of its own")
     parser.add_argument("-o", "--output", type=Path, required=True)
-    parser.add_argument("--width", type=int, default=WIDTH, help="of the GIF, pixels (%(default)s)")
-    args = parser.parse_args(argv)
-    try:
-        size = draw(args.file.read_bytes(), args.output, args.width)
-    except (Pd4Error, OSError) as error:
-        print(f"refining_gif: error: {error}", file=sys.stderr)
-        return 1
-    print(f"{args.output}: {size:,} bytes")
-    return 0
+    args = parser.parse_args()
+    draw(args.file.read_bytes(), args.output)
+    print(f"{args.output}: {args.output.stat().st_size:,} bytes")
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

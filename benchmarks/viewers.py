@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import argparse
 import math
-import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlencode
@@ -22,7 +21,6 @@ from common import ROOT, command, save_jpeg
 from refining_gif import widened
 
 from pd4dgs_codec import decode
-from pd4dgs_codec.errors import Pd4Error
 from pd4dgs_codec.io import whole_files
 from pd4dgs_codec.quality.frames import look_at_point, own_frames
 from pd4dgs_codec.scene import Camera, Scene
@@ -95,20 +93,15 @@ def supersplat(scene: Scene, camera: Camera) -> dict[str, Any]:
     return look | {"angles": (math.degrees(angle), 0, 0), "fov": fov, "ui": True}
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
+def main() -> None:
+    """The pictures of the file that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("file", type=Path, help="a .pd4 file with a camera of its own")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the pictures")
     parser.add_argument("--time", type=float, metavar="SECONDS", help="of the scene (the middle)")
-    args = parser.parse_args(argv)
-    try:
-        draw(args.file.read_bytes(), args.output, args.time)
-    except (Pd4Error, OSError) as error:
-        print(f"viewers: error: {error}", file=sys.stderr)
-        return 1
-    return 0
+    args = parser.parse_args()
+    draw(args.file.read_bytes(), args.output, args.time)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()
