@@ -19,6 +19,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+from pd4dgs_codec.cli.common import number as number
 from pd4dgs_codec.errors import DataError, TrainError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -236,6 +237,11 @@ def say(line: str) -> None:
     print(line, file=sys.stderr, flush=True)
 
 
+def peak_bytes(process: Path = Path("/proc/self")) -> int:
+    """Peak bytes of a process, on Linux; getrusage also counts what it was forked from."""
+    return 1024 * int((process / "status").read_text().split("VmHWM:")[1].split()[0])
+
+
 def git(*arguments: str) -> str:
     """What git prints about the repository; empty without git."""
     try:
@@ -261,11 +267,6 @@ def table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
     """A Markdown table without padding."""
     lines = [head, ["-"] * len(head), *rows]
     return "\n".join(f"| {' | '.join(map(str, line))} |" for line in lines)
-
-
-def number(value: float | None, digits: int = 2) -> str:
-    """A number with so many decimals and thousands separated, or a dash."""
-    return "-" if value is None else f"{value:,.{digits}f}"
 
 
 def seconds_at(size: float, rate: float = LINK) -> str:

@@ -21,7 +21,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from common import ROOT
+from common import ROOT, peak_bytes
 from PIL import Image
 
 from pd4dgs_codec import decode
@@ -249,20 +249,15 @@ CASES: dict[str, tuple[str, Callable[[], bytes], Callable[[Path], object]]] = {
 }  # fmt: skip
 
 
-def peak() -> int:
-    """Peak bytes of this process; getrusage also counts what it was forked from. Linux alone says."""
-    return 1024 * int(Path("/proc/self/status").read_text().split("VmHWM:")[1].split()[0])
-
-
 def measure(name: str, path: Path) -> None:
     """Prints seconds, bytes of memory and the answer of one reader, as JSON."""
-    before, begin, answer = peak(), time.process_time(), "read"
+    before, begin, answer = peak_bytes(), time.process_time(), "read"
     try:
         CASES[name][2](path)
     except Pd4Error as error:
         answer = str(error).replace(str(path.parent), "")
     seconds = time.process_time() - begin + resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
-    print(json.dumps([seconds, peak() - before, answer]))
+    print(json.dumps([seconds, peak_bytes() - before, answer]))
 
 
 def main() -> None:

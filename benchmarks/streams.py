@@ -24,6 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from browser import PATIENCE_MS, PLAYER, launched
+from common import peak_bytes
 
 from pd4dgs_codec import decode, open_stream
 from pd4dgs_codec.errors import DataError
@@ -117,7 +118,7 @@ def chromium(path: Path, way: str, size: int) -> tuple[float, int]:
             start = processor_time(own)
             page.evaluate("work()")
             seconds.append(processor_time(own) - start)
-        return min(seconds), 1024 * int((own / "status").read_text().split("VmHWM:")[1].split()[0])
+        return min(seconds), peak_bytes(own)
 
 
 def renderers() -> set[Path]:

@@ -8,6 +8,7 @@ directive in README.md.
 from __future__ import annotations
 
 import re
+import shutil
 import sys
 from pathlib import Path
 from typing import Any
@@ -106,7 +107,7 @@ def automodule(path: Path) -> list[str]:
 
 
 def write_api(app: Any) -> None:
-    """Event builder-inited: docs/api/ROOM.rst per room and docs/api/index.rst. A file that would not change stays."""
+    """Event builder-inited: docs/api/ROOM.rst per room and docs/api/index.rst."""
     rooms: dict[str, list[Path]] = {}
     for path in sorted(PACKAGE.iterdir()):
         if path.name.startswith("_") or path.name in LEFT_OUT:
@@ -121,14 +122,10 @@ def write_api(app: Any) -> None:
     }
     index = [*heading("API", "="), INDEX, "", ".. toctree::", "   :maxdepth: 1", ""]
     pages["index"] = [*index, *(f"   {name} <{name}>" for name in rooms), ""]
-    API.mkdir(exist_ok=True)
+    shutil.rmtree(API, ignore_errors=True)
+    API.mkdir()
     for name, lines in pages.items():
-        path, text = API / f"{name}.rst", "\n".join(lines)
-        if not path.exists() or path.read_text() != text:
-            path.write_text(text)
-    for path in API.glob("*.rst"):
-        if path.stem not in pages:
-            path.unlink()
+        (API / f"{name}.rst").write_text("\n".join(lines))
 
 
 INDEX = """\
