@@ -29,9 +29,6 @@ class Properties:
         return self.lc + 9 * (self.lp + 5 * self.pb)
 
 
-PROPERTIES = Properties().code
-
-
 def stored(data: bytes) -> bytes:
     """A stream of stored chunks, the first of which resets the dictionary."""
     sizes = [min(STORED_MAX, len(data) - start) for start in range(0, len(data), STORED_MAX)]
