@@ -7,7 +7,6 @@ bytes, quality of the packed file against the run's own pictures from held-out c
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import tempfile
 import time
@@ -26,7 +25,7 @@ OPTIONS = {
     "no_dx": False, "no_ds": False, "no_dr": False, "no_do": True, "no_dshs": True, "no_grid": False, "grid_pe": 0,
     "static_mlp": False, "empty_voxel": False, "apply_rotation": False,
 }  # fmt: skip
-FIT_STEPS = 300
+FIT_STEPS, ITERATIONS = 300, 1500
 
 
 def parameters(splats: Splats) -> dict[str, Tensor]:
@@ -240,9 +239,6 @@ def fit(model: FourD | Deformable, steps: int = FIT_STEPS) -> None:
 
 def main() -> None:
     """The table."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--iterations", type=int, default=1500, help="training steps of each (default: 1500)")
-    options = parser.parse_args()
     torch.manual_seed(0)
     print("| run | its bytes | .pd4 bytes | held-out dB | processor minutes |\n" + "| - " * 5 + "|")
     for name, model in (("4DGaussians", FourD(ball())), ("Deformable-3DGS", Deformable(ball(), is_blender=True))):
@@ -253,7 +249,7 @@ def main() -> None:
             size = sum(path.stat().st_size for path in run.rglob("*") if path.is_file())
             start = time.process_time()
             source = f"teacher:{run}?size=120x120&background=white"
-            command("train", source, "-o", made, "--preset", "tiny", "--iterations", options.iterations)
+            command("train", source, "-o", made, "--preset", "tiny", "--iterations", ITERATIONS)
             command("encode", made, "-o", packed)
             quality = command("eval", packed, source)["levels"][-1]["mpsnr"]
             minutes = (time.process_time() - start) / 60

@@ -34,15 +34,15 @@ HEADSET = """Object.assign(headset.size, { width: 312, height: 264 });
   Object.assign(headset.eyes, { left: [-0.03, -0.7, 0.6, -0.7, 0.4], right: [0.03, -0.6, 0.7, -0.7, 0.4] });"""
 
 
-def draw(data: bytes, folder: Path, seconds: float | None = None) -> None:
-    """Writes the pictures of the file `data`, by default at the middle of its time. Raises DataError without a browser
-    or a package, and Pd4Error for a file that is not valid or has no camera."""
+def draw(data: bytes, folder: Path) -> None:
+    """Writes the pictures of the file `data` at the middle of its time. Raises DataError without a browser or a
+    package, and Pd4Error for a file that is not valid or has no camera."""
     from PIL import Image
 
     browser.check_packages(*browser.VIEWERS)
     scene = decode(data)
     camera = widened(own_frames(scene.info, 1)[0].camera, WIDTH)
-    at = sum(scene.info.time_range) / 2 if seconds is None else seconds
+    at = sum(scene.info.time_range) / 2
     with tempfile.TemporaryDirectory() as name, Server(ROOT) as code, Server(name) as files:
         (Path(name) / "scene.pd4").write_bytes(data)
         command("export", Path(name) / "scene.pd4", "-o", Path(name) / "still.ply", "--to", "ply")
@@ -98,9 +98,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("file", type=Path, help="a .pd4 file with a camera of its own")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the pictures")
-    parser.add_argument("--time", type=float, metavar="SECONDS", help="of the scene (the middle)")
     args = parser.parse_args()
-    draw(args.file.read_bytes(), args.output, args.time)
+    draw(args.file.read_bytes(), args.output)
 
 
 if __name__ == "__main__":
