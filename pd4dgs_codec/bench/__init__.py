@@ -1,1 +1,1 @@
-"""What `pd4dgs-bench` measures: codec, renderer, trainer, latency, stability."""
+"""Measurements of `pd4dgs-bench`: codec, renderer, trainer, latency, stability."""

@@ -1,4 +1,4 @@
-"""Seconds from a request to the bytes and the rendered image of each level, over the paced link of `pd4dgs-serve`.
+"""Measures seconds from a request to each level's bytes and rendered image, over the paced link of `pd4dgs-serve`.
 
     python -m pd4dgs_codec.bench.latency URL
 
@@ -27,7 +27,7 @@ from pd4dgs_codec.web.client import SceneClient, Transfer
 
 @contextlib.contextmanager
 def served(data: bytes, rate: float) -> Iterator[str]:
-    """The URL of a file behind a link of `rate` bits per second, from `pd4dgs-serve` in another process."""
+    """Serves a file over a link of `rate` bits per second by `pd4dgs-serve` in another process; yields its URL."""
     with tempfile.TemporaryDirectory(prefix="pd4dgs-") as folder:
         (Path(folder) / "scene.pd4").write_bytes(data)
         with _python("-m", "pd4dgs_codec", "serve", folder, "--port", "0", "--rate", repr(rate)) as lines:
@@ -39,7 +39,7 @@ def served(data: bytes, rate: float) -> Iterator[str]:
 
 @contextlib.contextmanager
 def _python(*arguments: str, **environment: str) -> Iterator[IO[str]]:
-    """The stdout of a Python process that ends with the block."""
+    """Runs a Python process within the block and yields its stdout."""
     command, variables = [sys.executable, *arguments], os.environ | environment
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=variables)
     assert process.stdout is not None
@@ -52,7 +52,7 @@ def _python(*arguments: str, **environment: str) -> Iterator[IO[str]]:
 
 
 def arrivals(url: str, ends: Sequence[int]) -> list[float]:
-    """Seconds from the request to each of these bytes, read as a stream without decoding."""
+    """Returns the seconds from the request until the file has arrived up to each offset in `ends`, without decoding."""
     with contextlib.closing(Transfer(url)) as transfer:
         start, seconds = time.perf_counter(), []
         for end in ends:
@@ -63,8 +63,8 @@ def arrivals(url: str, ends: Sequence[int]) -> list[float]:
 
 
 def pictures(url: str, ready: Callable[[], object] = lambda: None) -> Iterator[tuple[float, float]]:
-    """Renders each level at time 0 with the file's own camera as soon as it is decoded: seconds since the request, and
-    since the last byte of its layer. ready: called before each.
+    """Renders each level at time 0 with the file's own camera as soon as it is decoded. Yields (seconds since the
+    request, seconds since the last byte of its layer). ready: called before each rendering.
 
     Raises what SceneClient.scenes raises, and DataError for a file without a camera.
     """
@@ -83,7 +83,7 @@ def pictures(url: str, ready: Callable[[], object] = lambda: None) -> Iterator[t
 
 
 def cold_start(url: str, **environment: str) -> list[float]:
-    """Seconds from the start of a viewer's process to each of its images. Raises DeliveryError if it fails."""
+    """Returns seconds from the start of a viewer's process to each of its images. Raises DeliveryError if it fails."""
     start = time.perf_counter()
     with _python("-m", "pd4dgs_codec.bench.latency", url, **environment) as lines:
         seconds = [time.perf_counter() - start for _ in lines]
@@ -93,9 +93,9 @@ def cold_start(url: str, **environment: str) -> list[float]:
 
 
 def times(data: bytes, rate: float, runs: int, step: Callable[[], None] = lambda: None) -> list[dict[str, Any]]:
-    """A row per level of a file at a rate, medians of `runs` in seconds: rate; level; bytes, S, of the prefix;
-    expected, 8S/rate; since the request, network, to the last byte, and picture, to the image in a warm process, of
-    which after_last_byte follow that byte; cold, from the start of a process with nothing loaded to the image.
+    """Returns a row per level of a file: rate (bits per second), level, bytes S of the prefix, and seconds, medians of
+    `runs`. expected: 8S/rate. network: from the request to the last byte. picture: from the request to the image in a
+    warm process, of which after_last_byte come after the last byte. cold: from the start of a new process to the image.
 
     `step` is called 3 times per run.
     """
@@ -126,13 +126,13 @@ def times(data: bytes, rate: float, runs: int, step: Callable[[], None] = lambda
 
 
 def first_start(data: bytes, rate: float) -> float:
-    """Seconds to the first image of a process without compiled kernels, as after installation."""
+    """Returns seconds to the first image of a process without compiled kernels, as after installation."""
     with tempfile.TemporaryDirectory(prefix="pd4dgs-") as cache, served(data, rate) as url:
         return cold_start(url, NUMBA_CACHE_DIR=cache)[0]
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """A row per rate and level."""
+    """Formats rows of `times` as a Markdown table."""
     from pd4dgs_codec.bench.report import markdown
 
     head = ("rate", "level", "S, bytes", "8S/B", "network", "picture, warm", "after last byte", "picture, cold")
@@ -152,7 +152,7 @@ def _warm_up() -> None:
 
 
 def main(url: str) -> None:
-    """The cold viewer: imports and kernels load in a thread while the bytes arrive."""
+    """Runs the cold viewer: imports and kernels load in a thread while the bytes arrive."""
     threads.configure()
     threads.load_numba()
     warming = threading.Thread(target=_warm_up)

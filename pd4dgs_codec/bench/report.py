@@ -1,4 +1,4 @@
-"""Seconds of repeated work and the machine that they hold for; Markdown tables, and plots of error over a cost."""
+"""Times repeated work, describes the machine, formats Markdown tables and plots error against cost."""
 
 import contextlib
 import os
@@ -17,7 +17,7 @@ from pd4dgs_codec import threads
 
 T = TypeVar("T")
 
-#: No repetition begins after so many seconds.
+#: No repetition begins after this many seconds.
 BUDGET = 5.0
 #: Packages whose versions affect times.
 PACKAGES = ("pd4dgs-codec", "numpy", "constriction", "torch", "numba", "gsplat")
@@ -37,13 +37,13 @@ Points = Sequence[tuple[float, float]]
 
 
 def summary(seconds: Sequence[float]) -> dict[str, Any]:
-    """median, low and high quartile (linear interpolation) and number of repeats of at least one duration."""
+    """Returns median, low and high quartile (linear interpolation) and number of one or more durations."""
     low, median, high = np.percentile(seconds, (25, 50, 75)).tolist()
     return {"median": median, "low": low, "high": high, "repeats": len(seconds)}
 
 
 def spread(found: dict[str, Any] | None) -> str:
-    """ "0.123 (0.120..0.130)", only the median of a single run, or "-" for None."""
+    """Formats a `summary`: "0.123 (0.120..0.130)", only the median of a single run, or "-" for None."""
     if found is None:
         return "-"
     quartiles = f" ({found['low']:.3g}..{found['high']:.3g})" if found["repeats"] > 1 else ""
@@ -51,7 +51,7 @@ def spread(found: dict[str, Any] | None) -> str:
 
 
 def clock(work: Callable[[], T], repeats: int, budget: float = BUDGET) -> tuple[T, list[float]]:
-    """(last result of `work`, seconds of each run) of up to `repeats` runs, none begun after `budget` seconds."""
+    """Runs `work` up to `repeats` times, never after `budget` seconds. Returns (last result, seconds of each run)."""
     seconds: list[float] = []
     while True:
         start = time.perf_counter()
@@ -62,7 +62,7 @@ def clock(work: Callable[[], T], repeats: int, budget: float = BUDGET) -> tuple[
 
 
 def machine() -> dict[str, Any]:
-    """What times depend on, without names or paths: CPU model, CPUs this process may use, threads, memory in bytes,
+    """Describes the machine without names or paths: CPU model, CPUs this process may use, threads, memory in bytes,
     load before the run, versions of installed packages. None: unknown on this system."""
     cpu = memory = load = None
     with contextlib.suppress(OSError):
@@ -89,7 +89,7 @@ def machine() -> dict[str, Any]:
 
 
 def machine_line(about: dict[str, Any]) -> str:
-    """`machine` in one line, below a table."""
+    """Formats `machine` as one line for below a table."""
     versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items())
     memory = f", {about['memory_bytes'] / 2**30:.0f} GiB" if about["memory_bytes"] else ""
     load = "" if about["load_average"] is None else f", load {about['load_average']:.2f} before the run"
@@ -101,7 +101,7 @@ def machine_line(about: dict[str, Any]) -> str:
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A Markdown table; columns are padded, so that it also reads as plain text."""
+    """Formats a Markdown table with padded columns, so that it also reads as plain text."""
     cells = [list(head), *map(list, rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
     lines = ["| " + " | ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) + " |" for row in cells]
@@ -110,12 +110,12 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def optional(value: Any, form: str) -> str:
-    """A formatted value; "-" for None."""
+    """Formats a value; "-" for None."""
     return "-" if value is None else format(value, form)
 
 
 def pareto_front(points: Points) -> list[tuple[float, float]]:
-    """The distinct points (cost, error) that no other point dominates, by ascending cost."""
+    """Returns the distinct points (cost, error) that no other point dominates, by ascending cost."""
     front: list[tuple[float, float]] = []
     for point in sorted(set(points)):
         if not front or point[1] < front[-1][1]:
@@ -142,9 +142,9 @@ def drawing(
     sharey: bool = False,
     legend: bool = False,
 ) -> Iterator[list[Any]]:
-    """Axes with a grid, one per title, at most `across` in a row; when the block ends they are written as a PNG.
+    """Yields axes with a grid, one per title, at most `across` in a row, and writes them as a PNG after the block.
 
-    size: width and height of each, inches. ylabel: of the first axis in each row. legend: of all series, below.
+    size: width and height of each axis, inches. ylabel: of the first axis in each row. legend: of all series, below.
     """
     import matplotlib
 

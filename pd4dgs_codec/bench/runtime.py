@@ -1,4 +1,4 @@
-"""Error against run time of the codec, the rasterisers and the trainer. Errors are RMSE of images, 0..1, not rounded to
+"""Measures error against run time of codec, rasterisers and trainer. Errors are RMSE of images in 0..1, not rounded to
 8 bits. A point or run is a dict, as in the report's JSON."""
 
 import json
@@ -25,7 +25,7 @@ Setting = tuple[float, str, int]  #: step scale, mode, effort
 
 
 def rmse(found: Iterable[np.ndarray], expected: Iterable[np.ndarray]) -> float:
-    """Over all pixels of images of one size."""
+    """Returns the RMSE over all pixels of images of one size."""
     pairs = zip(found, expected, strict=True)
     return math.sqrt(np.mean([np.square(got.astype(np.float64) - want).mean() for got, want in pairs]))
 
@@ -40,9 +40,9 @@ def _psnr(error: float | None) -> str:
 def codec_points(
     model: str, scene: Scene, frames: Sequence[Frame], settings: Iterable[Setting], repeats: int, step: Step
 ) -> list[Point]:
-    """A point per setting of the checkpoint `model`, whose scene is `scene`. error: of the images of the highest level
-    from those of the checkpoint. `step` is called after each. Encoding is timed without verification, which takes one
-    decoding more. Raises EncodeError, Pd4Error."""
+    """Measures a point per setting for the checkpoint `model`, whose scene is `scene`. error: of the highest level's
+    images from the checkpoint's images. `step` is called after each point. Encoding is timed without verification,
+    which takes one more decoding. Raises Pd4Error."""
 
     def images(level: Level) -> list[np.ndarray]:
         return [level.picture(frame.camera, frame.time) for frame in frames]
@@ -54,7 +54,7 @@ def codec_points(
     for scale, mode, effort in settings:
         options: dict[str, Any] = {"mode": mode, "effort": effort, "step_scale": scale, "verify": False}
         data, seconds = clock(partial(encode, scene, **options), repeats)
-        key = json.dumps(hashes(data))  # modes change no value, so that their images are equal
+        key = json.dumps(hashes(data))  # all modes code the same values and give the same images
         if key not in errors:
             errors[key] = rmse(images(load_levels(data, last_only=True)[-1]), expected)
         given = {"step_scale": scale, "effort": effort, "error": errors[key], "encode": summary(seconds)}
@@ -64,7 +64,7 @@ def codec_points(
 
 
 def file_point(data: bytes, repeats: int) -> Point:
-    """The point of a file whose error and time of encoding are unknown."""
+    """Measures the point of a file whose error and encoding time are unknown."""
     decode(data)  # loads the libraries
     seconds = clock(lambda: decode(data), repeats)[1]
     unknown = dict.fromkeys(("step_scale", "effort", "error", "encode"))
@@ -72,7 +72,7 @@ def file_point(data: bytes, repeats: int) -> Point:
 
 
 def codec_table(points: Sequence[Point]) -> str:
-    """A row per point."""
+    """Formats a row per point."""
     rows = [
         (optional(p["step_scale"], "g"), p["mode"], optional(p["effort"], "d"), f"{p['bytes']:,}")
         + (_psnr(p["error"]), spread(p["encode"]), spread(p["decode"]))
@@ -82,7 +82,7 @@ def codec_table(points: Sequence[Point]) -> str:
 
 
 def codec_panels(points: Sequence[Point]) -> list[Panel]:
-    """Error against bytes, encoding and decoding seconds; a series per mode and effort."""
+    """Returns panels of error against bytes, encoding and decoding seconds, with a series per mode and effort."""
     panels = []
     for label, cost in (("bytes", None), ("encoding, s", "encode"), ("decoding, s", "decode")):
         series: dict[str, list[tuple[float, float]]] = {}
@@ -103,7 +103,7 @@ View = dict[str, Any]
 
 
 def view(level: Level, frame: Frame) -> View:
-    """The Gaussians that the camera of `frame` meets at its time, with their colours in this view."""
+    """Returns the Gaussians that the camera of `frame` sees at its time, with their colours in this view."""
     import torch
 
     from pd4dgs_codec.draw.gaussians import near_plane
@@ -122,8 +122,8 @@ def view(level: Level, frame: Frame) -> View:
 
 
 def render_points(views: Sequence[View], names: Sequence[str], repeats: int, step: Step = lambda: None) -> list[Point]:
-    """A point per name of BACKENDS: milliseconds per image over all images and repeats (the reference renders each
-    once), rmse from the reference, or `missing`, the reason if there are no figures. `step` is called after each."""
+    """Measures a point per name of BACKENDS: milliseconds per image over all images and repeats (the reference renders
+    each once) and rmse from the reference, or `missing`, why it cannot run. `step` is called after each point."""
     exact = _rendered(views, ORACLE, 1)
     points: list[Point] = []
     for name in names:
@@ -138,7 +138,7 @@ def render_points(views: Sequence[View], names: Sequence[str], repeats: int, ste
 
 
 def _rendered(views: Sequence[View], name: str, repeats: int) -> tuple[list[np.ndarray], list[float]]:
-    """(image of each view [H, W, 3], seconds of each repetition); a first rendering for warming up is not timed."""
+    """Returns (image of each view [H, W, 3], seconds of each repetition); a warm-up rendering is not timed."""
     import torch
 
     from pd4dgs_codec.model.picture import rasterization
@@ -164,7 +164,7 @@ def _rendered(views: Sequence[View], name: str, repeats: int) -> tuple[list[np.n
 
 
 def _without_gsplat() -> str | None:
-    """Why gsplat cannot render here, in one line; None if it can."""
+    """Returns why gsplat cannot render here, in one line; None if it can."""
     import torch
 
     from pd4dgs_codec.model.picture import check_gsplat
@@ -179,13 +179,13 @@ def _without_gsplat() -> str | None:
 
 
 def render_table(points: Sequence[Point]) -> str:
-    """A row per rasteriser."""
+    """Formats a row per rasteriser."""
     rows = [(p["name"], p["missing"] or spread(p["milliseconds"]), optional(p["rmse"], ".2g")) for p in points]
     return markdown(("rendered by", "ms per image", "RMSE"), rows)
 
 
 def render_panels(points: Sequence[Point]) -> list[Panel]:
-    """One panel, a series per rasteriser."""
+    """Returns one panel with a series per rasteriser."""
     drawn = [p for p in points if not p["missing"]]
     return [
         Panel("rasterising, ms per image", [(p["name"], [(p["milliseconds"]["median"], p["rmse"])]) for p in drawn])
@@ -196,14 +196,14 @@ def render_panels(points: Sequence[Point]) -> list[Panel]:
 
 
 def run_of(name: str, curve: Sequence[Point], anchors: int) -> Point:
-    """A training run by its evaluations (dicts with seconds of wall time so far and psnr per level in dB). rmse: of the
-    highest level."""
+    """Describes a training run by its evaluations (dicts with seconds of wall time so far and psnr per level in dB).
+    rmse: of the highest level."""
     points = [{"seconds": p["seconds"], "psnr": p["psnr"], "rmse": 10 ** (-p["psnr"][-1] / 20)} for p in curve]
     return {"name": name, "curve": points, "anchors": anchors}
 
 
 def recorded_run(path: str) -> Point:
-    """The run that a checkpoint records. Raises DataError if it was never evaluated."""
+    """Reads the run that a checkpoint records. Raises DataError if it was never evaluated."""
     from pd4dgs_codec.model import checkpoint
 
     model, training = checkpoint.load(path)
@@ -215,7 +215,7 @@ def recorded_run(path: str) -> Point:
 
 
 def train_table(runs: Sequence[Point]) -> str:
-    """A row per evaluation of each run."""
+    """Formats a row per evaluation of each run."""
     levels = range(max(len(p["psnr"]) for run in runs for p in run["curve"]))
     rows = [
         [run["name"], f"{p['seconds']:.1f}"]
@@ -228,6 +228,6 @@ def train_table(runs: Sequence[Point]) -> str:
 
 
 def train_panels(runs: Sequence[Point]) -> list[Panel]:
-    """One panel, a series per run."""
+    """Returns one panel with a series per run."""
     series = [(run["name"], [(p["seconds"], p["rmse"]) for p in run["curve"]]) for run in runs]
     return [Panel("training wall time, s", series)]

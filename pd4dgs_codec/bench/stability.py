@@ -47,8 +47,8 @@ def refusal(group: str, error: type[Pd4Error], act: Callable[..., object], *inpu
 
 
 def judge(promise: Promise, given: tuple[Any, ...]) -> Row:
-    """Tests one input. Every exception is a failed row, except the promised refusal and a missing module, which is
-    raised."""
+    """Tests one input and returns its row. Any exception fails the row, except the promised refusal; that of a missing
+    module is raised."""
     case, fed, *arguments = given
     bound = error = None
     try:
@@ -70,7 +70,7 @@ def judge(promise: Promise, given: tuple[Any, ...]) -> Row:
 
 
 def chosen(name: str | None) -> list[Case]:
-    """The cases of the group `name`, else those with `name` in their own name; all for None. In the table's order."""
+    """Returns the cases of the group `name`, else the cases whose name contains it, in the table's order; None: all."""
     modules = (import_module(f"{__package__}.{module}") for module in MODULES)
     cases = [(promise, given) for module in modules for promise in module.PROMISES for given in promise.inputs]
     if name is None:
@@ -79,13 +79,13 @@ def chosen(name: str | None) -> list[Case]:
 
 
 def counts(rows: Sequence[Row]) -> dict[str, int]:
-    """Rows per status."""
+    """Counts the rows per status."""
     found = Counter(row["status"] for row in rows)
     return {status: found[status] for status in (PASS, REFUSED, FAIL)}
 
 
 def text(rows: Sequence[Row]) -> str:
-    """The rows as one Markdown table per group, and a line with the counts."""
+    """Formats the rows as one Markdown table per group, and a line with the counts."""
     head, parts = ("case", "fed", "promised", "came out", "error", "bound", "status"), []
     for group in dict.fromkeys(row["group"] for row in rows):
         cells = [
@@ -109,7 +109,7 @@ def mpmath() -> Any:
 
 
 def largest(errors: Iterable[float]) -> float:
-    """The largest of some numbers, NaN if one is NaN."""
+    """Returns the largest number, NaN if one is NaN."""
     return float(np.max(np.array(list(errors))))
 
 
@@ -120,7 +120,7 @@ CAMERA = Camera(_VIEWMAT, np.array([[40, 0, WIDTH / 2], [0, 40, HEIGHT / 2], [0,
 
 
 def small_scene(deformation: Deformation | None = None) -> Scene:
-    """40 anchors in front of CAMERA: layer 0, or layers 0 and 1 with a global deformation."""
+    """Makes 40 anchors in front of CAMERA: layer 0, or layers 0 and 1 with a global deformation."""
     rng, anchors = np.random.default_rng(3), 40
     layers = (0,) if deformation is None else (0, 1)
     cells = rng.choice(21**3, anchors, replace=False)

@@ -36,8 +36,8 @@ NAN, INF = math.nan, math.inf
 
 @torch.no_grad()
 def picture_error(model: Model, level: int, t: float, camera: Camera = CAMERA) -> float:
-    """Largest difference of a channel of a pixel between the float32 image and the image of the float64 reference from
-    the same Gaussians; NaN if the former is not finite."""
+    """Returns the largest difference of any channel between the float32 image and the float64 reference's image of the
+    same Gaussians; NaN if the float32 image is not finite."""
     picture = render(model, level, t, camera)
     g, near = picture.gaussians, near_plane(model.info)
     drawn = g.colors.isfinite().all(1)
@@ -53,7 +53,7 @@ RESOLUTION = (7, 5, 9, 4)
 INSIDE = np.random.default_rng(1).uniform(-0.9, 0.9, (60, 3)).astype(np.float32)
 CORNERS = np.array(list(itertools.product((-1, 1), repeat=3)), np.float32)
 FLAT = BOX * np.array([0, 1, 1], np.float32)
-#: Each of four time rows, and one float32 beside it.
+#: Each of four time rows, and the float32 on either side of it.
 ROWS = [x for i in range(4) for x in (i / 3, *(float(np.nextafter(np.float32(i / 3), np.float32(s))) for s in (-9, 9)))]
 
 
@@ -68,7 +68,7 @@ def _planes(resolution: Sequence[int], channels: int) -> tuple[dict[str, np.ndar
 def _exact_samples(
     planes: Sequence[dict[str, np.ndarray]], box: np.ndarray, points: np.ndarray, t: float
 ) -> np.ndarray:
-    """float64 [n, C * scales] by clause 13.2 of the format: all cells of a plane, weighted; most weights are 0."""
+    """Samples planes by clause 13.2 of the format, float64 [n, C * scales], as a weighted sum of all cells."""
     low, high = box.astype(np.float64)
     x = points.astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -119,7 +119,7 @@ def _bad_points_error() -> Found:
 
 
 def _field(name: str, plane: np.ndarray) -> Deformation:
-    """Planes of 1 but for one, [H, W]: the position's x residual in scene units; the y residual is its mirror image."""
+    """Makes a deformation with x residuals `plane` [H, W], scene units, over `name`; y residuals mirror them by row."""
     reso = (6, 6, 6, 12)
     planes = {name: np.ones((8, reso[b], reso[a]), np.float32) for name, a, b in PLANES}
     planes[name][:2] = plane, plane[::-1]
@@ -174,12 +174,12 @@ FIELDS: list[tuple[str, str, Deformation, Sequence[float]]] = [
 
 NAMES = ("means", "quats", "scales", "opacities", "colors")
 NEAR = 0.01
-#: Relative errors of the image and of each gradient, in the norm; the kernels compute in float32.
+#: Bound of the relative errors of the image and of each gradient, in the norm; the kernels compute in float32.
 BOUND = 1e-4
 
 
 def _camera(width: int = WIDTH, height: int = HEIGHT, shift: Sequence[float] = (0.0, 0.0), **bad: float) -> Camera:
-    """At the origin, looking along z. bad: the first element of a matrix by its name."""
+    """Makes a camera at the origin that looks along z. bad: first element of a matrix by its name."""
     f = 1.2 * width
     K = np.array([[f, 0, width / 2 + shift[0]], [0, 1.1 * f, height / 2 + shift[1]], [0, 0, 1]], np.float32)
     camera = Camera(np.eye(4, dtype=np.float32), K, width, height)
@@ -189,8 +189,8 @@ def _camera(width: int = WIDTH, height: int = HEIGHT, shift: Sequence[float] = (
 
 
 def _scene(n: int = 30, seed: int = 1, first: int | None = None, **changes: Any) -> list[Tensor]:
-    """n Gaussians at depths 2..6, spread over the view: the tensors of NAMES. changes: values of the first ones (of all
-    for None) by the tensor's name; depth: of their z alone."""
+    """Makes the tensors of NAMES for n Gaussians at depths 2..6, spread over the view. changes: values of the first
+    `first` Gaussians (None: of all) by the tensor's name; depth: of their z only."""
     g = torch.Generator().manual_seed(seed)
     z = torch.rand(n, generator=g) * 4 + 2
     xy = (torch.rand(n, 2, generator=g) - 0.5) / 1.2 * z[:, None]
@@ -210,7 +210,7 @@ def _scene(n: int = 30, seed: int = 1, first: int | None = None, **changes: Any)
 def _draw(
     tensors: list[Tensor], camera: Camera | None = None, background: Sequence[float] = (0.0,) * 3, backend: str = "cpu"
 ) -> dict[str, Tensor]:
-    """The image, its alphas, and the gradients of a fixed weighting of both, float64."""
+    """Returns the image, its alphas, and the gradients of a fixed weighting of both, float64."""
     leaves: Any = [t.detach().requires_grad_() for t in tensors]
     view: Any = (camera or _camera(), background)
     image, alphas, _ = rasterization(*leaves, *view, near_plane=NEAR, backend=backend)
@@ -239,7 +239,7 @@ def _not_skipped(tensor: str, value: Any) -> Found:
     return f"gradients {stray:g}, the others changed by {error:g}", error + stray
 
 
-#: (case, tensor, value of three Gaussians) that must be rendered as by the reference.
+#: (case, tensor, value in three Gaussians), which must be rendered as by the reference.
 DRAWN: tuple[tuple[str, str, Any], ...] = (
     ("quaternion 0", "quats", (0.0,) * 4), ("quaternion 1e-20", "quats", (1e-20,) * 4),
     ("quaternion 3e38", "quats", (3e38,) * 4), ("scales 0", "scales", (0.0,) * 3),
@@ -250,7 +250,7 @@ DRAWN: tuple[tuple[str, str, Any], ...] = (
     ("opacity 1/255", "opacities", 1 / 255), ("opacity just above 1/255", "opacities", 1 / 255 + 1e-7),
     ("opacity above 1", "opacities", 1.5),
 )  # fmt: skip
-#: The same, which must be skipped.
+#: (case, tensor, value in three Gaussians), which must be skipped.
 HIDDEN: tuple[tuple[str, str, Any], ...] = (
     ("z = near", "means", (0.1, 0.0, NEAR)), ("behind", "means", (0.1, 0.0, -3.0)),
     ("at the camera's centre", "means", (0.0, 0.0, 0.0)), ("beyond far", "means", (0.1, 0.0, 2e10)),
@@ -259,7 +259,7 @@ HIDDEN: tuple[tuple[str, str, Any], ...] = (
 )  # fmt: skip
 SMALL = _camera(16, 16)
 EQUAL: dict[str, Any] = {"means": (0.1, -0.1, 3.0), "quats": (0.3, 0.5, -1.0, 0.2), "scales": (0.2, 0.4, 0.6)}
-#: (case, description, scene, camera) that must be rendered as by the reference.
+#: (case, description, scene, camera), which must be rendered as by the reference.
 CROWDS: tuple[tuple[Any, ...], ...] = (
     ("nothing", "no Gaussian", _scene(0)),
     ("all behind", "20 Gaussians behind the camera", _scene(20, depth=-3.0)),
@@ -291,8 +291,8 @@ def _trainer(
     view: Mapping[str, Any] = {},  # noqa: B006 - never changed
     **fields: Any,
 ) -> Trainer:
-    """A run of 60 steps on six views. prepare: changes the model before its first step; factor: on all learning rates;
-    anchors: their number, if fixed; view, fields: replaced in each view and in the dataset."""
+    """Makes a run of 60 steps on six views. prepare: changes the model before its first step; factor: of all learning
+    rates; anchors: their number, if fixed; view, fields: replaced in each view and in the dataset."""
     data = load_source(SOURCE)
     views = tuple(replace(v, **view) for v in data.train)
     rates = LearningRates(**{k: (factor * a, factor * b) for k, (a, b) in asdict(LearningRates()).items()})
@@ -305,7 +305,7 @@ def _trainer(
 
 
 def _single(model: Model) -> None:
-    """All Gaussians of the anchor but the first are hidden."""
+    """Hides all Gaussians of the anchor except the first."""
     model.network("opacity").layers[-1].bias[1:] = -3.0
 
 
@@ -327,7 +327,7 @@ def _passing_nan() -> Found:
 
 
 def _run(trainer: Trainer) -> Found:
-    """Trains to the end, saves, encodes, decodes and renders: (in words, the error of the images)."""
+    """Trains to the end, saves, encodes, decodes and renders; returns (description, error of the images)."""
     with tempfile.TemporaryDirectory() as folder:
         trainer.run(Path(folder) / "model.pt")
         model, _ = checkpoint.load(Path(folder) / "model.pt")

@@ -30,7 +30,7 @@ IN_STEPS = (0.49, 0.499999, 0.5, 0.500001, 0.51, 1.0, 40.0)
 FARTHEST = 1e6  #: sigmas
 PLACES = ((0.0, 0.125), (-1.5, 0.7))  #: (mu, Q)
 LN_CLIP = math.log(rate.MIN_PROBABILITY)
-#: The ln P from which values and gradients are promised.
+#: Least ln P for which values and gradients are promised.
 LEAST = {torch.float64: -math.inf, torch.float32: math.log(1e-30)}
 
 
@@ -72,7 +72,7 @@ def _exact(*stored: float) -> tuple[float, float, float, float]:
 
 
 def _worst(inputs: list[Tensor], errors: Tensor, counts: Tensor) -> Found:
-    """The largest error, NaN if there is one, and its place."""
+    """Returns the place of the largest error among `counts`, and that error, NaN if there is one."""
     found = torch.where(counts, errors, -1.0)
     index = int(found.argmax())
     a, mu, sigma, step = (float(x[index].detach()) for x in inputs)
@@ -132,7 +132,7 @@ def _without_spread() -> Found:
 SETTINGS = (("best", 1), ("best", 5), ("gauss", 5))  #: (priors, effort)
 #: The size of a channel may be this multiple of its plain binary form, and OVERHEAD bits more.
 SLACK, OVERHEAD = 1.01, 256
-#: The same of channels most of whose values no window of 2^14 entries holds: exceptions take up to 40 bits.
+#: SLACK of channels with most values outside any window of 2^14 entries, since such exceptions take up to 40 bits.
 SLACK_OF_EXCEPTIONS, EXCEPTIONS = 1.6, ("the whole range", "two distant peaks")
 _RNG = np.random.default_rng(0)
 #: (case, description, symbols)
@@ -185,7 +185,7 @@ def _wrong_symbols(values: list[float], step: float, expected: list[int]) -> Fou
 
 
 def _in_bounds(x: np.ndarray, restored: np.ndarray, step: float) -> float:
-    """The largest |x - x_hat| / (Q/2 + half a unit in the last place of x_hat), exactly but for the quotient."""
+    """Returns the largest |x - x_hat| / (Q/2 + half a unit in the last place of x_hat), exact but for the quotient."""
     unit = np.spacing(np.abs(restored)).astype(np.float64)
     return float((2 * np.abs(x.astype(np.float64) - restored) / (step + unit)).max())
 
