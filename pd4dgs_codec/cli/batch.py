@@ -160,7 +160,7 @@ def _batch(args: argparse.Namespace, console: Console) -> int:
 
 
 class _Failures:
-    """Lines that failed, each reported at once, with its log in a file."""
+    """Collects the lines that failed; reports each at once and writes its log to a file."""
 
     def __init__(self, args: argparse.Namespace, manifest: Manifest):
         self.prog, self.place, self.folder = "pd4dgs-batch", args.input, Path(args.logs)
@@ -169,13 +169,13 @@ class _Failures:
             self._add(number, None, message)
 
     def see(self, job: Job, outcome: Outcome, tries: int) -> None:
-        """Records a job that has ended."""
+        """Records a job that has ended, if it failed."""
         if outcome.state != "failed":
             return
         log = None
         if outcome.log:
             path = self.folder / f"{job.line.output}.log"
-            with contextlib.suppress(OSError, ValueError):  # the batch matters more than its logs
+            with contextlib.suppress(OSError, ValueError):  # a log that cannot be written must not end the batch
                 path.parent.mkdir(parents=True, exist_ok=True)
                 path.write_text(printable(outcome.log), encoding="utf-8")
                 log = str(path)

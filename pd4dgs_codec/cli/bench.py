@@ -36,12 +36,12 @@ class Outcome(NamedTuple):
 
 
 def _given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """The options among `names` that were given."""
+    """Returns the options among `names` that were given."""
     return {name: getattr(args, name) for name in names if getattr(args, name) is not None}
 
 
 def _add_views(p: options.Parser, views: int) -> None:
-    """The options that choose the images to render; views: their default number."""
+    """Adds the options that choose the images to render. views: their default number."""
     add = p.add_argument
     what = "dataset whose held-out views give the cameras (default: the file's own camera over time)"
     add("--data", metavar="SOURCE", help=what)
@@ -50,7 +50,7 @@ def _add_views(p: options.Parser, views: int) -> None:
 
 
 def _frames(args: argparse.Namespace, info: SceneInfo) -> list[Frame]:
-    """Up to args.views frames: evenly spread held-out (or else training) views of --data, or the file's own camera."""
+    """Returns up to args.views frames: evenly spread held-out (or else training) views of --data, or the own camera."""
     from pd4dgs_codec.quality.frames import dataset_frames, own_frames
 
     if args.data is None:
@@ -260,7 +260,7 @@ def _latency(args: argparse.Namespace, console: Console) -> Outcome:
 
 
 def _with_camera(name: str) -> bytes:
-    """The bytes of a valid file with a camera."""
+    """Reads the bytes of a file. Raises DataError unless it is valid and holds a camera."""
     from pd4dgs_codec.format.decoder import decode
 
     data = read_bytes(name)
@@ -336,7 +336,7 @@ REPORTS = {
 
 
 def parser(name: str | None = None) -> options.Parser:
-    """The options of a report, or of `pd4dgs-bench` without one."""
+    """Returns the options of a report, or of `pd4dgs-bench` if `name` is None."""
     if name is not None:
         report = REPORTS[name]
         p = options.Parser(f"bench {name}", report.usage, report.summary, report.details)
@@ -368,7 +368,7 @@ def _misplaced(args: argparse.Namespace, console: Console) -> int:
 
 
 def _report(execute: Callable[..., Outcome], args: argparse.Namespace, console: Console) -> int:
-    """Checks the outputs, makes the report and writes it; FAILED if a row of it failed."""
+    """Checks the outputs, makes the report and writes it. Returns FAILED if one of its rows failed."""
     from pd4dgs_codec.io import finite, whole_file
 
     console.json = args.json == STDIO

@@ -1,4 +1,4 @@
-"""Running a command: inputs, outputs, messages on stdout and stderr, one-line errors and exit codes.
+"""Runs commands: inputs, outputs, messages on stdout and stderr, one-line errors and exit codes.
 
 At import only the standard library is loaded, so that `--help` and usage errors answer at once, and so that the number
 of threads is set before torch and numba are loaded.
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
 atexit.register(gc.freeze)
 
 OK, FAILED, USAGE, PARTIAL = 0, 1, 2, 3
-FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  #: a disk has no room
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  #: errors of a full disk
 STDIO = "-"
-EXTRAS = {"ray": "cluster", "submitit": "cluster"}  #: of the modules that are not of the extra `train`
+EXTRAS = {"ray": "cluster", "submitit": "cluster"}  #: extra of each module that the extra `train` does not install
 
 
 class UsageError(Exception):
@@ -43,22 +43,22 @@ class UsageError(Exception):
 
 
 class Console:
-    """Data to stdout, messages to stderr; with --json stdout holds one JSON object and nothing else."""
+    """Prints data to stdout and messages to stderr; with --json, stdout gets one JSON object and nothing else."""
 
     def __init__(self, args: argparse.Namespace):
         self.json, self.verbose = args.json, args.verbose
 
     def message(self, text: str) -> None:
-        """A line for the person at the terminal."""
+        """Prints a line for the person at the terminal."""
         say(text)
 
     def detail(self, text: str) -> None:
-        """A line shown with -v only."""
+        """Prints a line with -v only."""
         if self.verbose:
             self.message(text)
 
     def result(self, data: dict[str, Any], text: str, *, on_stdout: bool = False) -> None:
-        """Prints `data` as JSON on stdout with --json, else `text`: on stdout if it was asked for, else on stderr."""
+        """Prints `data` as JSON on stdout with --json, otherwise `text` on stderr, or on stdout with `on_stdout`."""
         if self.json:
             import json
 
@@ -72,7 +72,7 @@ class Console:
 
 
 def show(text: str) -> None:
-    """Prints `text` on stdout. Raises OSError that names stdout."""
+    """Prints `text` on stdout. Raises an OSError that names stdout."""
     with _naming_stdout():
         print(printable(text), flush=True)
 
@@ -86,7 +86,7 @@ def _naming_stdout() -> Iterator[None]:
 
 
 def say(text: str) -> None:
-    """A line on stderr. If stderr is full or closed, the line is lost and the work goes on."""
+    """Prints a line on stderr. If stderr is full or closed, the line is lost and the work goes on."""
     try:
         print(printable(text), file=sys.stderr, flush=True)
     except OSError:
@@ -106,7 +106,7 @@ def tell(prog: str, text: str) -> int:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """Rows as right-aligned columns under their heads; the first column is left-aligned."""
+    """Formats rows as right-aligned columns under their heads; the first column is left-aligned."""
     cells = [list(head), *([str(cell) for cell in row] for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
     return "\n".join(
@@ -118,12 +118,12 @@ def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def number(value: float | None, digits: int = 2) -> str:
-    """A number for a table, with thousands separators; "-" for None."""
+    """Formats a number for a table, with thousands separators; "-" for None."""
     return "-" if value is None else f"{value:,.{digits}f}"
 
 
 def shown_name(path: str, stream: str = "stdin") -> str:
-    """The name of a file in messages; `stream` for `-`."""
+    """Returns the name of a file for messages; `stream` for `-`."""
     return stream if path == STDIO else path
 
 
@@ -131,7 +131,7 @@ def shown_name(path: str, stream: str = "stdin") -> str:
 
 
 def read_bytes(path: str) -> bytes:
-    """All bytes of a file, or of stdin for `-`. Raises OSError naming the path, UsageError if stdin is a terminal."""
+    """Reads a file, or stdin for `-`. Raises an OSError that names the path, UsageError if stdin is a terminal."""
     if path != STDIO:
         from pd4dgs_codec.io import read_source
 
@@ -142,7 +142,7 @@ def read_bytes(path: str) -> bytes:
 
 
 def named_input(path: str) -> str | bytes:
-    """The path, or all bytes of stdin for `-`, for readers that take either."""
+    """Returns the path, or all bytes of stdin for `-`, for readers that take either."""
     return read_bytes(path) if path == STDIO else path
 
 
@@ -161,7 +161,7 @@ class _Stdin(io.BytesIO):
 
 
 def checkpoint_scene(path: str, data: bytes) -> Scene:
-    """The scene of a checkpoint that `read_bytes` read. Needs torch."""
+    """Loads the scene of the checkpoint at `path`, or of its bytes `data` if the path is `-`. Needs torch."""
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.model.convert import to_scene
 
@@ -180,14 +180,14 @@ def write_checkpoint(path: str, scene: Scene, overwrite: bool) -> None:
 
 
 def read_dataset(source: str, args: argparse.Namespace, info: SceneInfo) -> Dataset:
-    """The dataset `source`, read with the options of `add_reading`, to compare with a scene over its background."""
+    """Reads the dataset `source` with the options of `add_reading`, over the background of the scene to compare."""
     from pd4dgs_codec.interchange.teacher import load_source
 
     return load_source(source, downscale=args.downscale, holdout=args.holdout, background=info.background)
 
 
 def check_output(path: str, overwrite: bool) -> None:
-    """`io.check_output`, before any work; `-` is always fine."""
+    """Calls `io.check_output`, before any work, for outputs other than `-`."""
     if path != STDIO:
         from pd4dgs_codec.io import check_output  # loaded only if something is written
 
@@ -214,7 +214,7 @@ Action = Callable[[argparse.Namespace, Console], int]
 def run(parser: argparse.ArgumentParser, action: Action, argv: Sequence[str] | None) -> int:
     """Parses the arguments and runs `action`; every failure becomes one line on stderr and an exit code.
 
-    ENDING signals end it as a failure. One that comes while a command runs another ends both.
+    A signal in ENDING ends the command as a failure; if the command runs another one, it ends both.
     """
     open_streams()
     arguments = list(sys.argv[1:] if argv is None else argv)
@@ -232,7 +232,7 @@ def run(parser: argparse.ArgumentParser, action: Action, argv: Sequence[str] | N
 
 @contextlib.contextmanager
 def _told_warnings(prog: str) -> Iterator[None]:
-    """Tells of damage in files as messages are told, and escapes all other warnings."""
+    """Prints a DamageWarning as a message, and escapes the text of all other warnings."""
     before = warnings.showwarning
 
     def tell_of(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
@@ -276,7 +276,7 @@ def _run(parser: argparse.ArgumentParser, action: Action, arguments: list[str]) 
 
 
 def command(parser: Callable[[], argparse.ArgumentParser], action: Action) -> Callable[..., int]:
-    """The entry point of a program: takes its arguments, or those of the process, and returns the exit code."""
+    """Makes the entry point of a program: takes arguments (None: of the process) and returns the exit code."""
 
     def main(argv: Sequence[str] | None = None) -> int:
         return run(parser(), action, argv)
@@ -285,7 +285,7 @@ def command(parser: Callable[[], argparse.ArgumentParser], action: Action) -> Ca
 
 
 def _explain(error: BaseException, name: str) -> str | None:
-    """One line for an error that the caller can do something about; None for a fault of this program."""
+    """Returns one line for an error that the user can act on, None for a fault of this program."""
     if isinstance(error, (DecodeError, EncodeError)):  # the codec sees bytes and arrays, not the name of their file
         return f"{name}: {error}"
     if isinstance(error, Pd4Error):
@@ -321,7 +321,7 @@ def _fail(prog: str, error: BaseException, message: str, as_json: bool, code: in
 
 
 def open_streams() -> None:
-    """Opens those of descriptors 0 to 2 that the caller closed, so that no file of ours gets their numbers.
+    """Opens the descriptors 0 to 2 that the caller closed, so that no file of ours gets their numbers.
 
     A closed stdin reads as empty, writing to a closed stdout is an error like writing to a full one, and output to a
     closed stderr is lost.

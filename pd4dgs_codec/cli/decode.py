@@ -73,7 +73,7 @@ main = common.command(parser, _decode)
 
 
 def _input(args: argparse.Namespace, console: Console) -> bytes:
-    """The bytes of the file; of a URL only those that --max-layer and --max-bytes need."""
+    """Reads the file; from a URL only the bytes that --max-layer and --max-bytes need."""
     from pd4dgs_codec.web import is_url
 
     if not is_url(args.input):
@@ -93,7 +93,7 @@ def _input(args: argparse.Namespace, console: Console) -> bytes:
 
 
 def _output_kind(args: argparse.Namespace) -> str | None:
-    """ ".npz", ".pt", or None without an output."""
+    """Returns ".npz", ".pt", or None without an output. Raises UsageError for options that do not fit."""
     kind = None if args.output is None else ".npz" if args.output == STDIO else Path(args.output).suffix
     if args.output == STDIO and args.json:
         raise UsageError("-o - and --json both write to stdout; name an output file")

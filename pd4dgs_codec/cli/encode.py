@@ -121,7 +121,7 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
 
 
 def _load(args: argparse.Namespace) -> tuple[Scene, Metadata | None]:
-    """(scene, metadata)."""
+    """Reads (scene, metadata) from a checkpoint or a `.pd4` file."""
     data = common.read_bytes(args.input)
     if common.is_pd4(data):
         from pd4dgs_codec.format.decoder import decode
@@ -134,7 +134,7 @@ def _load(args: argparse.Namespace) -> tuple[Scene, Metadata | None]:
 
 
 def _metadata(args: argparse.Namespace, had: Metadata | None) -> Metadata | None:
-    """The metadata of the options, instead of those that the file had."""
+    """Returns the metadata `had` of the file, with the fields replaced that were given as options."""
     given = {name: vars(args)[name] for name in ("title", "source", "licence") if vars(args)[name] is not None}
     if not given:
         return had

@@ -113,7 +113,7 @@ def _check_usage(args: argparse.Namespace) -> None:
 
 
 def _check_folder(path: str, overwrite: bool) -> None:
-    """Refuses a folder with frames of another run, which must not mix with the new ones."""
+    """Raises DataError for a folder with frames of another run, which must not mix with the new ones."""
     check_path(path)
     folder = Path(path)
     if folder.exists() and not folder.is_dir():
@@ -141,7 +141,7 @@ def _eyes(args: argparse.Namespace, player: Player) -> Eyes:
 
 
 def _write_still(args: argparse.Namespace, export: Export, console: Console) -> dict[str, Any]:
-    """Writes one point in time."""
+    """Writes the Gaussians of one time."""
     import numpy as np
 
     from pd4dgs_codec.interchange.export import UNTURNED, upright
@@ -168,7 +168,7 @@ def _scaled(splats: Splats, args: argparse.Namespace) -> Splats:
 
 
 def frame_times(info: SceneInfo, fps: float) -> list[float]:
-    """Times of the frames at a rate, in seconds from the scene's start; the last is no later than its end."""
+    """Returns frame times in seconds from the scene's start, up to its end but for rounding. Raises DataError."""
     start, stop = info.time_range
     count = math.floor((stop - start) * fps * (1 + 1e-6)) + 1
     if count > MAX_FRAMES:
@@ -198,7 +198,7 @@ def _write_sequence(args: argparse.Namespace, export: Export) -> dict[str, Any]:
 def _frames(
     args: argparse.Namespace, export: Export, times: list[float], step: Callable[[], None]
 ) -> Iterator[tuple[Splats, np.ndarray]]:
-    """(Gaussians, slots) at normalised times."""
+    """Yields (Gaussians, slots) at normalised times."""
     learnt = None
     for t in times:
         splats, learnt = export.splats(t, before=learnt)

@@ -19,7 +19,7 @@ examples:
   pd4dgs-info scene.pd4 --check --at 500k,2M,50M --json
   pd4dgs-info http://127.0.0.1:8000/scene.pd4"""
 
-#: Shown of each layer with -v: quantisation steps, planes as [channels, x, y, z, t], widths of the networks' layers.
+#: Shown per layer with -v: quantisation steps, planes as [channels, x, y, z, t], widths of the networks' layers.
 DETAIL_KEYS = ("steps", "planes", "networks")
 
 
@@ -61,7 +61,7 @@ main = command(parser, _info)
 
 
 def _input(args: argparse.Namespace, console: Console) -> tuple[bytes, int]:
-    """(bytes, length of the file): the whole file, or only the header from a URL if that suffices."""
+    """Reads (bytes, length of the file). From a URL it fetches only the header if that suffices."""
     from pd4dgs_codec.web import is_url
 
     if not is_url(args.input):
@@ -76,8 +76,8 @@ def _input(args: argparse.Namespace, console: Console) -> tuple[bytes, int]:
 
 
 def _parts(result: dict[str, Any]) -> list[dict[str, Any]]:
-    """The bytes of each kind of section by layer, and of all other parts. The header counts as part of layer 0; chunks
-    that are not layers count for none."""
+    """Returns the bytes of each kind of section by layer, and of all other parts. The header counts as part of layer 0;
+    other chunks belong to no layer."""
     layers = result["layers"]
     missing = [row["layer"] for row in layers if "sections" not in row]
     if missing:
@@ -105,7 +105,7 @@ def _parts_table(result: dict[str, Any]) -> str:
 
 
 def _left_out(layers: list[dict[str, Any]]) -> list[dict[str, str]]:
-    """Layers, deformations and residual heads of the format that this file does not have."""
+    """Lists layers, deformations and residual heads of the format that this file does not have."""
     from pd4dgs_codec.format.registry import LAYER_KINDS
     from pd4dgs_codec.scene import HEADS
 
@@ -134,7 +134,7 @@ def _about_lines(metadata: dict[str, Any] | None) -> list[str]:
 
 
 def _slice_lines(result: dict[str, Any]) -> list[str]:
-    """The ends of the slices if a layer has several, and the quality after each if the file states it."""
+    """Lists the ends of the slices if a layer has several, and the quality after each if the file states it."""
     parts = [(row["layer"], part) for row in result["layers"] for part in row["slices"]]
     if len(parts) == len(result["layers"]):
         return []

@@ -1,6 +1,6 @@
-"""Options of the commands: the parser that they share, and types that turn text into values.
+"""Options of the commands: the shared parser, and types that turn text into values.
 
-A type returns the value or raises one line that says what was found and what was expected.
+A type returns the value, or raises an error of one line with the text found and the expected form.
 """
 
 import argparse
@@ -82,7 +82,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def add_reading(options: argparse._ActionsContainer, *, defaults: bool = True) -> None:
-    """How a dataset is read: --downscale and --holdout. defaults: False for None where an option is not given."""
+    """Adds --downscale and --holdout for reading a dataset. defaults: if False, options not given are None."""
     add, (downscale, holdout) = options.add_argument, (1, 8) if defaults else (None, None)
     add("--downscale", type=positive_int, default=downscale, metavar="K", help="use images at 1/K size (default: 1)")
     what = "hold out frames with i %% K == K/2 if there are no split files (default: 8; 0: none)"
@@ -90,13 +90,13 @@ def add_reading(options: argparse._ActionsContainer, *, defaults: bool = True) -
 
 
 def add_background(options: argparse._ActionsContainer, default: str) -> None:
-    """--background; default: what it is otherwise, in words."""
+    """Adds --background. default: the default in words."""
     what = f"black, white or R,G,B in 0..1 behind the scene and behind pictures with alpha (default: {default})"
     options.add_argument("--background", type=background, metavar="COLOR", help=what)
 
 
 def add_max_layer(options: argparse._ActionsContainer, what: str) -> None:
-    """--max-layer, whose help is `what`."""
+    """Adds --max-layer with the help text `what`."""
     options.add_argument("--max-layer", type=int, choices=(0, 1, 2), help=what)
 
 
@@ -108,7 +108,7 @@ class _Version(argparse.Action):
 
 
 def version_line(prog: str) -> str:
-    """The program's release and the version of the format that it writes."""
+    """Returns the program's release and the version of the format that it writes."""
     from pd4dgs_codec import FORMAT_VERSION, __version__
 
     return f"{prog} {__version__}, format {FORMAT_VERSION}"
@@ -118,7 +118,7 @@ def version_line(prog: str) -> str:
 
 
 def checked(kind: Callable[[str], T], accept: Callable[[T], bool], expected: str) -> Callable[[str], T]:
-    """The type of an option whose text `kind` converts and whose value `accept` allows."""
+    """Makes a type: `kind` converts the text, `accept` checks the value, and `expected` is the form in errors."""
 
     def read(text: str) -> T:
         with contextlib.suppress(ValueError):
@@ -137,7 +137,7 @@ seed = checked(int, lambda value: 0 <= value <= 2**63 - 2, "an integer from 0 to
 positive_float = checked(float, lambda value: 0 < value < math.inf, "a number > 0")
 non_negative_float = checked(float, lambda value: 0 <= value < math.inf, "a number >= 0")
 share = checked(float, lambda value: 0 <= value <= 1, "a number from 0 to 1")
-#: Frames a second that GIF and ffmpeg can tell.
+#: Frames per second that GIF and ffmpeg can represent.
 fps = checked(float, lambda value: 0.01 <= value <= 1000, "a number from 0.01 to 1000")
 named = checked(str, lambda text: text not in ("", "-"), "the name of a file or folder")
 line = checked(str, str.isprintable, "one line of printable text")
@@ -145,12 +145,12 @@ finite_float = checked(float, math.isfinite, "a number")
 
 
 def listed(kind: Callable[[str], T]) -> Callable[[str], tuple[T, ...]]:
-    """The type of comma-separated values of a kind: without repetitions, in the order given."""
+    """Makes the type of comma-separated values of a kind, without repetitions, in the order given."""
     return lambda text: tuple(dict.fromkeys(kind(part) for part in text.split(",")))
 
 
 def background(text: str) -> tuple[float, float, float]:
-    """A colour as RGB in 0..1, see `dataset.color`."""
+    """Reads a colour as RGB in 0..1, see `dataset.color`."""
     from pd4dgs_codec.data.dataset import color
 
     with contextlib.suppress(ValueError):
@@ -159,27 +159,27 @@ def background(text: str) -> tuple[float, float, float]:
 
 
 def rate(text: str) -> float:
-    """A link rate in bits per second with k, M or G for 1e3, 1e6, 1e9: "2M" -> 2e6."""
+    """Reads a link rate in bits per second with k, M or G for 1e3, 1e6, 1e9: "2M" -> 2e6."""
     return _scaled(text, {"k": 1e3, "M": 1e6, "G": 1e9}, "a rate in bits per second such as 2M or 500k")
 
 
 def rates(text: str) -> dict[str, float]:
-    """Comma-separated link rates: "2M,10M" -> {"2M": 2e6, "10M": 1e7}."""
+    """Reads comma-separated link rates: "2M,10M" -> {"2M": 2e6, "10M": 1e7}."""
     return {name: rate(name) for name in text.split(",")}
 
 
 def duration(text: str) -> float:
-    """Seconds: "50ms", "1.5s" or "1.5"."""
+    """Reads seconds: "50ms", "1.5s" or "1.5"."""
     return _scaled(text, {"ms": 1e-3, "s": 1.0}, "a time such as 50ms or 1.5s", low=0.0)
 
 
 def size(text: str, expected: str = "a size in bytes such as 50k") -> int:
-    """Bytes with k, M for 1e3, 1e6: "50k" -> 50000."""
+    """Reads bytes with k, M for 1e3, 1e6: "50k" -> 50000."""
     return int(_scaled(text, {"k": 1e3, "M": 1e6}, expected, low=1.0))
 
 
 def layer_sizes(text: str) -> dict[int, int]:
-    """Bytes by layer with k, M for 1e3, 1e6: "L0=425k,L1=80000" -> {0: 425000, 1: 80000}."""
+    """Reads bytes by layer with k, M for 1e3, 1e6: "L0=425k,L1=80000" -> {0: 425000, 1: 80000}."""
     layers, expected = {"L0": 0, "L1": 1, "L2": 2}, "sizes in bytes such as L0=425k,L1=120000"
     sizes: dict[int, int] = {}
     for part in text.split(","):
@@ -191,7 +191,7 @@ def layer_sizes(text: str) -> dict[int, int]:
 
 
 def _scaled(text: str, units: dict[str, float], expected: str, low: float = math.ulp(0.0)) -> float:
-    """A finite number >= low times its unit."""
+    """Reads a number with one of the units; the product must be finite and at least `low`."""
     unit = next((unit for unit in units if text.endswith(unit)), "")
     with contextlib.suppress(ValueError):
         value = float(text.removesuffix(unit)) * units.get(unit, 1.0)

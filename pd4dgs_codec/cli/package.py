@@ -39,7 +39,7 @@ examples:
   pd4dgs-package out -o out
   pd4dgs-package scene.pd4 -o out/scene --no-video --json"""
 
-STILL_FRAMES = 60  #: of the video of a static scene
+STILL_FRAMES = 60  #: frames in the video of a static scene
 MAX_FRAMES = 3000
 FRAGMENT_SECONDS = 2
 
@@ -104,7 +104,7 @@ def _write(args: argparse.Namespace, files: dict[str, bytes]) -> list[dict[str, 
 
 
 def _reason(error: RenderError | ModuleNotFoundError) -> str:
-    """The reason why there is no video. Raises the error if a module of ours is missing."""
+    """Returns the reason why there is no video. Raises the error if a module of ours is missing."""
     if isinstance(error, RenderError):
         return str(error)
     if (error.name or "").startswith("pd4dgs_codec"):

@@ -13,13 +13,13 @@ from pd4dgs_codec.cli.common import say
 if TYPE_CHECKING:
     from pd4dgs_codec.train.loop import Trainer
 
-#: Between two lines if stderr is not a terminal.
+#: Least time between two lines if stderr is not a terminal.
 LINE_SECONDS = 10.0
 
 
 @contextlib.contextmanager
 def progress_bar(total: int | None, unit: str, label: str) -> Iterator[Callable[[], None]]:
-    """A function to call after each item: a bar on a terminal, otherwise a line every LINE_SECONDS."""
+    """Yields a function to call after each item. Shows a bar on a terminal, otherwise a line every LINE_SECONDS."""
     if sys.stderr.isatty():
         from tqdm import tqdm
 
@@ -43,7 +43,7 @@ def progress_bar(total: int | None, unit: str, label: str) -> Iterator[Callable[
 
 
 class TrainingProgress:
-    """A bar on a terminal; otherwise a line after each evaluation."""
+    """Shows a bar on a terminal, otherwise a line after each evaluation."""
 
     def __init__(self) -> None:
         self.stream = sys.stderr

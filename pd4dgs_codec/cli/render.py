@@ -103,7 +103,7 @@ main = command(parser, _render)
 
 
 def _check_usage(args: argparse.Namespace) -> str:
-    """The kind of output: the lower-case suffix."""
+    """Returns the lower-case suffix of the output. Raises UsageError for options that do not fit."""
     kind = Path(args.output).suffix.lower()
     if args.output == STDIO or kind not in (*PICTURES, *VIDEOS):
         raise UsageError(f"found -o {args.output}, expected images such as out/%04d.png, or a .gif or .mp4")
@@ -131,8 +131,8 @@ def _frames(args: argparse.Namespace, level: Level) -> list[Frame]:
 def _pictures(
     frames: list[Frame], levels: list[Level], beside: bool, milliseconds: list[float], step: Callable[[], None]
 ) -> Iterator[np.ndarray]:
-    """uint8 [H, W, 3] per frame: one level, or all of them beside the ground truth. Appends the time of each picture to
-    `milliseconds`."""
+    """Yields uint8 [H, W, 3] per frame: one level, or all levels beside the ground truth. Appends the time of each
+    picture to `milliseconds`."""
     from pd4dgs_codec.quality.movie import Panel, level_panels, side_by_side
 
     for frame in frames:

@@ -32,7 +32,7 @@ def parser() -> options.Parser:
 
 
 def add_link(p: options.Parser) -> None:
-    """--rate and --latency of the link."""
+    """Adds --rate and --latency of the simulated link."""
     what = "rate of the link in bits per second, such as 2M (default: unlimited)"
     p.add_argument("--rate", type=options.rate, metavar="BPS", help=what)
     what = "round-trip time of the link, such as 50ms (default: 0)"
@@ -56,7 +56,7 @@ main = command(parser, _serve)
 
 
 def set_by_signals() -> threading.Event:
-    """An event that Ctrl-C and SIGTERM set from now on."""
+    """Returns an event that Ctrl-C and SIGTERM set from now on."""
     stop = threading.Event()
     if threading.current_thread() is threading.main_thread():
         for number in (signal.SIGINT, signal.SIGTERM):

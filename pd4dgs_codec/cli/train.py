@@ -50,7 +50,7 @@ VIEW_PORT = 8080
 
 
 def parser() -> options.Parser:
-    """The options of `pd4dgs-train`. Those stored in a checkpoint default to None, so that conflicts are noticed."""
+    """Returns the parser. Options that are stored in a checkpoint default to None, so that conflicts are noticed."""
     p = options.Parser("train", "SOURCE -o FILE.pt", "Train a layered dynamic Gaussian scene from images.", DETAILS)
     add = p.add_argument
     add("source", metavar="SOURCE", help="dataset to train on, see below")
@@ -153,7 +153,7 @@ def _check_usage(args: argparse.Namespace) -> None:
 
 
 def _ablated(args: argparse.Namespace) -> dict[str, Any]:
-    """The fields of TrainConfig that --without sets."""
+    """Returns the fields of TrainConfig that --without sets."""
     return {name: value for part in args.without for name, value in ABLATIONS[part].items()}
 
 
@@ -164,9 +164,9 @@ def _fresh_config(args: argparse.Namespace) -> TrainConfig:
 
 
 def _stored_config(args: argparse.Namespace) -> TrainConfig:
-    """The configuration in the checkpoint args.resume, with the time limit of this call if it has one.
+    """Reads the configuration of the checkpoint args.resume, with the time limit of this call if it has one.
 
-    Raises TrainError for options that differ from those stored.
+    Raises TrainError for options that differ from the stored ones.
     """
     from pd4dgs_codec.model import checkpoint
 
@@ -214,7 +214,7 @@ def _check_time_left(trainer: Trainer, path: str) -> None:
 
 
 def _prepare_log(args: argparse.Namespace, iteration: int) -> Path | None:
-    """The log to append to: empty for a fresh run, cut to the first `iteration` steps for a resumed one."""
+    """Returns the log to append to: empty for a fresh run, cut to the first `iteration` steps for a resumed one."""
     if args.log and os.path.isfile(args.log):  # devices and pipes cannot be cut
         if args.resume:
             _cut_log(args.log, iteration)
@@ -224,8 +224,8 @@ def _prepare_log(args: argparse.Namespace, iteration: int) -> Path | None:
 
 
 def _cut_log(path: str, iteration: int) -> None:
-    """Removes the records of steps from `iteration` on, which a killed run wrote after its last save and which will be
-    repeated, and an incomplete last line. Other lines stay. The file is replaced whole or not at all."""
+    """Removes an incomplete last line and the records of steps from `iteration` on, which a killed run wrote after its
+    last save and which are repeated now. The file is replaced whole or not at all."""
     with open(path, "rb") as stream:
         lines = stream.read().splitlines(keepends=True)
     kept = b"".join(line for line in lines if line.endswith(b"\n") and not _is_step_from(line, iteration))
@@ -252,7 +252,7 @@ def _progress(args: argparse.Namespace, trainer: Trainer, console: Console) -> T
 
 
 def _announce(trainer: Trainer, console: Console) -> None:
-    """Says what is trained, on which views, where and how long."""
+    """Prints preset, views, device and time limit of the run."""
     from pd4dgs_codec.train import workers
 
     config, dataset = trainer.config, trainer.dataset
@@ -270,7 +270,7 @@ def _announce(trainer: Trainer, console: Console) -> None:
 
 
 def _device(name: str, console: Console) -> str:
-    """Where to train. auto is CUDA if PyTorch finds a GPU and gsplat can render on it, else the CPU."""
+    """Returns the device. auto is CUDA if PyTorch finds a GPU and gsplat can render on it, else the CPU."""
     import torch
 
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):

@@ -78,7 +78,7 @@ main = command(parser, _view)
 
 
 def _packed(source: str, console: Console) -> bytes:
-    """The bytes of a whole and valid `.pd4`; a checkpoint is encoded."""
+    """Reads a complete, valid `.pd4`, or encodes a checkpoint."""
     from pd4dgs_codec.format.decoder import decode
 
     data = read_bytes(source)

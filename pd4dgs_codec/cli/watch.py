@@ -1,4 +1,4 @@
-"""`pd4dgs-train --view`: the scene in the browser while it trains, served by viser.
+"""`pd4dgs-train --view`: shows the scene in the browser while it trains, served by viser.
 
 Frames are rendered between two steps, in the trainer's own thread, so that none shows half an update. Without a viewer
 a step costs one look-up in an empty table.
@@ -47,8 +47,8 @@ class _Shown:
 
 @contextlib.contextmanager
 def _own_pages_alone() -> Iterator[None]:
-    """Lets no page of another site connect to a server of viser that starts in this block: viser itself asks no page
-    where it comes from."""
+    """Makes viser servers that start in this block refuse connections from pages of other sites, since viser itself
+    does not check origins."""
     from websockets.asyncio import server
 
     serve, own = server.serve, re.compile(rf"http://({re.escape(HOST)}|localhost)(:\d+)?")
@@ -60,7 +60,7 @@ def _own_pages_alone() -> Iterator[None]:
 
 
 class WatchedProgress(TrainingProgress):
-    """The terminal's progress, and a page that shows the scene from the cameras of its viewers."""
+    """Shows progress in the terminal, and the scene from each viewer's camera on a page."""
 
     def __init__(self, trainer: Trainer, port: int) -> None:
         """Raises DataError if viser is not installed, TrainError if the port cannot be used."""
@@ -137,7 +137,7 @@ class WatchedProgress(TrainingProgress):
             self.curve.data = (steps, *psnr)
 
     def _show(self, trainer: Trainer, key: int, client: Any) -> None:
-        """Renders for one browser: small at once if its camera moved, otherwise in full size every REFRESH seconds."""
+        """Renders for one browser: small at once if its view changed, otherwise in full size every REFRESH seconds."""
         from pd4dgs_codec.model.picture import render_image
         from pd4dgs_codec.quality.image import to_uint8
 
@@ -157,8 +157,8 @@ class WatchedProgress(TrainingProgress):
 
 
 def camera_of(wxyz: Any, position: Any, fov: float, aspect: float, pixels: int) -> Camera:
-    """A browser's camera. wxyz: camera-to-world rotation as a quaternion, OpenCV axes; fov: vertical, radians; aspect:
-    width over height; pixels: of the longer side."""
+    """Converts a browser's camera. wxyz: camera-to-world rotation as a quaternion, OpenCV axes; fov: vertical, radians;
+    aspect: width over height; pixels: of the longer side."""
     rotation = rotation_matrix(np.asarray(wxyz) / max(float(np.linalg.norm(wxyz)), 1e-12))
     viewmat = world_to_camera(rotation.T, np.asarray(position, np.float64))
     width, height = (
