@@ -1,4 +1,4 @@
-"""The decoded scene: numpy arrays with shape, dtype, unit and axes, and the layers that are present.
+"""The decoded scene: numpy arrays of documented shape, dtype, unit and axes, and the layers that are present.
 
 The decoder returns a `Scene` and the encoder takes one. This module knows nothing of torch, bytes or files.
 
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 SCALING_DIM = 6
-#: Inputs of a network that are the view direction, a unit vector, behind the feature.
+#: Width of the view direction, a unit vector that follows the feature in a network's input.
 VIEW_DIM = 3
 
 #: Limits of `Widths`: the feature may be twice as wide as in Scaffold-GS.
@@ -46,9 +46,9 @@ SCAFFOLD_NETWORKS = ("opacity", "covariance", "color")
 
 @dataclass(frozen=True)
 class Widths:
-    """Sizes of an anchor: `feature` numbers D for the networks, and `slots` G, the Gaussians that it spawns. All other
-    widths of anchors and networks follow from these two. graded: whether each anchor has a step class. viewing: the
-    scaffold's networks that take the view direction as well, in their order."""
+    """Sizes from which all widths of anchors and networks follow. feature: length D of an anchor's feature. slots:
+    number G of Gaussians per anchor. graded: whether each anchor has a step class. viewing: the scaffold's networks
+    that take the view direction as well, in the order of SCAFFOLD_NETWORKS."""
 
     feature: int = 32
     slots: int = 10
@@ -57,32 +57,32 @@ class Widths:
 
     @property
     def attributes(self) -> dict[str, tuple[int, ...]]:
-        """By name, in coding order, the shape of one anchor's value."""
+        """Shape of one anchor's value by attribute name, in coding order."""
         return dict(zip(ATTRIBUTES, ((self.feature,), (SCALING_DIM,), (self.slots, 3)), strict=True))
 
     @property
     def predicted(self) -> int:
-        """Scalars of an anchor before its offsets."""
+        """Number of scalars of an anchor before its offsets: D + 6."""
         return self.feature + SCALING_DIM
 
     @property
     def channels(self) -> int:
-        """Scalars of an anchor."""
+        """Number of scalars of an anchor: D + 6 + 3 G."""
         return self.predicted + 3 * self.slots
 
     @property
     def inputs(self) -> dict[str, int]:
-        """Input width of each of the scaffold's decoders: the feature, and 3 of the view direction if it takes it."""
+        """Input width of each of the scaffold's networks: D, plus 3 if it takes the view direction."""
         return {name: self.feature + VIEW_DIM * (name in self.viewing) for name in SCAFFOLD_NETWORKS}
 
     @property
     def shapes_are_blind(self) -> bool:
-        """Whether nothing of an anchor's Gaussians but their colours depends on the eye."""
+        """Whether opacity and covariance do not depend on the view direction."""
         return not {"opacity", "covariance"} & {*self.viewing}
 
     @property
     def networks(self) -> dict[str, int]:
-        """Output width of each of the scaffold's decoders."""
+        """Output width of each of the scaffold's networks."""
         return dict(zip(SCAFFOLD_NETWORKS, (self.slots, 7 * self.slots, 3 * self.slots), strict=True))
 
     @property
@@ -97,15 +97,15 @@ DEFAULT_WIDTHS = Widths()
 
 @dataclass(frozen=True)
 class Head:
-    """A residual head. outputs: its output width at given widths of the anchors. unit: what its output is added to and
-    measured in: "length" (in units of `deformation_unit`) or an attribute."""
+    """A residual head. outputs: its output width as a function of Widths. unit: the quantity that its output is added
+    to, "length" (the position, in units of `deformation_unit`) or the name of an attribute."""
 
     outputs: Callable[[Widths], int]
     unit: str
 
 
-#: The residual heads that a deformation may have, each of which adds to a quantity of the anchors. Their order is that
-#: of the numbers 1, 2, .. in the bitstream, where the trunk has number 0.
+#: The residual heads that a deformation may have, in the order of their numbers 1, 2, .. in the bitstream. The trunk
+#: has number 0.
 HEADS: dict[str, Head] = {
     "position": Head(lambda widths: 3, "length"),
     "feature": Head(lambda widths: widths.feature, "feature"),
@@ -117,15 +117,15 @@ LENGTH_HEADS = tuple(name for name, head in HEADS.items() if head.unit == "lengt
 
 
 def deformation_unit(box: np.ndarray) -> np.float32:
-    """The unit of LENGTH_HEADS: a quarter of the longest side of the HexPlanes' box, scene units.
+    """Returns the unit of LENGTH_HEADS in scene units: a quarter of the longest side of the HexPlanes' box [2, 3].
 
-    In scene units a rounded weight would shift a small scene by whole pixels.
+    With outputs in scene units, rounding a weight would shift a small scene by whole pixels.
     """
     unit: np.float32 = np.float32(0.25) * (box[1] - box[0]).astype(np.float32).max()
     return unit
 
 
-#: The network of each deformation whose outputs the heads read.
+#: Name of a deformation's network whose outputs the heads read.
 TRUNK = "trunk"
 
 #: A network: per linear layer (weight float32 [out, in], bias float32 [out]); ReLU between layers, none at the end.
@@ -161,7 +161,7 @@ class SceneInfo:
 
 @dataclass(frozen=True, eq=False)
 class Deformation:
-    """The planes of a layer, and the residual MLP F(x, t) of its level, which takes the place of that of a layer below.
+    """The planes of a layer, and the residual MLP F(x, t) of its level, which replaces the MLP of the layer below.
 
     planes: float32, sampled bilinearly (align corners, border clamp), multiplied within a scale, concatenated over
     scales. networks: "trunk" and the heads that are present. key: the code of the key instant t* (see `instant`) if the
@@ -174,21 +174,21 @@ class Deformation:
 
     @property
     def channels(self) -> int:
-        """Features that the planes give: channels, over all scales."""
+        """Number of features that the planes give: the sum of channels over all scales."""
         return sum(len(scale["xy"]) for scale in self.planes)
 
 
-#: Normalised times that a file holds are multiples of 1 / INSTANTS.
+#: A file stores normalised times as multiples of 1 / INSTANTS.
 INSTANTS = 65535
 
 
 def instant(code: int) -> float:
-    """The normalised time, a binary32 value, that a code 0..INSTANTS stands for."""
+    """Returns the normalised time, a binary32 value, of a code 0..INSTANTS."""
     return float(np.float32(code) / np.float32(INSTANTS))
 
 
 def plane_sides(planes: dict[str, np.ndarray]) -> tuple[int, int, int, int]:
-    """Resolutions along x, y, z, t of one scale's planes, read off xy and zt."""
+    """Returns the resolutions along x, y, z, t of one scale, from the shapes of its planes xy and zt."""
     return planes["xy"].shape[2], planes["xy"].shape[1], planes["zt"].shape[2], planes["zt"].shape[1]
 
 
@@ -207,7 +207,7 @@ class Steps:
 
     @property
     def attributes(self) -> dict[str, float]:
-        """Step by name of the attribute."""
+        """Steps by attribute name."""
         return {"feature": self.feature, "scaling_log": self.scaling_log, "offset": self.offset}
 
     def planes(self, layer: int) -> float:
@@ -219,30 +219,30 @@ class Steps:
         return (self.weights_scaffold, self.weights_global, self.weights_local)[layer]
 
     def scaled(self, factor: float) -> Steps:
-        """Every step times `factor`, rounded to binary32."""
+        """Returns every step times `factor`, rounded to binary32."""
         with np.errstate(over="ignore"):  # the encoder refuses infinite steps
             return Steps(**{k: float(np.float32(v * factor)) for k, v in self.__dict__.items()})
 
 
 @dataclass(frozen=True, eq=False)
 class Grading:
-    """Step classes: quantisation steps of the attributes that differ between anchors.
+    """Step classes, which give each anchor its own quantisation steps of the attributes.
 
-    classes: uint8 [N], 0 .. MAX_CLASS; an anchor of class c has 2^c times the steps. centre: float32 [channels], in
-    each channel a value that anchors of every class can have; in decoded scenes it is a multiple of the step.
+    classes: uint8 [N], 0 .. MAX_CLASS; an anchor of class c has 2^c times the steps. centre: float32 [channels], the
+    value of symbol 0 in each channel for every class; in decoded scenes it is a multiple of the step.
     """
 
     classes: np.ndarray
     centre: np.ndarray
 
     def take(self, rows: np.ndarray | slice) -> Grading:
-        """The step classes of these anchors, in this order."""
+        """Returns the step classes of the anchors `rows`, in this order."""
         return replace(self, classes=self.classes[rows])
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A prefix of a scene, from the layers `layers`.
+    """A scene, or a prefix of one, that consists of the layers `layers`.
 
     layers: ascending layer numbers present, starting with 0, e.g. (0,), (0, 1), (0, 2), (0, 1, 2).
     rows: rows[i] = number of anchors in the prefix that ends with layers[i].
@@ -250,9 +250,9 @@ class Scene:
     feature: float32 [N, D]. scaling_log: float32 [N, 6], natural log of scene units (0..2 spread of the offsets,
     3..5 base scale). offset: float32 [N, G, 3], in units of exp(scaling_log[:3]).
     mask: per present layer i, uint8 [rows[i]] codes (see MASK_STEP), non-decreasing from layer to layer.
-    networks: "opacity", "covariance", "color". local_deformation belongs to layer 2, global_deformation to layer 1;
-    either may be None (left out). The trunk of layer 2 reads the planes of layer 1 as well, see `motion`.
-    grading: None where every anchor has the steps as they are.
+    networks: "opacity", "covariance", "color". global_deformation belongs to layer 1, local_deformation to layer 2;
+    each may be None (left out). The trunk of layer 2 reads the planes of layer 1 as well, see `motion`.
+    grading: None if all anchors have the same steps.
     """
 
     info: SceneInfo
@@ -271,7 +271,7 @@ class Scene:
 
     @property
     def widths(self) -> Widths:
-        """Read off the arrays; a network of more inputs than the feature takes the view direction."""
+        """Sizes read from the arrays; a network with more inputs than the feature takes the view direction."""
         inputs = {name: network[0][0].shape[1:] for name, network in self.networks.items() if network}
         viewing = tuple(name for name in SCAFFOLD_NETWORKS if inputs.get(name) != self.feature.shape[1:])
         return Widths(self.feature.shape[1], self.offset.shape[1], self.grading is not None, viewing)
@@ -287,7 +287,7 @@ class Scene:
         return self.anchor_at(slice(None))
 
     def anchor_at(self, rows: np.ndarray | slice) -> np.ndarray:
-        """float32 [n, 3] positions of the anchors `rows`."""
+        """Returns the positions float32 [n, 3] of the anchors `rows`, world, scene units."""
         voxel = np.float64(np.float32(self.info.voxel_size))
         with np.errstate(over="ignore"):  # a huge voxel size gives infinities, which the decoder refuses
             position: np.ndarray = (self.anchor_q[rows].astype(np.float64) * voxel).astype(np.float32)
@@ -295,38 +295,38 @@ class Scene:
 
     @property
     def attributes(self) -> dict[str, np.ndarray]:
-        """float32 [N, ...] by name of the attribute."""
+        """Arrays float32 [N, ...] by attribute name."""
         return {"feature": self.feature, "scaling_log": self.scaling_log, "offset": self.offset}
 
     def of_anchors(self, rows: np.ndarray | slice) -> dict[str, Any]:
-        """The per-anchor fields (without the masks) of the anchors `rows`, as arguments for `dataclasses.replace`."""
+        """Returns the fields of the anchors `rows`, without masks, as arguments of `dataclasses.replace`."""
         grading = None if self.grading is None else self.grading.take(rows)
         attributes = {name: values[rows] for name, values in self.attributes.items()}
         return {"anchor_q": self.anchor_q[rows], **attributes, "grading": grading}
 
     def deformation(self, layer: int) -> Deformation | None:
-        """The deformation of layer 1 or 2; None if it is left out, and for layer 0, which has none."""
+        """Returns the deformation of layer 1 or 2, None if it is left out; None for layer 0, which has none."""
         return (None, self.global_deformation, self.local_deformation)[layer]
 
     def motion(self, layer: int) -> Deformation | None:
-        """The deformation of the prefix that ends with `layer`: the planes of all its layers, and the networks and the
-        key instant of the highest that has a deformation; None if none has one."""
+        """Returns the deformation of the prefix that ends with `layer`: the planes of all its layers, and the networks
+        and key instant of its highest layer with a deformation; None if no layer has one."""
         found = [one for one in (self.global_deformation, self.local_deformation)[:layer] if one is not None]
         return replace(found[-1], planes=tuple(s for one in found for s in one.planes)) if found else None
 
     def full_masks(self) -> list[np.ndarray]:
-        """uint8 [N] codes per layer present; an anchor that a layer's prefix lacks is inactive there."""
+        """Returns mask codes uint8 [N] per layer present; anchors that a layer's prefix lacks have code 0."""
         return [np.concatenate([codes, np.zeros(self.rows[-1] - codes.size, np.uint8)]) for codes in self.mask]
 
     def tensors(self, layer: int) -> Deformation:
-        """Planes and networks of layer 0, 1 or 2. Layer 0 has its decoders and no planes; a layer without a deformation
-        has neither."""
+        """Returns the planes and networks of layer 0, 1 or 2. Layer 0 has no planes; a layer without a deformation has
+        neither planes nor networks."""
         if layer == 0:
             return Deformation((), self.networks)
         return self.deformation(layer) or Deformation((), {})
 
     def with_tensors(self, layer: int, tensors: Deformation | None) -> Scene:
-        """The scene with other planes and networks in a layer; None leaves out the deformation of layer 1 or 2."""
+        """Returns the scene with these planes and networks in a layer; None removes the deformation of layer 1 or 2."""
         if layer == 1:
             return replace(self, global_deformation=tensors)
         if layer == 2:
@@ -335,7 +335,7 @@ class Scene:
         return replace(self, networks=tensors.networks)
 
     def prefix(self, max_layer: int) -> Scene:
-        """The scene that a decoder returns for the layers <= max_layer; `self` if nothing is cut."""
+        """Returns the layers <= max_layer, or `self` if it has no others. Raises ValueError if max_layer < 0."""
         n = sum(layer <= max_layer for layer in self.layers)
         if n == len(self.layers):
             return self
