@@ -25,23 +25,23 @@ _U32 = np.dtype("<u4")
 _INVALID = f"a frequency table does not ascend from 0 to {TOTAL}"
 
 
-#: A table as constriction has it. Passed less one, its own rounding has scale exactly 1 and reproduces the integers.
+#: A table in constriction. Its own rounding has scale exactly 1 for frequencies less one and reproduces the integers.
 Model: TypeAlias = constriction.stream.model.Categorical
 
 
 def model_of(cum: np.ndarray) -> Model | None:
-    """The model of a table int64 [n + 1]; None for a table of one symbol. Raises Malformed for an invalid table."""
-    frequencies = cum[1:] - cum[:-1]  # beside `models_of_each`, which takes twice as long for one table
+    """Returns the model of a table int64 [n + 1], None if it has one symbol. Raises Malformed for an invalid table."""
+    frequencies = cum[1:] - cum[:-1]  # without `models_of_each`, which takes twice as long for one table
     if not len(frequencies) or cum[0] or cum[-1] != TOTAL or frequencies[frequencies.argmin()] < 1:
         raise Malformed(_INVALID)
     return Model((frequencies - 1).astype(np.float64), perfect=False) if len(frequencies) > 1 else None
 
 
 def models_of_each(cums: np.ndarray, sizes: np.ndarray) -> list[Model | None]:
-    """`model_of` of concatenated tables, int64 [sum of sizes + 1], in one pass."""
+    """Returns `model_of` each of the concatenated tables, int64 [sum of (size + 1)], in one pass."""
     ends = np.cumsum(sizes + 1)
     firsts = ends - sizes - 1
-    frequencies = np.zeros(len(cums))  # its last number is none of a table, and junk there could make numpy warn
+    frequencies = np.zeros(len(cums))  # the last number belongs to no table; junk there could make numpy warn
     np.subtract(cums[1:], cums[:-1], out=frequencies[:-1])
     frequencies -= 1
     frequencies[ends - 1] = 0  # the difference between two tables
@@ -87,7 +87,7 @@ class AnsDecoder:
         self._coder = constriction.stream.stack.AnsCoder(np.ascontiguousarray(words))
 
     def take(self, count: int, model: Model | None) -> np.ndarray:
-        """The next `count` symbols under a table, int32 [count]. Junk bytes decode to junk: see finish()."""
+        """Decodes the next `count` symbols under a table, int32 [count]. Corrupt bytes give junk: see finish()."""
         if not 0 <= count <= MAX_COUNT:
             raise LimitExceeded(f"{count} symbols in one channel, limit {MAX_COUNT}")
         if count == 0 or model is None:
@@ -99,7 +99,7 @@ class AnsDecoder:
         """Raise Malformed unless exactly the stream's symbols have been taken: state 0 and no words left.
 
         This finds nearly every damaged stream, not all: state 0 is a fixed point that yields first symbols for ever, so
-        a cut stream can end in it too. The chunk's length and CRC-32 are what guarantees whole bytes.
+        a cut stream can end in it too. Only the chunk's length and CRC-32 guarantee complete bytes.
         """
         if not self._coder.is_empty():
             raise Malformed("an ANS stream does not end in state 0: corrupt bytes or wrong counts")

@@ -1,11 +1,10 @@
 """Entropy coding of channels: int32 symbols <-> one self-contained payload.
 
-Payload: for each non-empty channel a varint token, (family << 1 | has_exceptions), then, if the family is below 8, a
-new prior's parameters, else the prior defined (family - 8) definitions before the latest; then the channel's
-exceptions, if any: their number, and for each the gap to the previous position and the distance outside the window.
-Definitions of earlier payloads count too if the caller passes them on.
-After the last channel the ANS words: the heights of each histogram prior in order of definition, then each channel's
-symbols.
+A payload begins with a record per non-empty channel: a varint token (family << 1 | has_exceptions), the parameters of a
+new prior if the family is below 8, and the exceptions, if any: their number, and for each the gap to the previous
+position and the distance outside the window. Family 8 + i stands for the prior defined i definitions before the latest;
+definitions of earlier payloads count if the caller passes them on.
+The ANS words follow: the heights of each histogram prior in order of definition, then each channel's symbols.
 """
 
 from collections.abc import Sequence
@@ -33,19 +32,19 @@ from pd4dgs_codec.entropy.tables import BIT
 from pd4dgs_codec.entropy.varint import VARINT_MAX, ByteReader, put_varint
 from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
 
-#: Payloads of fewer bytes are always coded with Gaussians alone too: that is faster than estimating the result.
+#: Payloads of fewer bytes are always coded with Gaussians alone too, which is faster than estimating the result.
 SMALL = 4096
 
 
 @dataclass(frozen=True)
 class CodedChannels:
     payload: bytes
-    rate_bits: float  #: the sum of R(a), whatever prior was chosen
+    rate_bits: float  #: the sum of R(a), which does not depend on the priors
     defined: list[Fitted] = field(default_factory=list)  #: the new priors, in the order of definition
 
     @property
     def payload_bits(self) -> int:
-        """Symbols, prior parameters, tables and exceptions."""
+        """Bits of symbols, prior parameters, tables and exceptions."""
         return 8 * len(self.payload)
 
 
@@ -56,7 +55,7 @@ class _Exceptions:
 
 
 def check_channels(channels: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """The channels as int32 [N]; EncodeError unless each is a 1-D integer array with |k| <= 2**24 - 1."""
+    """Returns the channels as int32 [N]. Raises EncodeError unless each is a 1-D integer array, |k| <= 2**24 - 1."""
     checked = []
     for index, channel in enumerate(channels):
         array = np.asarray(channel)
@@ -75,8 +74,8 @@ def encode_channels(
 ) -> CodedChannels:
     """Encode int32 channels (1-D, any lengths, |k| <= 2**24 - 1) into one payload.
 
-    priors: "gauss" allows const and gauss only, the model of R(a); "best" every prior. It is never larger in payloads
-    under 4 kB, and in longer ones where Gaussians alone come near.
+    priors: "gauss" allows only const and gauss, the model of R(a). "best" allows every prior, and keeps the smaller
+    result of both if the payload has less than 4 kB or the estimate for Gaussians alone comes close.
     effort: 1..9, time spent on fitting. known: priors of earlier payloads, in order; a decoder must have them too.
     Raises EncodeError.
     """
@@ -88,7 +87,7 @@ def encode_channels(
     richer = priors == "best" and effort > 1
     fit: Fit = (lambda h: fit_best(h, effort)) if richer else (lambda h: h.gauss)
     best = _encode(arrays, plan_priors(histograms, fit, rounds, known), known)
-    least = sum(h.gauss.own for h in histograms) / BIT  # about the bits of Gaussians: sharing can save more
+    least = sum(h.gauss.own for h in histograms) / BIT  # estimated bits with Gaussians: sharing can save more
     if richer and (len(best[0]) < SMALL or least < 1.005 * 8 * len(best[0])):
         other = _encode(arrays, plan_priors(histograms, lambda h: h.gauss, rounds, known), known)
         best = min(best, other, key=lambda encoded: len(encoded[0]))
@@ -99,7 +98,7 @@ def encode_channels(
 def _encode(
     arrays: Sequence[np.ndarray], plan: Sequence[Fitted], known: Sequence[Fitted]
 ) -> tuple[bytes, list[Fitted]]:
-    """(the payload, the new priors)."""
+    """Returns (payload, new priors)."""
     out = bytearray()
     defined, fresh = [fitted.prior for fitted in known], list[Fitted]()
     symbols, cums = list[np.ndarray](), list[np.ndarray]()
@@ -125,7 +124,7 @@ def _split(array: np.ndarray, window: Window) -> tuple[np.ndarray, _Exceptions]:
 
 
 def _write_channel(out: bytearray, prior: Prior, exceptions: _Exceptions, defined: list[Prior]) -> bool:
-    """Returns whether the channel defines its prior, which is then appended to `defined`."""
+    """Writes a channel's record. Returns whether it defines its prior, which is then appended to `defined`."""
     back = next((i for i, known in enumerate(reversed(defined)) if known is prior), None)
     family = prior.id if back is None else FIRST_REUSE + back
     put_varint(out, 2 * family + (len(exceptions.positions) > 0))
@@ -171,7 +170,7 @@ def decode_channels(
 
 
 def decode_joined(payload: bytes | memoryview, counts: Sequence[int], known: list[Prior] | None = None) -> np.ndarray:
-    """int32 [sum of counts]: the channels of a payload, concatenated.
+    """Decodes the channels of a payload into one array, int32 [sum of counts].
 
     known: priors of earlier payloads, in order; this payload's definitions are appended. The caller has checked the
     counts against its limits. Raises Malformed (cut, trailing or corrupt bytes), LimitExceeded, or UnsupportedFeature
@@ -215,12 +214,12 @@ def _complete(defined: list[Prior], first: int, stream: AnsDecoder) -> None:
         defined[at] = prior
 
 
-#: Of a channel: the index of its prior, the number of its symbols, and its exceptions.
+#: (index of a channel's prior, number of its symbols, its exceptions).
 _Head = tuple[int, int, _Exceptions | None]
 
 
 def _joined(one: _Head, next: _Head) -> _Head | None:
-    """One head for two channels of one prior, if their symbols follow each other under its table."""
+    """Returns one head for two consecutive channels of one prior, None if exceptions or MAX_COUNT forbid it."""
     (index, some, exceptions), (_, more, others) = one, next
     apart = exceptions or others or some + more > MAX_COUNT
     return None if apart else (index, some + more, None)

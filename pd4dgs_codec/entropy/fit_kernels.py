@@ -1,12 +1,12 @@
-"""The inner loops of `fitting`: fits of priors, their costs, and which channels share one. Nothing here is normative.
+"""The inner loops of `fitting`: they fit priors, compute costs and choose shared priors. Nothing here is normative.
 
-numba compiles them where it is installed. Without it Python runs the same source, some ten times slower, with the
-innermost loops over a table in numpy. Costs are integers in units of 2^-20 bits (`BIT`), so that both choose the same.
-A histogram is `dense` int64 [n], its counts per entry of a table. Gaussians are fitted by interval likelihood: moments
-lose 15 to 130 % at sigma / Q <= 0.2.
+numba compiles the loops if it is installed. Otherwise Python runs the same source, some ten times slower, with numpy
+for the innermost loops over a table. Costs are integers in units of 2^-20 bits (`BIT`), so that both choose the same.
+`dense` int64 [n] is a histogram: counts per entry of a table. Gaussians are fitted by interval likelihood: fits by
+moments lose 15 to 130 % at sigma / Q <= 0.2.
 
 The first fit of an installation waits for the compilation, so slow constructs are avoided: assigning an array to a
-slice takes five seconds to compile, `np.interp` two, and a function is compiled anew for each constant argument.
+slice takes five seconds to compile, `np.interp` two, and each constant argument compiles a function anew.
 """
 
 import math
@@ -39,14 +39,14 @@ Decorator = Callable[[Callable[..., Any]], Callable[..., Any]]
 _compiled: Decorator = njit(cache=True, nogil=True) if NUMBA else lambda function: function
 _inlined: Decorator = njit(cache=True, nogil=True, forceinline=True) if NUMBA else lambda function: function
 
-#: Counts are summed to 2^bits entries before a fit; a wide Gaussian loses nothing by it.
+#: Counts are summed into at most 2^bits entries before a fit, at no loss for a wide Gaussian.
 GAUSS_BITS, MIXTURE_BITS = 8, 10
 GAUSS_ROUNDS = 12
-#: A round that gains less ends the descent.
+#: Least gain of a round of the descent; a smaller gain ends it.
 ENOUGH = BIT // 8
-#: Widths of the Gaussian of a histogram's heights.
+#: Number of widths for the Gaussian of a histogram's heights.
 HEIGHT_WIDTHS = 64
-#: Of R(a): the clip of probabilities, and the least standard deviation, in units of Q.
+#: Least probability and least standard deviation, in units of Q, of R(a).
 P_MIN, SIGMA_MIN = 1e-6, 2.0**-10
 
 _STEPS = np.array(HEIGHT_STEPS)
@@ -64,7 +64,7 @@ def frequency_cost(frequency: int) -> Any:
 
 @_compiled
 def _cdf28(mu8: int, si: int, cdf: np.ndarray) -> None:
-    """`tables.norm_cdf28_of_each` of one Gaussian into cdf int64 [n - 1]."""
+    """Writes the inner values of `tables.norm_cdf28_of_each` for one Gaussian into cdf int64 [n - 1]."""
     e, octave = si >> 6, OCTAVE[si & 63]
     nb = max(0, e - 8)
     shift, t = 23 + e - nb, 128 - mu8
@@ -79,14 +79,14 @@ def _cdf28(mu8: int, si: int, cdf: np.ndarray) -> None:
 
 @_compiled
 def _mixed(first: np.ndarray, second: np.ndarray, weight: int, cdf: np.ndarray) -> None:
-    """The mixture of two cdfs into a third."""
+    """Writes the mixture of two cdfs into a third. weight: of the second, in 1/256."""
     for k in range(len(cdf)):
         cdf[k] = ((256 - weight) * first[k] + weight * second[k]) >> 8
 
 
 @_compiled
 def _table_cost(cdf: np.ndarray, floor: int, counts: np.ndarray) -> Any:
-    """Of counts int64 [n] under the table of cdf int64 [n - 1]."""
+    """Cost of counts int64 [n] under the table of cdf int64 [n - 1]."""
     n = len(counts)
     cost, before, spread = 0, 0, TOTAL - n * floor
     for k in range(n - 1):
@@ -99,7 +99,7 @@ def _table_cost(cdf: np.ndarray, floor: int, counts: np.ndarray) -> Any:
 
 @_compiled
 def _entry_costs(cdf: np.ndarray, floor: int) -> np.ndarray:
-    """int64 [n] of the table's entries."""
+    """Costs int64 [n] of the entries of the table of cdf int64 [n - 1]."""
     n = len(cdf) + 1
     costs = np.empty(n, np.int64)
     before, spread = 0, TOTAL - n * floor
@@ -129,7 +129,7 @@ if not NUMBA:  # the loops over a table in numpy
 
 @_compiled
 def _cheaper_floor(cdf: np.ndarray, dense: np.ndarray) -> tuple[int, int, np.ndarray]:
-    """(index of the floor, cost of dense, costs of the entries)."""
+    """Returns (index of the cheaper floor, cost of dense, costs of the entries)."""
     low, high = _table_cost(cdf, _LOW, dense), _table_cost(cdf, _HIGH, dense)
     if low <= high:
         return 0, low, _entry_costs(cdf, _LOW)
@@ -138,7 +138,7 @@ def _cheaper_floor(cdf: np.ndarray, dense: np.ndarray) -> tuple[int, int, np.nda
 
 @_compiled
 def _coarsen(dense: np.ndarray, bits: int) -> tuple[np.ndarray, int]:
-    """(counts of at most 2^bits entries, the number of low bits of an entry's number that they leave out)."""
+    """Returns (counts summed into at most 2^bits entries, the number of low bits dropped from an entry's index)."""
     n, shift = len(dense), 0
     while ((n - 1) >> shift) >= 1 << bits:
         shift += 1
@@ -152,8 +152,8 @@ def _coarsen(dense: np.ndarray, bits: int) -> tuple[np.ndarray, int]:
 
 @_compiled
 def _cost_at(probe: np.ndarray, x: np.ndarray, kept: np.ndarray, scratch: np.ndarray, counts: np.ndarray) -> Any:
-    """Of counts under the Gaussians of `probe`. kept int64 [2, n - 1]: the cdfs of those of x, which are not made anew;
-    scratch: int64 [3, n - 1]."""
+    """Cost of counts under the Gaussians of `probe`. kept: int64 [2, n - 1], cdfs of the Gaussians of x, reused where
+    `probe` has the same. scratch: int64 [3, n - 1]."""
     first, second, mixed = kept[0], kept[1], scratch[2]
     if probe[0] != x[0] or probe[1] != x[1]:
         first = scratch[0]
@@ -171,8 +171,8 @@ def _cost_at(probe: np.ndarray, x: np.ndarray, kept: np.ndarray, scratch: np.nda
 def _descend(
     counts: np.ndarray, x: np.ndarray, steps: np.ndarray, low: np.ndarray, high: np.ndarray, rounds: int
 ) -> np.ndarray:
-    """x int64 [2] (mu8, si) or [5] (mu8, si, mu8, si, weight) downhill on the cost of counts: probe each axis both
-    ways, then the joint parabola step; halve steps that no longer gain."""
+    """Minimises the cost of counts from x int64 [2] (mu8, si) or [5] (mu8, si, mu8, si, weight). Each round probes
+    every axis both ways, then the joint parabola step, and halves the steps if that was best or nothing gained."""
     dims, n = len(x), len(counts)
     x, steps = x.copy(), steps.copy()
     kept, scratch = np.empty((2, n - 1), np.int64), np.empty((3, n - 1), np.int64)
@@ -234,7 +234,7 @@ def _quantile(weights: np.ndarray, share: float) -> float:
 
 @_compiled
 def gauss(dense: np.ndarray) -> tuple[int, int, int, int, np.ndarray]:
-    """The Gaussian that codes dense cheapest: (mu8, si, index of the floor, cost, costs of the entries int64 [n])."""
+    """Fits the cheapest Gaussian: (mu8, si, index of the floor, cost of dense, costs of the entries int64 [n])."""
     counts, shift = _coarsen(dense, GAUSS_BITS)
     n = len(counts)
     weights = counts / counts.sum()
@@ -268,7 +268,7 @@ def gauss(dense: np.ndarray) -> tuple[int, int, int, int, np.ndarray]:
 
 @_compiled
 def _expectation_maximisation(counts: np.ndarray, rounds: int) -> np.ndarray:
-    """int64 [3, 5], mixtures from three starts: narrow and wide, left and right, a spike and the rest."""
+    """Fits mixtures int64 [3, 5] from three starts: narrow and wide, left and right, a spike and the rest."""
     n = len(counts)
     total, mean, mode = counts.sum(), 0.0, 0
     for i in range(n):
@@ -324,7 +324,7 @@ def _expectation_maximisation(counts: np.ndarray, rounds: int) -> np.ndarray:
 
 @_compiled
 def mixture(dense: np.ndarray, effort: int) -> tuple[int, int, int, int, int, int, int, np.ndarray]:
-    """Two Gaussians: (mu8, si, mu8, si, weight of the second, index of the floor, cost, costs of the entries)."""
+    """Fits two Gaussians: (mu8, si, mu8, si, weight of the second, index of the floor, cost, costs of the entries)."""
     counts, shift = _coarsen(dense, MIXTURE_BITS)
     n = len(counts)
     first, second = np.empty(n - 1, np.int64), np.empty(n - 1, np.int64)
@@ -357,8 +357,8 @@ def mixture(dense: np.ndarray, effort: int) -> tuple[int, int, int, int, int, in
 
 @_compiled
 def _height_width(counts: np.ndarray, mu8: int, symbols: int) -> tuple[int, int]:
-    """(height_si16, cost) of the cheapest Gaussian around mu8 for counts int64 [n] of height symbols, `symbols` in all:
-    from their spread downhill."""
+    """Returns (height_si16, cost) of the cheapest Gaussian around mu8 for counts int64 [n] of height symbols, `symbols`
+    in all, by descent from their standard deviation."""
     spread = 0.0
     for k in range(len(counts)):
         spread += (256.0 * k - mu8) ** 2 * counts[k]
@@ -382,7 +382,7 @@ def _height_width(counts: np.ndarray, mu8: int, symbols: int) -> tuple[int, int]
 
 @_compiled
 def heights(dense: np.ndarray) -> tuple[int, int, int, int, int, int, int, np.ndarray, np.ndarray]:
-    """The frequencies themselves, rounded to heights: (index of the step or -1 if none fits, differences, top,
+    """Fits a histogram, frequencies rounded to heights: (index of the step, -1 if none fits, differences, top,
     height_si16, height_mean16, cost of dense, cost of the heights, costs of the entries, heights int64 [n])."""
     n, largest = len(dense), dense[0]
     for k in range(n):
@@ -449,11 +449,11 @@ def heights(dense: np.ndarray) -> tuple[int, int, int, int, int, int, int, np.nd
 def cost_matrix(
     values: np.ndarray, counts: np.ndarray, ends: np.ndarray, windows: np.ndarray, costs: np.ndarray
 ) -> np.ndarray:
-    """Cost of each channel under each prior without its description, int64 [channels, priors].
+    """Returns the cost of each channel under each prior, without its description: int64 [channels, priors].
 
-    values, counts: int64, of all channels one after the other, which end at `ends` [channels]. windows: int64
-    [priors, 3] of (kmin, n, first of its entries in `costs`); costs int64: of all entries.
-    Symbols outside a window are listed: their number, and a position step and a distance each, an estimate.
+    values, counts: int64, concatenated over channels, which end at `ends` [channels].
+    windows: int64 [priors, 3] of (kmin, n, index of the first entry in `costs`). costs: int64, of all tables' entries.
+    The cost of exceptions, symbols outside a window, is an estimate.
     """
     matrix = np.empty((len(ends), len(windows)), np.int64)
     for column in range(len(windows)):
@@ -481,7 +481,7 @@ def cost_matrix(
 
 @_compiled
 def assign(costs: np.ndarray, prices: np.ndarray) -> tuple[np.ndarray, int]:
-    """Closes priors one by one while that saves bits: (the owner of each channel int64 [channels], the total).
+    """Removes priors one by one while that saves bits: (prior of each channel int64 [channels], total cost).
 
     costs: int64 [channels, priors]; prices: int64 [priors], of the descriptions.
     """
@@ -527,7 +527,7 @@ def assign(costs: np.ndarray, prices: np.ndarray) -> tuple[np.ndarray, int]:
 
 @_compiled
 def split_cost(channels: np.ndarray, classes: np.ndarray, count: int) -> Any:
-    """Order-0 entropy of channels int64 [m, n], each split by the `count` classes int64 [n] of its elements."""
+    """Order-0 entropy, in 2^-20 bits, of channels int64 [m, n], each split by the `count` classes int64 [n]."""
     n, cost = channels.shape[1], np.int64(0)
     sizes = np.zeros(count, np.int64)
     for i in range(n):
@@ -565,8 +565,8 @@ def gaussian_bits(values: np.ndarray, counts: np.ndarray) -> Any:
     """Sum of R(a) = -log2(Phi((k + 1/2 - mu) / sigma) - Phi((k - 1/2 - mu) / sigma)) over values k int64 [U] that occur
     counts [U] times, in bits.
 
-    mu and sigma are the symbols' mean and standard deviation (units of Q, sigma >= 2**-10), each probability is
-    clipped at 1e-6. Written with the upper tail of |k - mu|, so nothing above the clip loses more than 1e-9 of itself.
+    mu and sigma are the symbols' mean and standard deviation (units of Q, sigma >= 2**-10); each probability is at
+    least 1e-6. Computed from the upper tail of |k - mu|, so that greater probabilities are exact to one part in 1e9.
     """
     total, mu, spread, bits = counts.sum(), 0.0, 0.0, 0.0
     for i in range(len(values)):

@@ -1,10 +1,10 @@
-"""Encoder side: the cheapest prior for each channel, and priors that channels share. Nothing here is normative.
+"""Encoder: finds the cheapest prior for each channel, and priors for several channels. Nothing here is normative.
 
-Costs are exact, in units of 2^-20 bits: the integer table itself plus the prior's description. Only the position part
-of exceptions is an estimate. Files are the same with and without numba.
+Costs are in units of 2^-20 bits and exact, from the integer table and the prior's description; only the cost of
+exceptions is an estimate. Files are the same with and without numba.
 
-Sharing starts with one prior per channel, closes the prior whose description costs more than its channels lose
-elsewhere, refits the others on the channels they now serve, and repeats: k-means with a price on each centre.
+Sharing starts with one prior per channel, removes priors whose description costs more than their channels lose under
+other priors, refits the rest to the channels they now serve, and repeats: k-means with a cost per centre.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ from pd4dgs_codec.entropy.priors import (
 from pd4dgs_codec.entropy.tables import BIT, order0_bits, symbol_counts
 
 BLOCK = 256  #: channels planned together; keeps the cost matrix small
-WIDE = 1024  #: a channel with more distinct symbols spends too much on each for its prior's few bytes to matter
+WIDE = 1024  #: most distinct symbols of a channel that takes part in sharing; beyond, a prior's few bytes do not matter
 
 
 @cache
 def loops() -> ModuleType:
-    """The inner loops. Loaded with the first fit, because decoding imports this module too and must not load numba."""
+    """Imports the inner loops at the first fit: decoding imports this module too and must not load numba."""
     return import_module("pd4dgs_codec.entropy.fit_kernels")
 
 
@@ -60,13 +60,13 @@ class Histogram:
 
     @cached_property
     def gauss(self) -> Fitted:
-        """Cached, because fits with and without richer priors start from it."""
+        """The cheapest const or Gaussian, cached because fits with and without richer priors start from it."""
         return fit_gauss(self)
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A prior and its costs. costs: int64 [n], of its table's entries. price: of its description.
+    """A prior and its costs in 2^-20 bits. costs: int64 [n], of its table's entries. price: of its description.
     own: of the symbols that it was fitted to."""
 
     prior: Prior
@@ -140,20 +140,20 @@ def _fit_gauss_in(h: Histogram, window: Window) -> Fitted:
 
 
 def _fitted(prior: Prior, costs: np.ndarray, own: int, heights: int = 0) -> Fitted:
-    """heights: cost of a histogram's heights, which are coded with the symbols."""
+    """Returns the prior with its costs. heights: cost of a histogram's heights, which are coded with the symbols."""
     out = bytearray()
     prior.write(out)
     return Fitted(prior, costs, 8 * BIT * len(out) + heights, own)
 
 
 def _richer_priors(h: Histogram, found: Fitted, effort: int) -> list[Fitted]:
-    """Mixture and histogram on the window found, unless the empirical entropy shows that they cannot gain."""
+    """Fits a mixture and a histogram in the window found, unless the empirical entropy shows that they cannot gain."""
     window = found.prior.window
     dense, beside = _dense(h, window), _beside(h, window)
     seen = dense[dense > 0]
     spare = (found.own - beside) / BIT - order0_bits(seen)
     priors: list[Fitted] = []
-    if spare > 40 + 0.72 * len(seen):  # a mixture's five extra bytes; a sample's entropy is low by log2(e) / 2 each
+    if spare > 40 + 0.72 * len(seen):  # a mixture takes five more bytes; a sample's entropy is low by log2(e) / 2 each
         mu1, si1, mu2, si2, weight, floor, cost, costs = loops().mixture(dense, effort)
         mixture = Mixture(window, Normal(mu1, si1), Normal(mu2, si2), weight, FLOORS[floor])
         priors.append(_fitted(mixture, costs, cost + beside))
@@ -177,7 +177,7 @@ def _dense(h: Histogram, window: Window) -> np.ndarray:
 
 
 def _beside(h: Histogram, window: Window) -> int:
-    """Cost of exceptions, which the table does not include."""
+    """Cost of the symbols outside the window as exceptions."""
     if window.kmin <= h.values[0] and h.values[-1] < window.end:
         return 0
     free = Fitted(Const(window), np.zeros(window.n, np.int64), 0, 0)
@@ -185,7 +185,7 @@ def _beside(h: Histogram, window: Window) -> int:
 
 
 def _windows(h: Histogram) -> list[Window]:
-    """The full range, or its fullest window of the largest size, and narrower windows without its outliers.
+    """Returns the full range, or the fullest window of the largest size, and narrower windows without its outliers.
 
     An outlier costs 20 bits inside the window and at least 24 as an exception: trimming gains only for wide windows.
     """
@@ -193,7 +193,7 @@ def _windows(h: Histogram) -> list[Window]:
     if high - low < 512:
         return [_window(low, high)]
     if high - low >= MAX_WINDOW:
-        ends = np.searchsorted(h.values, h.values + MAX_WINDOW)  # of a window from each value on
+        ends = np.searchsorted(h.values, h.values + MAX_WINDOW)  # of a window that begins at each value
         inside = np.diff(np.concatenate([[0], np.cumsum(h.counts)])[np.stack([np.arange(len(ends)), ends])], axis=0)
         fullest = int(inside.argmax())
         low, high = int(h.values[fullest]), int(h.values[ends[fullest] - 1])
@@ -226,8 +226,8 @@ Fit = Callable[[Histogram], Fitted]
 
 
 def plan_priors(histograms: Sequence[Histogram], fit: Fit, rounds: int, known: Sequence[Fitted] = ()) -> list[Fitted]:
-    """The prior of each channel; channels that share one hold the same object. known: priors that were described
-    earlier."""
+    """Returns the prior of each channel; channels that share one get the same object. rounds: of sharing at most.
+    known: priors that were described earlier, at no cost now."""
     plan = [fit(h) for h in histograms]
     free = [replace(fitted, price=0) for fitted in known]
     if free and plan:
@@ -246,8 +246,8 @@ def plan_priors(histograms: Sequence[Histogram], fit: Fit, rounds: int, known: S
 
 
 def _within_limit(histograms: Sequence[Histogram], plan: list[Fitted], free: list[Fitted], fit: Fit) -> list[Fitted]:
-    """The plan. If its tables are larger than a section may define, one prior for all their channels replaces the
-    widest new ones, or known priors do if there is no room for one."""
+    """Returns the plan, changed if its tables have more entries than a section may define: then one prior for all their
+    channels replaces the widest new priors, or known priors do if there is no room for one."""
     known = {id(p.prior) for p in free}
     distinct = {id(p.prior): p for p in plan if id(p.prior) not in known}.values()
     ordered = sorted(distinct, key=lambda p: p.prior.window.n)
@@ -291,6 +291,6 @@ def _plan_block(
 
 
 def _refit(histograms: Sequence[Histogram], owner: np.ndarray, fit: Fit) -> list[Fitted]:
-    """A prior fitted to all of its channels, for each prior that serves several."""
+    """For each prior that serves several channels, fits a new one to all of them."""
     members = [np.flatnonzero(owner == p).tolist() for p in np.unique(owner)]
     return [fit(pool([histograms[c] for c in shared])) for shared in members if len(shared) > 1]

@@ -1,8 +1,8 @@
-"""The same symbols under LZMA, in the layout that suits LZMA best.
+"""Mode lzma: channels coded by LZMA2 instead of ANS, in the byte layout that LZMA2 codes best.
 
-Payload: one byte of flags (bit 0: the bytes of wide numbers lie in separate planes), then per non-empty channel a
-varint of (zigzag(base) << 2 | log2(width)); then one raw LZMA2 stream of the channels in order, each as little-endian
-signed integers k - base of the narrowest width.
+A payload has one byte of flags (bit 0: the bytes of wide numbers lie in separate planes), a varint (zigzag(base) << 2 |
+log2(width)) per non-empty channel, and one raw LZMA2 stream of the channels in order, each as little-endian signed
+integers k - base of the narrowest width in bytes.
 """
 
 import itertools
@@ -24,7 +24,7 @@ _SIGNED: list[np.dtype] = [np.dtype("<i1"), np.dtype("<i2"), np.dtype("<i4")]
 
 
 def encode_channels_lzma(channels: Sequence[np.ndarray], *, effort: int = 5) -> bytes:
-    """The payload of int32 channels (1-D, |k| <= 2**24 - 1). effort 1..9 bounds the search for settings."""
+    """Encodes int32 channels (1-D, |k| <= 2**24 - 1). effort: 1..9, settings to try. Raises EncodeError."""
     head, numbers = bytearray(), list[np.ndarray]()
     for array in check_channels(channels):
         if len(array):
@@ -58,7 +58,7 @@ def decode_channels_lzma(payload: bytes | memoryview, counts: Sequence[int]) -> 
 
 
 def _narrowest(low: int, high: int) -> tuple[int, int]:
-    """(base, log2(width)): base 0 if it is no wider than the centred one."""
+    """Returns (base, log2(width)) of the narrowest width; base is 0 if that takes no wider numbers."""
     for log_width, limit in enumerate((1 << 7, 1 << 15)):
         if -limit <= low and high < limit:
             return 0, log_width
@@ -136,7 +136,7 @@ def _decompress(
 
 
 def _inflate(packed: bytes, size: int) -> bytes:
-    """Exactly `size` bytes. Asks for at most one more, which detects a longer stream."""
+    """Decompresses exactly `size` bytes. Asks for one more to detect a longer stream. Raises Malformed."""
     decoder = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=_filters(size, 3, 0, 0))
     try:
         data = decoder.decompress(packed, max_length=size + 1)

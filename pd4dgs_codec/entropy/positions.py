@@ -3,15 +3,15 @@
 Payload (clause 10 of the format; the decoder knows N)
     Empty for N = 0. Else three zigzag varints, the minimum of the cells along x, y, z, and u8 R, the bit length of the
     largest cell - minimum. The octree has one node of side 2**R; at level = R .. 1 every node is replaced by its
-    occupied children, in Morton order. While there are fewer than N nodes, a level states two varints: how many nodes
-    have one child, and how many children there are beyond one or, for the other nodes, two. After the last such level
-    come six varints: how many nodes have 2 .. 7 children. So the length of every channel is known, and the rest is one
-    section of coded channels (`channels`).
+    occupied children, in Morton order. A level of fewer than N nodes states two varints: the number of nodes with one
+    child, and the sum of (children - 2) over its other nodes. After the last such level come six varints, the numbers
+    of nodes with 2 .. 7 children. These give the length of every channel. The rest is one section of coded channels
+    (`channels`).
 
 Channels
-    Per level: the numbers of children less one, of the nodes whose parent has one child and of the others (both left
-    out once there are N nodes), and the child numbers of the nodes with one child. Then, over all levels, what the
-    nodes with 2 .. 7 children have: a pattern's index among those of its size.
+    Per level, three channels: the number of children less one, of the nodes whose parent has one child and of the other
+    nodes (both left out once there are N nodes), and the child number of each node with one child. Then, over all
+    levels, six channels: for the nodes with 2 .. 7 children, the index of the pattern among patterns of its size.
 
 Every table is static, so a level is one vectorised step.
 """
@@ -26,24 +26,24 @@ from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
 from pd4dgs_codec.errors import EncodeError, Malformed
 from pd4dgs_codec.morton import AXIS_BITS, MAX_VOXEL, join_bits, morton_codes
 
-LEAST_EFFORT = 3  #: with less, channels have Gaussians and do not share them: 4 to 13 % more bytes
+LEAST_EFFORT = 3  #: below it, channels share no priors, and at 1 have only Gaussians: 4 to 13 % more bytes
 
 _BYTES = np.arange(256)
-_CHILDREN = np.array([value.bit_count() for value in range(256)])  # of an occupancy byte
+_CHILDREN = np.array([value.bit_count() for value in range(256)])  # by occupancy byte
 _PATTERNS = [np.flatnonzero(_CHILDREN == k) for k in range(9)]  #: bytes with k children, ascending
-_INDEX = np.zeros(256, dtype=np.int32)  # of a byte among those with as many children
+_INDEX = np.zeros(256, dtype=np.int32)  # of a byte among the bytes with as many children
 for _patterns in _PATTERNS:
     _INDEX[_patterns] = np.arange(len(_patterns))
-#: Child numbers of a byte, ascending; those past its last child are unused.
+#: Child numbers by byte, ascending; entries past the last child are unused.
 _CHILD = np.argsort((_BYTES[:, None] >> np.arange(8) & 1) == 0, axis=1, kind="stable")
 _CODED = range(2, 8)  # numbers of children with more than one pattern; nodes with one child have channels of their own
 
 
 def encode_positions(cells: np.ndarray, effort: int = 5, known: list[Fitted] | None = None) -> bytes:
-    """The payload of cells int32 [N, 3] (voxels), which must be distinct and in Morton order (`morton_order`).
+    """Encodes cells int32 [N, 3] (voxels), which must be distinct and in Morton order (`morton_order`).
 
-    effort: 1..9, time spent on fitting tables, of which there are few. known: priors of earlier payloads, to which
-    new ones are appended. Raises EncodeError as position_channels does.
+    effort: 1..9, time spent on fitting tables; at least LEAST_EFFORT is used. known: priors of earlier payloads, to
+    which new ones are appended. Raises EncodeError as position_channels does.
     """
     head, channels = position_channels(cells)
     if not head:
@@ -55,7 +55,7 @@ def encode_positions(cells: np.ndarray, effort: int = 5, known: list[Fitted] | N
 
 
 def position_channels(cells: np.ndarray) -> tuple[bytes, list[np.ndarray]]:
-    """(bytes before the section of coded channels, the channels); no bytes for no cells.
+    """Returns (bytes before the section of coded channels, channels), both empty without cells.
 
     Raises EncodeError unless the cells are distinct, in Morton order and within -2**20 .. 2**20.
     """
@@ -97,7 +97,7 @@ def position_channels(cells: np.ndarray) -> tuple[bytes, list[np.ndarray]]:
 
 
 def _occupancies(codes: np.ndarray, depth: int) -> list[np.ndarray]:
-    """Per level, the root's first: the occupancy byte, int64 [nodes], of each node in Morton order."""
+    """Returns the occupancy bytes int64 [nodes] of each level, from the root, with nodes in Morton order."""
     levels = []
     for _ in range(depth):
         parents = codes >> 3
@@ -108,10 +108,10 @@ def _occupancies(codes: np.ndarray, depth: int) -> list[np.ndarray]:
 
 
 def decode_positions(payload: bytes | memoryview, count: int, known: list[Prior] | None = None) -> np.ndarray:
-    """The cells int32 [count, 3] of a payload, in Morton order. Memory is O(count), whatever the bytes say.
+    """Decodes cells int32 [count, 3], in Morton order. Memory is O(count), whatever the bytes say.
 
     known: priors of earlier payloads, to which this payload's are appended.
-    Raises Malformed or LimitExceeded if the payload is not one that encode_positions could make for them.
+    Raises Malformed, LimitExceeded or UnsupportedFeature for a payload that encode_positions could not write.
     """
     if count <= 0:
         if count or len(payload):
@@ -141,7 +141,7 @@ def decode_positions(payload: bytes | memoryview, count: int, known: list[Prior]
 
 
 def _read_counts(reader: ByteReader, depth: int, count: int) -> tuple[list[int], list[int]]:
-    """Per level from the root: the number of nodes, and of those with one child."""
+    """Reads, per level from the root, the number of nodes and the number of nodes with one child."""
     nodes, single, have = list[int](), list[int](), 1
     for _ in range(depth):
         nodes.append(have)
@@ -161,7 +161,7 @@ def _read_counts(reader: ByteReader, depth: int, count: int) -> tuple[list[int],
 
 
 def _grow(channels: list[np.ndarray], nodes: list[int], single: list[int], sizes: list[int], count: int) -> np.ndarray:
-    """The codes int64 [count] of the cells, in Morton order."""
+    """Expands the octree to the Morton codes int64 [count] of its cells, ascending."""
     first = len(channels) - len(sizes)
     levels = iter(channels[:first])
     patterns = {k: _within(c, len(_PATTERNS[k])) for k, c in zip(_CODED, channels[first:], strict=False)}
@@ -196,7 +196,7 @@ def _grow(channels: list[np.ndarray], nodes: list[int], single: list[int], sizes
 
 
 def _within(symbols: np.ndarray, size: int) -> np.ndarray:
-    """The symbols; Malformed unless all are in 0 .. size - 1."""
+    """Returns the symbols. Raises Malformed unless all are in 0 .. size - 1."""
     if symbols.size and not (int(symbols.min()) >= 0 and int(symbols.max()) < size):
         found = f"{int(symbols.min())}..{int(symbols.max())}"
         raise Malformed(f"positions: symbols in {found}, expected 0..{size - 1}")

@@ -2,8 +2,8 @@
 
 A prior covers a window of symbols kmin .. kmin + n - 1. Symbols outside it are exceptions, listed beside the prior.
 
-Adding a prior: a subclass of `_Tabled` with an id, `cum`, `write` and `read`, and its name in `Prior`. `make_models` is
-only faster: a family that it does not list makes its tables one by one.
+A new prior needs a subclass of `_Tabled` with an id, `cum`, `write` and `read`, and its name in `Prior`. `make_models`
+only saves time: a family that it does not list makes its tables one by one.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from pd4dgs_codec.errors import Malformed, UnsupportedFeature
 
 K_MAX = (1 << 24) - 1  #: |k| of any symbol
 MAX_WINDOW = 1 << 14
-#: Most entries of all tables that a section defines, beyond one per symbol: without earlier definitions, and with them.
-#: Eight bytes can define a table of 2**14 entries, 128 KiB, in each section of each slice.
+#: Most entries of all tables that a section defines, beyond one per symbol: without and with earlier priors. They bound
+#: memory: eight bytes can define a table of 2**14 entries, 128 KiB, in each section of each slice.
 FREE_ENTRIES, MORE_ENTRIES = 1 << 18, 1 << 10
 MU8_MAX = 1 << 31
 FLOORS = (1, 16)  #: 16 / 2**24 is the clip of R(a)
@@ -84,7 +84,7 @@ class Normal:
 
 
 class _Tabled:
-    """What priors have in common: the table cum int64 [n + 1] and its model, which `make_models` sets for many."""
+    """Base of all priors: the table cum int64 [n + 1] and its model, which `make_models` can set for many at once."""
 
     @cached_property
     def cum(self: Any) -> np.ndarray:
@@ -160,7 +160,7 @@ class Mixture(_Tabled):
 
 @dataclass(frozen=True, eq=False)
 class Hist(_Tabled):
-    """A histogram: frequencies as heights in units of `step` / 64 octaves, up to `top`; 0 is absent.
+    """A histogram: frequencies as heights in units of `step` / 64 octaves, up to `top`; height 0 is an absent symbol.
 
     The heights (or their differences) are coded in the ANS stream, before all channels, under a Gaussian of their own.
     """
@@ -176,7 +176,7 @@ class Hist(_Tabled):
 
     @property
     def height_normal(self) -> tuple[int, Normal]:
-        """Number of entries and Gaussian of the heights' table."""
+        """(number of entries, Gaussian) of the heights' table."""
         n, mu8 = (2 * self.top + 1, 256 * self.top) if self.differences else (self.top + 1, 16 * self.height_mean16)
         return n, Normal(mu8, 16 * self.height_si16 - 160)
 
@@ -226,12 +226,12 @@ AnyPrior = TypeVar("AnyPrior", bound=Prior)
 _FAMILIES: dict[int, type[Prior]] = {family.id: family for family in get_args(Prior)}
 
 
-#: Table entries made at a time: enough to save numpy's calls, few enough to save memory.
+#: Table entries made at a time: enough to save numpy calls, few enough to save memory.
 BATCH = 1 << 14
 
 
 def make_models(priors: Sequence[Prior]) -> None:
-    """Fills in `model` of Gaussians and mixtures, and `height_model` of histograms, many in one pass."""
+    """Sets `model` of Gaussians and mixtures, and `height_model` of histograms, many in one pass."""
     for batch in _batches([prior for prior in priors if isinstance(prior, Gauss | Mixture | Hist)]):
         for prior, model in zip(batch, models_of_each(*normal_tables(batch)), strict=True):
             # where cached_property keeps it
@@ -239,7 +239,7 @@ def make_models(priors: Sequence[Prior]) -> None:
 
 
 def _batches(priors: Sequence[AnyPrior]) -> Iterator[list[AnyPrior]]:
-    """The priors in order, with windows of about BATCH entries together."""
+    """Yields the priors in order, in batches whose windows have about BATCH entries together."""
     batch, entries = list[AnyPrior](), 0
     for prior in priors:
         batch.append(prior)
@@ -252,7 +252,7 @@ def _batches(priors: Sequence[AnyPrior]) -> Iterator[list[AnyPrior]]:
 
 
 def normal_tables(priors: Sequence[Prior]) -> tuple[np.ndarray, np.ndarray]:
-    """(concatenated tables int64, their sizes int64 [m]): of histograms, the tables of their heights."""
+    """Returns (concatenated tables int64, their sizes int64 [m]); for histograms, the tables of their heights."""
     rows = list[tuple[int, Normal, int]]()
     for prior in priors:
         if isinstance(prior, Hist):
@@ -274,7 +274,7 @@ def normal_tables(priors: Sequence[Prior]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def with_height_symbols(priors: Sequence[Hist], symbols: Sequence[np.ndarray]) -> list[Hist]:
-    """The histograms, at least one, with the heights of their symbols of height_cum, int32 [n] each, and with `model`.
+    """Returns the histograms with `heights` from their symbols under height_cum, int32 [n] each, and with `model` set.
 
     Raises Malformed for heights out of range."""
     whole = list[Hist]()
@@ -309,12 +309,12 @@ def _columns(normals: Sequence[Normal]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def top_limit(step: int) -> int:
-    """The largest height a histogram may have: heights reach 31 octaves below the largest frequency."""
+    """Returns the largest height of a histogram: heights reach 31 octaves below the largest frequency."""
     return 1 + 31 * 64 // step
 
 
 def read_prior(reader: ByteReader, family: int) -> Prior:
-    """A prior of a family, by its own `read`. Raises UnsupportedFeature for one outside the registry."""
+    """Reads a prior of a family. Raises UnsupportedFeature for a family outside the registry."""
     if family not in _FAMILIES:
         raise UnsupportedFeature(f"prior {family} is not in the registry {sorted(_FAMILIES)}", offset=reader.offset)
     return _FAMILIES[family].read(reader)

@@ -1,4 +1,4 @@
-"""Integer frequency tables: the only probabilities that enter the format; costs of symbols, for encoders.
+"""Integer frequency tables, the only probabilities in the format, and costs of symbols for encoders.
 
 A table is ``cum`` int64 [n + 1], strictly increasing from 0 to 2**24; symbol q owns the interval [cum[q], cum[q + 1]).
 Every rule below uses integers below 2**53 only, so Python, C and JavaScript build the same table on every machine.
@@ -19,7 +19,7 @@ OCTAVE = np.array([round(2.0 ** (31 - j / 64)) for j in range(64)], dtype=np.int
 
 
 def _mass(t: np.ndarray, si: np.ndarray) -> np.ndarray:
-    """The Gaussian's mass up to t / 256 from its mean, in units of 2**-28; si broadcasts against t."""
+    """Returns a Gaussian's mass up to t / 256 from its mean, in units of 2**-28; si broadcasts against t."""
     e, nb = si >> 6, np.maximum(0, (si >> 6) - 8)
     a = np.minimum(np.abs(t) >> nb, (1 << 21) - 1)
     z = np.minimum((a * OCTAVE[si & 63]) >> (23 + e - nb), 8 << 16)
@@ -30,22 +30,21 @@ def _mass(t: np.ndarray, si: np.ndarray) -> np.ndarray:
 
 
 def norm_cdf28_of_each(sizes: np.ndarray, mu8: np.ndarray, si: np.ndarray) -> np.ndarray:
-    """C(k) for k = -1 .. n - 1 of many Gaussians, int64 [m] each, concatenated, in units of 2**-28: the mass up to
-    k + 1/2. A table uses neither the first nor the last value.
+    """Returns C(k), the mass up to k + 1/2 in units of 2**-28, for k = -1 .. n - 1 of many Gaussians, concatenated.
 
-    mu8: 256 * (mean - kmin), in symbols; si: 64 * log2(sigma / Q). Calling numpy for each short table would take longer
-    than decoding it.
+    sizes, mu8, si: int64 [m], the n of each Gaussian, 256 * (mean - kmin) in symbols, and 64 * log2(sigma / Q). A table
+    uses neither the first nor the last value. Calling numpy for each short table would take longer than decoding it.
     """
     lengths = sizes + 1
     return _mass(_counted(lengths) * 256 - np.repeat(128 + mu8, lengths), np.repeat(si, lengths))
 
 
 def tables_of_each(cdf: np.ndarray, sizes: np.ndarray, floor: np.ndarray) -> np.ndarray:
-    """NormTable v1: the tables of `sizes` from a result of norm_cdf28_of_each, with a floor int64 [m] each, joined.
+    """NormTable v1: returns the concatenated tables of a result of norm_cdf28_of_each. sizes, floor: int64 [m].
 
-    Each symbol gets the floor plus its share of the rest; the first one has the mass below the window, the last one
-    that above. The caller has checked the limits of clause 8.2: sizes 1 .. 2**14, si within SI_MIN .. SI_MAX, |mu8| <
-    2**40, floors up to 16.
+    Each symbol gets the floor plus its share of the rest; the first also gets the mass below the window, the last the
+    mass above it. The caller has checked the limits of clause 8.2: sizes 1 .. 2**14, si within SI_MIN .. SI_MAX, |mu8|
+    < 2**40, floors up to 16.
     """
     lengths = sizes + 1
     ends = np.cumsum(lengths)
@@ -56,13 +55,13 @@ def tables_of_each(cdf: np.ndarray, sizes: np.ndarray, floor: np.ndarray) -> np.
 
 
 def _counted(lengths: np.ndarray) -> np.ndarray:
-    """0 .. length - 1 of each of `lengths`, concatenated."""
+    """Returns 0 .. length - 1 for each of `lengths`, concatenated."""
     counted: np.ndarray = np.arange(int(lengths.sum())) - np.repeat(np.cumsum(lengths) - lengths, lengths)
     return counted
 
 
 def histogram_table(freqs: np.ndarray) -> np.ndarray:
-    """cum int64 [n + 1] from non-negative weights [n], each < 2**31, n <= 2**14, not all zero.
+    """Returns cum int64 [n + 1] from non-negative weights [n], each < 2**31, n <= 2**14, not all zero.
 
     With W(q) the sum of the first q weights and s = max(0, bits(W(n)) - 28):
     cum[q] = ((W(q) >> s) * (2**24 - n)) // (W(n) >> s) + q, so that an absent symbol keeps 2**-24.
@@ -87,13 +86,13 @@ def histogram_tables_of_each(freqs: np.ndarray, sizes: np.ndarray) -> np.ndarray
 
 # -- costs -----------------------------------------------------------------------------------------------------------
 
-BIT = 1 << 20  #: one bit, where costs are integers, whose sums do not depend on their order
+BIT = 1 << 20  #: one bit in integer costs, whose sums do not depend on their order
 #: log2(1 + i / 4096) in these units, the last one twice. Linear interpolation is off by less than 2e-8 bits.
 LOG2 = np.rint(np.log2(1 + np.minimum(np.arange(4098), 4096) / 4096) * BIT).astype(np.int64)
 
 
 def frequency_costs(frequencies: np.ndarray) -> np.ndarray:
-    """24 - log2 of frequencies int64 [...] from 1 to 2^24, of 2^24 in all: int64 [...] in units of 2^-20 bits."""
+    """Returns the costs 24 - log2(f), int64 [...] in units of 2^-20 bits, of frequencies f int64 [...], 1 .. 2^24."""
     bits = frequencies.astype(np.float64).view(np.int64)  # exponent and mantissa, IEEE 754
     i, f = (bits >> 40) & 4095, (bits >> 28) & 4095
     log2: np.ndarray = (((bits >> 52) - 1023) * BIT) + LOG2[i] + (((LOG2[i + 1] - LOG2[i]) * f) >> 12)
@@ -101,8 +100,8 @@ def frequency_costs(frequencies: np.ndarray) -> np.ndarray:
 
 
 def symbol_counts(symbols: np.ndarray, times: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """(values int64 [U], ascending, counts int64 [U]) of integer symbols, at least one. times: int [N], how often each
-    counts, if not once."""
+    """Returns (values int64 [U], ascending, counts int64 [U]) of integer symbols, at least one.
+    times: int [N], how often each symbol counts; once if None."""
     low, high = int(symbols.min()), int(symbols.max())
     if high - low > 4 * symbols.size + 1024:  # too wide for an array of counts, which is faster than sorting
         values, index = np.unique(symbols, return_inverse=True)
