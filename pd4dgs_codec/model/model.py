@@ -4,8 +4,8 @@ Render_0    = R(MLP(A))
 Render_1(t) = R(MLP(A + F_global(A, t)))
 Render_2(t) = R(MLP(A + F_local(A, t)))
 
-A: anchors (feature, log-scaling, offsets on a voxel grid), of which the scaffold's networks make Gaussians. F_global
-reads the planes of layer 1, coarse in space and time; F_local, in its place, reads these and the finer ones of layer 2.
+A: anchors on a voxel grid (feature, log-scaling, offsets), from which the scaffold's networks make Gaussians. F_global
+reads the planes of layer 1, coarse in space and time. F_local replaces it and also reads the finer planes of layer 2.
 The gate m^(level) multiplies each Gaussian's opacity and scale.
 """
 
@@ -25,8 +25,8 @@ from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.networks import EXACT, MLP, Quantisation, Rounding, level_mask
 from pd4dgs_codec.scene import MASK_THRESHOLD, SCAFFOLD_NETWORKS, Camera, SceneInfo, Steps, Widths
 
-#: Opacities of an anchor's Gaussians start spread between these, so that some but not all are seen everywhere: they
-#: start at one place.
+#: Range over which the opacity biases of an anchor's Gaussians, which start at one place, are spread at the start: some
+#: but not all of them are visible everywhere.
 START_OPACITY = (-0.1, 0.2)
 
 
@@ -89,14 +89,14 @@ class Model(nn.Module):
 
     @property
     def widths(self) -> Widths:
-        """Feature width, slots and what its networks take, as its tensors have them."""
+        """The widths of anchors and networks, read off the tensors."""
         features = self.feature.shape[1]
         viewing = tuple(n for n in SCAFFOLD_NETWORKS if self.network(n).layers[0].in_features > features)
         return Widths(features, self.offset.shape[1], viewing=viewing)
 
     @property
     def spacing(self) -> Tensor:
-        """[N], 2^c: the factor of the steps of each anchor's attributes."""
+        """[N], 2^c: the factor on the steps of each anchor's attributes."""
         return torch.exp2(self.step_class.float())
 
     @property
@@ -118,11 +118,11 @@ class Model(nn.Module):
         return max(self.deformations, default=0)
 
     def network(self, name: str) -> MLP:
-        """One of the scaffold's decoders."""
+        """Returns the scaffold's decoder `name`."""
         return cast(MLP, self.networks[name])
 
     def masks(self, level: int) -> Tensor:
-        """m^(level) [N]."""
+        """Returns the masks m^(level) [N]."""
         return level_mask(self.mask_logits, level)
 
     @torch.no_grad()
@@ -136,8 +136,8 @@ class Model(nn.Module):
     def gaussians(
         self, level: int, t: float, camera: Camera, rounding: Rounding = EXACT, only: Tensor | None = None
     ) -> Gaussians:
-        """The Gaussians of `level` at normalised time t in 0..1 as the camera meets them; only of the anchors `only`
-        (bool [N]) if given. By the kernels where they take the model, else in plain torch."""
+        """Returns the Gaussians of `level` that the camera may see at normalised time t in 0..1, of the anchors `only`
+        (bool [N]) if given. The kernels evaluate them if they support the model, else plain torch does."""
         kernels, masks, slots = self._fusible(), self.masks(level), self.widths.slots
         stages: Any = fused if kernels else reference
         rows, viewmat = self._visible(masks, self.anchor, camera, only), self._viewmat(camera)
@@ -152,7 +152,7 @@ class Model(nn.Module):
         return Gaussians(means, quats, *gated, colors, kept, rows, raw_opacity)
 
     def _picked(self, rows: Tensor, rounding: Rounding) -> tuple[Any, ...]:
-        """The arguments of `pick` for the anchors `rows`: attributes, positions, rows and how they are quantised."""
+        """Returns the arguments of `pick` for the anchors `rows`: attributes, positions, rows and quantisation."""
         noise = None
         if rounding.noise is not None and not rounding.attributes:
             taken = self.feature, self.scaling_log, self.offset  # in the order in which they take noise
@@ -165,7 +165,7 @@ class Model(nn.Module):
         return [getattr(self, name) for name in names], self.anchor, rows, quantisation
 
     def _moved(self, level: int, rows: Tensor, t: float, rounding: Rounding, kernels: bool) -> Tensor:
-        """The rows of anchors plus the residuals of the deformation of `level`."""
+        """Returns the rows of anchors plus the residuals of the deformation of `level`."""
         layers = [layer for layer in self.deformations if layer <= level]
         if not layers:
             return rows
@@ -185,7 +185,7 @@ class Model(nn.Module):
 
     @torch.no_grad()
     def round_to_steps(self) -> None:
-        """Rounds all parameters but the masks in place to multiples of their steps: what `Rounding` imitates."""
+        """Rounds all parameters but the masks in place to multiples of their steps, as `Rounding` simulates."""
         steps = self.steps
         for name, centre in self.centres.items():
             values = getattr(self, name)
@@ -199,15 +199,15 @@ class Model(nn.Module):
                 parameter.copy_(torch.round(parameter / step) * step)
 
     def _fusible(self) -> bool:
-        """Whether `fused` can evaluate all of the model."""
+        """Whether `fused` can evaluate the whole model."""
         fields = all(field.fusible for field in self.deformations.values())
         networks = [self.network(name) for name in SCAFFOLD_NETWORKS]
         return fields and fused.fusible(networks) and self.feature.device.type == "cpu"
 
 
 def fresh_networks(widths: Widths, hidden: int) -> dict[str, MLP]:
-    """The scaffold's decoders, untrained."""
+    """Returns untrained decoders of the scaffold."""
     networks = {name: MLP((widths.inputs[name], hidden, outputs)) for name, outputs in widths.networks.items()}
-    with torch.no_grad():  # else chance decides what is ever seen
+    with torch.no_grad():  # random biases could hide anchors for good
         networks["opacity"].layers[-1].bias.copy_(torch.linspace(*START_OPACITY, widths.slots))
     return networks

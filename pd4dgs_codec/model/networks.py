@@ -1,4 +1,4 @@
-"""Parts of the model: imitation of quantisation, multi-layer perceptrons, and the masks of the levels."""
+"""Parts of the model: simulated quantisation, multi-layer perceptrons, and the masks of the levels."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch.nn import functional as F
 
 from pd4dgs_codec.scene import Network
 
-POOL = 1 << 23  #: numbers of `Noise`
+POOL = 1 << 23  #: size of the pool of `Noise`
 
 
 class Noise:
@@ -24,7 +24,7 @@ class Noise:
         self.pool = (torch.rand(POOL, generator=self.generator) - 0.5).to(device)
 
     def draw(self, shape: torch.Size) -> Tensor:
-        """A tensor of `shape`."""
+        """Returns noise of `shape`."""
         n = shape.numel()
         if n > len(self.pool):
             return torch.rand(shape, generator=self.generator).to(self.pool.device) - 0.5
@@ -34,8 +34,8 @@ class Noise:
 
 @dataclass(frozen=True)
 class Rounding:
-    """How a training step imitates quantisation: noise on the anchors' attributes, or rounding of them; and rounding of
-    the other parameters. Rounding is straight-through."""
+    """How a training step simulates quantisation. noise: added to the anchors' attributes. attributes: they are rounded
+    instead. weights: the other parameters are rounded. Rounding is straight-through."""
 
     noise: Noise | None = None
     attributes: bool = False
@@ -46,9 +46,9 @@ EXACT = Rounding()
 
 
 class Quantisation(NamedTuple):
-    """How the attributes of anchors are quantised: the step of each attribute, its centre, of which rounded values
-    differ by multiples of the step, the factor `spacing` [N] of each anchor's steps, and the noise in steps [n, width]
-    of each attribute, None without; rounding: round in place of the noise."""
+    """How the attributes of n of N anchors are quantised: to centre plus multiples of step * spacing. steps, centres:
+    per attribute. spacing: [N], per anchor. noise: per attribute [n, width], in steps, or None. rounding: round instead
+    of adding noise."""
 
     steps: Sequence[float]
     centres: Sequence[Tensor]
@@ -58,7 +58,7 @@ class Quantisation(NamedTuple):
 
 
 def rounded(x: Tensor, step: float | Tensor | None) -> Tensor:
-    """round(x / step) * step; x itself if step is None. For use within a forward pass, outside of the graph."""
+    """Returns round(x / step) * step, or x itself if step is None. For custom forward passes, outside the graph."""
     return x if step is None else torch.div(x, step).round_().mul_(step)
 
 
@@ -73,7 +73,7 @@ class _Round(torch.autograd.Function):
 
 
 def round_straight_through(x: Tensor, step: float | Tensor | None) -> Tensor:
-    """`rounded` with the identity's gradient."""
+    """`rounded`, with the gradient of the identity."""
     if step is None:
         return x
     found: Tensor = _Round.apply(x, step)  # type: ignore[no-untyped-call]
@@ -100,7 +100,7 @@ class MLP(nn.Module):
         return x
 
     def arrays(self) -> Network:
-        """The weights as numpy arrays, input side first."""
+        """Returns the layers as numpy arrays, input side first."""
         return tuple(
             (lin.weight.detach().cpu().numpy().copy(), lin.bias.detach().cpu().numpy().copy()) for lin in self.layers
         )
@@ -117,7 +117,7 @@ class MLP(nn.Module):
 
     @staticmethod
     def arrays_of_state(state: Mapping[str, np.ndarray], prefix: str) -> Network:
-        """The arrays of the network whose parameters are named `prefix` in a state dictionary of arrays."""
+        """Returns the network whose parameters have names with `prefix` in a state dictionary of arrays."""
         count = sum(key.startswith(f"{prefix}.linears.") and key.endswith(".weight") for key in state)
         names = [f"{prefix}.linears.{i}" for i in range(count)]
         return tuple((state[f"{name}.weight"], state[f"{name}.bias"]) for name in names)
@@ -127,10 +127,10 @@ class MLP(nn.Module):
 
 
 def level_mask(logits: Tensor, level: int) -> Tensor:
-    """m^(level) [N] of logits [N, 3]: sigmoid(a0 + sum_{1<=j<=level} softplus(a_j)), so never falling with level.
+    """Returns m^(level) [N] = sigmoid(a_0 + sum_{1<=j<=level} softplus(a_j)) of logits [N, 3]; it rises with the level.
 
-    Above level 0 the gradient does not reach a_0: else layer 0 would hold the anchors of higher levels too, and the
-    levels' masks would stay together.
+    Above level 0 the gradient does not reach a_0. Otherwise layer 0 would hold the anchors of higher levels too, and
+    the levels' masks would stay together.
     """
     columns = logits.T.contiguous()  # torch vectorises contiguous tensors only
     total = columns[0].detach() if level else columns[0]
@@ -140,7 +140,7 @@ def level_mask(logits: Tensor, level: int) -> Tensor:
 
 
 def mask_logits(masks: np.ndarray) -> np.ndarray:
-    """Logits float32 [N, 3] whose level masks are `masks` [N, 3], non-decreasing along axis 1, to within 1e-6."""
+    """Returns logits float32 [N, 3] of the level masks `masks` [N, 3], non-decreasing along axis 1, to within 1e-6."""
     m = np.clip(masks.astype(np.float64), 1e-7, 1 - 1e-7)
     total = np.log(m) - np.log1p(-m)
     rise = np.maximum(np.diff(total, axis=1), 1e-13)

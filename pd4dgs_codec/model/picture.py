@@ -1,4 +1,4 @@
-"""Pictures with gradients: Render_level of a model, and `rasterization` of any Gaussians by one of three backends.
+"""Differentiable rendering: Render_level of a model, and `rasterization` of any Gaussians by one of three backends.
 
 `cpu` is numba (`draw.rasteriser`), `gsplat` is CUDA, `reference` (`reference.py`) is a dense float64 torch oracle.
 """
@@ -27,7 +27,7 @@ from pd4dgs_codec.model.networks import EXACT, Rounding
 from pd4dgs_codec.scene import Camera, SceneInfo
 
 BACKENDS = ("auto", "cpu", "gsplat", "reference")
-#: The clamp on alpha is compiled into gsplat and changed between versions; only a version with ours is accepted.
+#: The clamp on alpha is compiled into gsplat and differs between versions; only a version with ALPHA_MAX is accepted.
 ALPHA_MAX_OF_VERSION = {"1.5": 0.999, "1.6": 0.99}
 
 Drawn = tuple[Tensor, Tensor, dict[str, Tensor]]
@@ -35,8 +35,8 @@ Drawn = tuple[Tensor, Tensor, dict[str, Tensor]]
 
 @dataclass
 class Picture:
-    """image [H, W, 3] (may exceed 1 slightly where Gaussians overlap numerically), alpha [H, W], the Gaussians, and the
-    meta of `rasterization`."""
+    """A rendered image [H, W, 3] (it may exceed 1 slightly by rounding), alpha [H, W], the Gaussians, and the meta of
+    `rasterization`."""
 
     image: Tensor
     alpha: Tensor
@@ -47,7 +47,7 @@ class Picture:
 def render(
     model: Model, level: int, t: float, camera: Camera, rounding: Rounding = EXACT, only: Tensor | None = None
 ) -> Picture:
-    """Render_level at normalised time t in 0..1, of the anchors `only` (bool [N]) if given."""
+    """Renders `level` at normalised time t in 0..1, only the anchors `only` (bool [N]) if given."""
     check_time(t)
     gaussians = model.gaussians(level, t, camera, rounding, only)
     if torch.is_grad_enabled():
@@ -59,7 +59,7 @@ def render(
 
 
 def draw(info: SceneInfo, gaussians: Gaussians, camera: Camera) -> Picture:
-    """The picture of `gaussians` over the scene's background."""
+    """Draws `gaussians` over the scene's background."""
     g = gaussians
     image, alpha, meta = rasterization(
         g.means, g.quats, g.scales, g.opacities, g.colors, camera, info.background, near_plane=near_plane(info)
@@ -69,7 +69,7 @@ def draw(info: SceneInfo, gaussians: Gaussians, camera: Camera) -> Picture:
 
 @torch.no_grad()
 def render_image(model: Model, level: int, t: float, camera: Camera, rounding: Rounding = EXACT) -> np.ndarray:
-    """Render_level at normalised time t in 0..1 as float32 [H, W, 3] in 0..1."""
+    """Renders `level` at normalised time t in 0..1 as float32 [H, W, 3] in 0..1."""
     image: np.ndarray = render(model, level, t, camera, rounding).image.clamp(0, 1).cpu().numpy()
     return image
 
@@ -91,17 +91,17 @@ def rasterization(
 ) -> Drawn:
     """Draws N Gaussians with a pinhole camera (OpenCV axes, pixel centres at +0.5).
 
-    Arguments as those of `rasteriser.draw`, as tensors. A zero quaternion gets no gradient.
+    Arguments as for `rasteriser.draw`, but tensors. A zero quaternion gets no gradient.
     backend: "cpu", "gsplat" (CUDA), "reference" (dense float64, slow) or "auto", by the device of `means`.
 
-    float16 and float64 inputs are drawn in float32; gradients come back in the input's type. A Gaussian with NaN or
-    infinity in its position, rotation, scale or opacity is skipped and gets zero gradients; in its colour, refused.
+    float16 and float64 inputs are drawn in float32; gradients have the input's type. A Gaussian with NaN or infinity in
+    its position, rotation, scale or opacity is skipped and gets zero gradients.
 
     Returns (image [H, W, 3], alpha [H, W], meta), float32 (`reference`: float64). meta, as gsplat has it, is zero where
     a Gaussian is skipped: radii [1, N, 2] int32 pixels; means2d [1, N, 2] pixels, whose `.grad` holds dL/d(pixel
     position) after backward, for densification (except with gsplat it is a leaf: a loss on it does not reach `means`).
 
-    Raises RenderError for wrong shapes, devices and cameras, NotFinite (a RenderError) for colours.
+    Raises RenderError for wrong shapes, devices and cameras, NotFinite (a RenderError) for colours that are not finite.
     Formulas: Zwicker et al., "EWA splatting"; Kerbl et al., "3D Gaussian Splatting"; conventions of gsplat 1.5.3.
     """
     if backend not in BACKENDS:
@@ -120,7 +120,7 @@ def _is_floats(tensor: Any) -> bool:
 
 
 def _choose(backend: str, device: torch.device) -> Callable[..., Drawn]:
-    """The function of a backend for tensors on `device`."""
+    """Returns the function of a backend for tensors on `device`. Raises RenderError if it cannot draw there."""
     if device.type not in ("cpu", "cuda"):
         raise RenderError(f"tensors are on {device.type}, expected cpu or cuda")
     if backend == "reference":
@@ -135,8 +135,8 @@ def _choose(backend: str, device: torch.device) -> Callable[..., Drawn]:
 
 
 class _Composite(torch.autograd.Function):
-    """(projected, background, means2d, means, ..., colors) -> (image, alpha); all tensors float32, contiguous and on
-    the CPU, where arrays are views."""
+    """(projected, background, means2d, means, ..., colors) -> (image, alpha). Tensors are float32, contiguous and on
+    the CPU, so that numpy arrays share their memory."""
 
     @staticmethod
     def forward(
@@ -171,10 +171,10 @@ def rasterize_cpu(given: Sequence[Tensor], camera: Camera, background: np.ndarra
 
 
 def check_gsplat() -> None:
-    """RenderError in one line unless gsplat can draw here: the right version, with its CUDA kernels.
+    """Raises RenderError, of one line, unless gsplat has an accepted version and working CUDA kernels.
 
-    Without a CUDA compiler gsplat imports all the same and fails at the first picture. With one it may build its
-    kernels now, which takes minutes.
+    Without a CUDA compiler gsplat can be imported but fails at the first picture. With a compiler this call may build
+    the kernels, which takes minutes.
     """
     _gsplat()
     try:
@@ -187,11 +187,11 @@ def check_gsplat() -> None:
 
 
 def _gsplat() -> Any:
-    """The gsplat module, if its version has the CPU backend's limits."""
+    """Imports gsplat. Raises RenderError unless its version clamps alpha as the CPU backend does."""
     try:
         version = importlib.metadata.version("gsplat")
         module = importlib.import_module("gsplat")
-    except (ImportError, RuntimeError, OSError) as error:  # it may load or build its CUDA part at once
+    except (ImportError, RuntimeError, OSError) as error:  # the import may load or build its CUDA part
         raise RenderError(f"gsplat cannot be imported ({error}): install pd4dgs-codec[gpu] or use the CPU") from error
     alpha_max = ALPHA_MAX_OF_VERSION.get(".".join(version.split(".")[:2]))
     if alpha_max != ALPHA_MAX:
@@ -201,7 +201,7 @@ def _gsplat() -> Any:
 
 
 def _drawable(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> list[Tensor]:
-    """Gaussians that are not finite become faint (skipped, no gradient); a zero quaternion becomes the identity."""
+    """Sets Gaussians that are not finite to opacity 0 (skipped, no gradient) and zero quaternions to the identity."""
     finite = torch.isfinite(torch.cat([means, quats, scales, opacities[:, None]], -1)).all(-1)
     identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
     rotated = finite & (quats != 0).any(-1)
@@ -214,7 +214,7 @@ def _drawable(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -
 
 
 def rasterize_gsplat(given: Sequence[Tensor], camera: Camera, background: np.ndarray, near_plane: float) -> Drawn:
-    """gsplat behind `rasterization`, which checks the arguments. float32, dense layout."""
+    """The gsplat backend of `rasterization`, which checks the arguments. float32, dense layout."""
     *shapes, colors = (t.to(torch.float32) for t in given)
     viewmat, K = (colors.new_tensor(np.array(a))[None] for a in (camera.viewmat, camera.K))
     images, alphas, meta = _gsplat().rasterization(

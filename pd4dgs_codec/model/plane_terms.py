@@ -1,4 +1,4 @@
-"""Terms of the loss of a HexPlane's planes, each with its gradient in numba, beside the plain torch form.
+"""Loss terms of a HexPlane's planes, with gradients: numba kernels, and their plain torch form.
 
 Regularisers, unweighted, each a sum over scales and planes. plane_smooth: mean squared second difference of the spatial
 planes along each of their two axes. time_smooth: mean squared second difference of the time planes along time. time_l1:
@@ -6,8 +6,8 @@ mean |1 - g| of the time planes. (4DGaussians takes the spatial planes along one
 
 The rate is a smooth proxy for the bits of the planes' residuals r under one fixed predictor of the codec, before
 rounding: the median on spatial planes, the previous instant on time planes. A Laplacian of mean magnitude m in steps Q
-takes about log2(2 e m / Q) bits; 1 is added inside, so that only a residual of 0 is free. Half of the proxy is of the
-mean over a channel's cells, half of the mean over a cell's channels:
+takes about log2(2 e m / Q) bits; 1 is added inside, so that only a residual of 0 is free. One half of the proxy takes
+the mean over a channel's cells, the other half the mean over a cell's channels:
 
     sum over values of 1/2 log2(1 + 2 e mean_channel|r| / Q) + 1/2 log2(1 + 2 e mean_cell|r| / Q)
 
@@ -48,13 +48,13 @@ TERMS = ("plane_smooth", "time_smooth", "time_l1")
 
 Band = tuple[float, float, float, float, float]  #: five numbers in the middle of a row of a matrix
 
-# The kernels walk lines, the rows of all planes (`PlaneLayout.lines`). Sums are kept per line: results do not depend on
-# the number of threads.
+# Kernels run over lines, the rows of all planes (`PlaneLayout.lines`). Sums are kept per line, so that results do not
+# depend on the number of threads.
 
 
 @kernel(inline=True)
 def _squares(grid: Array, start: int, stop: int, step: int) -> Any:
-    """Sum of the squared second differences, over `step`, of the flat range start..stop."""
+    """Returns the sum of squared second differences, `step` apart, over the flat range start..stop."""
     two = splat(grid.dtype.type(2))
     value = splat(grid.dtype.type(0))
     for k in range(start, stop, LANES):
@@ -87,7 +87,7 @@ def _values(tasks: Tasks, sums: Array, grid: Array, lines: Array) -> None:
 
 @kernel(inline=True)
 def _band(i: int, n: int) -> Band:
-    """Row i, from column i - 2, of D^T D, where D takes the n - 2 second differences of n values."""
+    """Returns columns i - 2 .. i + 2 of row i of D^T D, where D takes the n - 2 second differences of n values."""
     if 2 <= i < n - 2:
         return 1.0, -4.0, 6.0, -4.0, 1.0
     before = 1.0 if i >= 2 else 0.0  # the difference centred at i - 1 exists
@@ -98,7 +98,7 @@ def _band(i: int, n: int) -> Band:
 
 @kernel(inline=True)
 def _curve(grid: Array, k: int, i: int, n: int, step: int, band: Band, weight: float) -> Vector:
-    """weight times the band's row applied around flat offset k, which is value i of n."""
+    """Returns weight times the product of `band` and the values around flat offset k, which is value i of n."""
     real = grid.dtype.type
     value = load(grid, k) * splat(real(weight * band[2]))
     value = fma(load(grid, k - min(i, 2) * step), splat(real(weight * band[0])), value)
@@ -151,7 +151,7 @@ class _Regularisers(torch.autograd.Function):
 
 
 def regularisers(grid: Tensor, layout: PlaneLayout) -> dict[str, Tensor]:
-    """The three terms of the planes in grid [cells, C], by name."""
+    """Returns the three regularisers of the planes grid [cells, C], by name."""
     if grid.device.type == "cpu" and grid.shape[1] % LANES == 0:
         values = _Regularisers.apply(grid, layout.lines)  # type: ignore[no-untyped-call]
         return dict(zip(TERMS, values, strict=True))
@@ -185,7 +185,7 @@ _LN2 = math.log(2.0)
 
 @kernel(inline=True)
 def _neighbour(i: int, j: int, up: int, left: int, temporal: int) -> int:
-    """The distance back to the only neighbour of the value at row i, column j (not both 0); 0: it has three."""
+    """Returns the distance back to the only neighbour of the value at row i, column j (not both 0), 0 if it has 3."""
     if i == 0:
         return left
     return up if temporal or j == 0 else 0
@@ -200,7 +200,7 @@ def _median(w: Vector, n: Vector, plane: Vector) -> Vector:
 
 @kernel(inline=True)
 def _residual(grid: Array, k: int, before: int, up: int, left: int) -> Vector:
-    """Residuals at flat offset k; the only neighbours lie `before`, or, if that is 0, one `up` and one `left`."""
+    """Returns residuals at flat offset k; the neighbour lies `before`, or, if that is 0, three lie `up` and `left`."""
     if before:
         return load(grid, k) - load(grid, k - before)
     w, n = load(grid, k - left), load(grid, k - up)
@@ -266,7 +266,7 @@ def _proxy_gradient(
                     plane = w + n - load(grid, k - up - left)
                     median = _median(w, n, plane)
                     g = _signed(weight, load(grid, k) - median)
-                    # it goes to the neighbours that make the median
+                    # the median's gradient goes to the neighbours that form it
                     west = select_gt(median, w, zero, select_gt(w, median, zero, g))
                     north = g - west
                     low, high = select_gt(w, n, n, w), select_gt(w, n, w, n)
@@ -304,13 +304,13 @@ class _Proxy(torch.autograd.Function):
 
 
 def _tables(layout: PlaneLayout) -> tuple[Array, Array]:
-    """(first cells int64 [P], height, width and 1 if temporal int64 [P, 3]) of all planes of all scales."""
+    """Returns first cells int64 [P], and height, width, 1 if temporal int64 [P, 3], of the planes of all scales."""
     sizes = [(r[b], r[a], b == TIME_AXIS) for r in layout.reso for _, a, b in PLANES]
     return layout.start.ravel(), np.array(sizes, np.int64)
 
 
 def proxy_bits(grid: Tensor, layout: PlaneLayout, step: float) -> Tensor:
-    """The proxy, in bits, of planes grid [cells, C] at a quantisation step; its gradient reaches every value."""
+    """Returns the proxy, in bits, of planes grid [cells, C] at a quantisation step; its gradient reaches all values."""
     if grid.device.type == "cpu" and grid.shape[1] % LANES == 0:
         bits: Tensor = _Proxy.apply(grid, layout, step)  # type: ignore[no-untyped-call]
         return bits
@@ -331,7 +331,7 @@ def proxy_bits_reference(grid: Tensor, layout: PlaneLayout, step: float) -> Tens
 
 
 def _residuals(x: Tensor, temporal: bool) -> Tensor:
-    """Of a plane [H, W, C]; 0 for its first value."""
+    """Returns the residuals of a plane [H, W, C], 0 for its first value."""
     first_row = torch.cat([torch.zeros_like(x[:1, :1]), x[:1, 1:] - x[:1, :-1]], dim=1)
     if temporal:
         return torch.cat([first_row, x[1:] - x[:-1]])

@@ -1,7 +1,7 @@
 """The training-time rate R(a) = -log2 P, P = Phi((a + Q/2 - mu)/sigma) - Phi((a - Q/2 - mu)/sigma).
 
-Source: the PD-4DGS rate model. The plain difference of two Phi is wrong by 7 % above P = 1e-6 in float32 and 0 below;
-so ln P is taken in one of three forms, chosen per element, and its gradient is written out rather than traced.
+Source: the PD-4DGS rate model. In float32 the plain difference of two Phi is wrong by 7 % above P = 1e-6 and 0 below,
+so ln P is computed in one of three forms, chosen per element, with an explicit gradient.
 With d = |a - mu|, z = d/sigma, h = Q/(2 sigma), u = (d - Q/2)/sigma, v = (d + Q/2)/sigma:
 
 - narrow, h*max(z, 1) small: P = 2 h phi(z) (1 + h^2 He2(z)/6 + h^4 He4(z)/120 + h^6 He6(z)/5040)
@@ -22,14 +22,14 @@ from torch.autograd.function import once_differentiable
 
 from pd4dgs_codec.draw.simd import Array, Tasks, kernel, parallel
 
-#: The clip of the training rate: no scalar costs more than log2(1e6) = 19.93 bits.
+#: Probabilities are clipped to this: no scalar costs more than log2(1e6) = 19.93 bits in training.
 MIN_PROBABILITY = 1e-6
 MAX_BITS = -math.log2(MIN_PROBABILITY)
 #: sigma is kept at or above Q * MIN_SIGMA_RATIO.
 MIN_SIGMA_RATIO = 2.0**-10
-#: h max(z, 1) below which P is taken as narrow.
+#: h max(z, 1) below which P has the narrow form.
 NARROW = {torch.float64: 0.03, torch.float32: 0.2}
-#: Added to a channel's variance, so that the gradient of its root is finite where all values are one.
+#: Added to a channel's variance, so that the gradient of its root is finite if all values are equal.
 MIN_VARIANCE = 1e-20
 
 _LN2 = math.log(2.0)
@@ -39,8 +39,8 @@ _SQRT_HALF = math.sqrt(0.5)
 
 
 def _log_ratio(z: Tensor, h: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """ln(phi(u) / P), for the gradients and for ln P. In the tails ln P and ln phi(u) grow like z^2, their difference
-    does not, so the difference is computed."""
+    """Returns ln(phi(u) / P), from which ln P and the gradients follow. In the tails ln P and ln phi(u) grow like z^2;
+    their difference does not, so it is computed directly."""
     narrow = h * z.clamp(min=1.0) < NARROW[z.dtype]
     tail = ~narrow & (u >= 0)
     centre = ~(narrow | tail)
@@ -95,14 +95,14 @@ class _LogProbability(torch.autograd.Function):
 
 
 def log_probability(a: Tensor, mu: Tensor, sigma: Tensor, q: Tensor | float) -> Tensor:
-    """ln P of the interval a +- Q/2 under N(mu, sigma), broadcast; gradients to all four, finite in the tails."""
+    """Returns ln P of a +- Q/2 under N(mu, sigma), broadcast; gradients reach all arguments, finite in the tails."""
     q = torch.as_tensor(q, dtype=a.dtype, device=a.device)
     log_p: Tensor = _LogProbability.apply(a, mu, sigma, q)  # type: ignore[no-untyped-call]
     return log_p
 
 
 class _ClipValue(torch.autograd.Function):
-    """The clipped bits forward; the gradient of the unclipped bits backward, so that it still reaches outliers."""
+    """Clips bits forward but passes the gradient of the unclipped bits, so that it still reaches outliers."""
 
     @staticmethod
     def forward(ctx: Any, bits: Tensor) -> Tensor:
@@ -114,7 +114,7 @@ class _ClipValue(torch.autograd.Function):
 
 
 def rate_bits(a: Tensor, mu: Tensor, sigma: Tensor, q: Tensor | float) -> Tensor:
-    """R(a) in bits, the probability clipped at 1e-6, same shape as the broadcast inputs."""
+    """Returns R(a) in bits, in the shape of the broadcast inputs, with probabilities clipped at 1e-6."""
     q = torch.as_tensor(q, dtype=a.dtype, device=a.device)
     sigma = torch.maximum(sigma, q * MIN_SIGMA_RATIO)
     bits: Tensor = _ClipValue.apply(-log_probability(a, mu, sigma, q) / _LN2)  # type: ignore[no-untyped-call]
@@ -123,13 +123,13 @@ def rate_bits(a: Tensor, mu: Tensor, sigma: Tensor, q: Tensor | float) -> Tensor
 
 # -- rows of anchors, in numba -----------------------------------------------------------------------------------------
 
-# `classes` int8 [N] holds the step class of each anchor, -1 of one that is not active. Values are [N, c] of one float
-# type, computed in float64. Sums are kept per block of rows: results do not depend on the number of threads.
+# `classes` int8 [N] is the step class of each anchor, -1 if inactive. Values are [N, c] of one float type, computed in
+# float64. Sums are kept per block of rows, so that results do not depend on the number of threads.
 
 _BLOCK = 1024  #: rows
 _SQRT_HALF_PI = math.sqrt(0.5 * math.pi)
 _INVERSE_SQRT_PI = 1.0 / math.sqrt(math.pi)
-#: From here on erfcx is its asymptotic series, to 4e-12; below it exp(x^2) erfc(x), to 1e-13.
+#: From here on erfcx is computed by its asymptotic series, to 4e-12; below by exp(x^2) erfc(x), to 1e-13.
 _FAR = 20.0
 
 
@@ -144,7 +144,7 @@ def _erfcx(x: float) -> float:
 
 @kernel(inline=True)
 def _probability(z: float, h: float, u: float, v: float, narrow_below: float) -> tuple[float, float]:
-    """(ln P, phi(u) / P) in the forms above; narrow_below: h max(z, 1) below which P is taken as narrow."""
+    """Returns (ln P, phi(u) / P) by the forms above; narrow_below: h max(z, 1) below which P has the narrow form."""
     if h * max(z, 1.0) < narrow_below:
         z2, h2 = z * z, h * h
         series = (z2 - 1) * h2 / 6 + ((z2 - 6) * z2 + 3) * h2 * h2 / 120
@@ -160,7 +160,7 @@ def _probability(z: float, h: float, u: float, v: float, narrow_below: float) ->
 
 @parallel(lambda parts, *_: len(parts))
 def _class_sums(tasks: Tasks, parts: Array, values: Array, classes: Array, centre: Array, power: int) -> None:
-    """parts [blocks, K, c] += of each class the sum of values, or with power 2 that of their squared distances from
+    """Adds to parts [blocks, K, c] the sum of each class's values or, with power 2, of their squared distances from
     centre [K, c]."""
     channels = values.shape[1]
     for block in range(tasks[0], tasks[1]):
@@ -193,8 +193,8 @@ def _scalar_bits(
     most_bits: float,
     narrow_below: float,
 ) -> None:
-    """bits float64 [n]: the sum of R over each of `rows` int64 [n], a scalar's bits clipped to most_bits; by_value and
-    by_sigma [n, c]: the gradients of each scalar's R, not clipped. sigma [K, c] is held above least_sigma steps."""
+    """Fills bits float64 [n], the sum of R over each of `rows` int64 [n], each R clipped to most_bits; by_value and
+    by_sigma [n, c], the gradients of each scalar's unclipped R. sigma [K, c] is at least least_sigma steps."""
     for r in range(tasks[0], tasks[1]):
         i = rows[r]
         k = classes[i]
@@ -216,7 +216,8 @@ def _scalar_bits(
 def _moments_gradient(
     tasks: Tasks, grad: Array, values: Array, classes: Array, by_mu: Array, mu: Array, by_square: Array
 ) -> None:
-    """grad [N, c] = by_mu + (values - mu) by_square of each row's class, all [K, c] of the type of `values`."""
+    """Fills grad [N, c] = by_mu + (values - mu) by_square of each row's class, 0 for inactive rows. by_mu, mu,
+    by_square: [K, c] of the type of `values`."""
     for i in range(tasks[0], tasks[1]):
         k = classes[i]
         for j in range(values.shape[1]):
@@ -265,7 +266,7 @@ class _RowBits(torch.autograd.Function):
 
 
 def _sums(values: Array, classes: Array, centre: Array, power: int) -> Array:
-    """float64 [K, c]: those of `_class_sums`."""
+    """Returns the sums of `_class_sums`, float64 [K, c]."""
     parts = np.zeros((-(-len(values) // _BLOCK), *centre.shape))
     _class_sums(parts, values, classes, centre, power)
     total: Array = parts.sum(0)
@@ -273,11 +274,10 @@ def _sums(values: Array, classes: Array, centre: Array, power: int) -> Array:
 
 
 def row_bits(parts: Sequence[tuple[Tensor, float]], classes: Tensor, rows: Tensor) -> Tensor:
-    """R summed over each of the rows `rows` (int64 [n], none twice) of all parts: [n], gradient through all.
+    """Returns [n], differentiable: R summed over each of `rows` (int64 [n], active, none twice) of all parts.
 
-    parts: values [N, c] and their step. classes: int8 [N], the step class of an active row and -1 of others; `rows` are
-    active. A scalar's step is step * 2^class, and its prior are mean and standard deviation of its column over the
-    active rows of its class.
+    parts: values [N, c] and their step. classes: int8 [N], the step class of each active row, -1 of others. A scalar's
+    step is step * 2^class. Its prior has the mean and standard deviation of its column over the class's active rows.
     """
     if classes.device.type == "cpu":
         values, steps = zip(*parts, strict=True)
@@ -299,6 +299,6 @@ def row_bits_reference(parts: Sequence[tuple[Tensor, float]], classes: Tensor, r
 
 
 def channel_moments(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Mean and standard deviation per column of x [n, c]; gradient through both; n >= 1."""
+    """Returns mean and standard deviation per column of x [n, c], n >= 1, both differentiable."""
     mu = x.mean(0)
     return mu, ((x - mu).square().mean(0) + MIN_VARIANCE).sqrt()

@@ -1,11 +1,10 @@
 """Plain torch forms of the kernels, with gradients by autograd: a rasteriser, and the stages of `Model.gaussians`.
 
-The rasteriser is a dense float64 oracle, every Gaussian against every pixel; slow, for tests. It is written from the
-textbook formulas (matrix products, an inverse by determinant) and shares only thresholds with the kernels, so that a
-common mistake is unlikely. Only the determinant differs from the textbook: p r - q^2 has no digit left where a Gaussian
-is 10^8 times as long as a pixel is wide.
+The rasteriser is a slow float64 oracle for tests. It is written from the textbook formulas (matrix products, an inverse
+by determinant) and shares only thresholds with the kernels, so that a common mistake is unlikely. Only the determinant
+differs from the textbook: p r - q^2 loses all digits where a Gaussian is 10^8 times as long as a pixel is wide.
 
-The stages are the oracle of `fused`, and the path on CUDA and for networks that the kernels do not take.
+The stages are the oracle of `fused`, and the path on CUDA and for networks that the kernels do not support.
 """
 
 from __future__ import annotations
@@ -24,12 +23,12 @@ from pd4dgs_codec.model.networks import MLP, Quantisation, round_straight_throug
 from pd4dgs_codec.scene import SCALING_DIM, Camera
 
 T_MIN = 1e-4
-#: Pixels of the side of a block.
+#: Side of a block, pixels.
 BLOCK = 16
 
 
 def _rotations(quats: Tensor) -> Tensor:
-    """[N, 3, 3] from wxyz; a zero quaternion is the identity without gradient."""
+    """Returns rotations [N, 3, 3] of quaternions wxyz; a zero quaternion is the identity without gradient."""
     norm = torch.linalg.vector_norm(quats, dim=-1, keepdim=True)
     zero = norm == 0
     identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype, device=quats.device)
@@ -45,8 +44,8 @@ def _rotations(quats: Tensor) -> Tensor:
 def project(
     means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Pixel means [N, 2], covariances [N, 2, 2] (EPS2D included), their determinants [N] and depths [N]; the caller
-    keeps z > 0."""
+    """Returns pixel means [N, 2], covariances [N, 2, 2] (EPS2D included), their determinants [N] and depths [N], which
+    must be positive."""
     x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(-1)
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
@@ -60,7 +59,7 @@ def project(
     blur = math.sqrt(EPS2D) * torch.eye(2, dtype=means.dtype, device=means.device)
     root = torch.cat([half, blur.expand(len(half), 2, 2)], -1)
     products = root[:, 0, :, None] * root[:, 1, None, :]
-    det = (products - products.mT).triu().square().sum((1, 2))  # of all minors of the root (Cauchy and Binet)
+    det = (products - products.mT).triu().square().sum((1, 2))  # sum of squared minors (Cauchy and Binet)
     return torch.stack([fx * x / z + cx, fy * y / z + cy], -1), root @ root.mT, det, z
 
 
@@ -85,7 +84,7 @@ def composite(
 def composite_blocks(
     means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, width: int, height: int
 ) -> tuple[Tensor, Tensor]:
-    """`composite` in blocks of pixels, each with the Gaussians whose radii [N, 2] reach it: for any number of them."""
+    """`composite` in blocks of pixels, each with only the Gaussians whose radii [N, 2] reach it, to limit memory."""
     image, alpha = colors.new_zeros(height, width, 3), colors.new_zeros(height, width, 1)
     for top in range(0, height, BLOCK):
         for left in range(0, width, BLOCK):
@@ -102,7 +101,7 @@ def composite_blocks(
 def rasterize(
     given: Sequence[Tensor], camera: Camera, background: np.ndarray, near_plane: float
 ) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-    """The oracle behind `rasterization(backend="reference")`, which checks the arguments. Float64 results."""
+    """The "reference" backend of `rasterization`, which checks the arguments. Results are float64."""
     means, quats, scales, opacities, colors = (t.double() for t in given)
     viewmat, K = (means.new_tensor(np.array(a)).double() for a in (camera.viewmat, camera.K))
     n, width, height = len(means), camera.width, camera.height
@@ -117,7 +116,7 @@ def rasterize(
     index, conics = index[seen], torch.stack([r, -q, p], -1)[seen] / det[seen, None]
     pixels = means.new_zeros((1, n, 2)).index_copy(1, index, means2d[None, seen].detach())
     pixels.requires_grad_(torch.is_grad_enabled() and means2d.requires_grad)
-    moved = means2d[seen] + (pixels - pixels.detach())[0, index]  # 0, for the gradient by pixels
+    moved = means2d[seen] + (pixels - pixels.detach())[0, index]  # adds 0, for the gradient by `pixels`
     image, alpha = composite_blocks(moved, radii[seen], conics, opacities[seen], colors[seen], width, height)
     image = image + (1.0 - alpha) * torch.from_numpy(background).to(means)
     radii = means.new_zeros((1, n, 2)).index_copy(1, index, radii[None, seen]).to(torch.int32)
@@ -127,7 +126,7 @@ def rasterize(
 def _before_the_camera(
     means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmat: Tensor, near_plane: float
 ) -> Tensor:
-    """int64 [M]: the Gaussians that are finite, visible and between the planes, front to back."""
+    """Returns int64 [M]: the Gaussians that are finite, visible and between near_plane and FAR, front to back."""
     z = (means @ viewmat[2, :3] + viewmat[2, 3]).detach()
     keep = (z > near_plane) & (z <= FAR) & (opacities > ALPHA_MIN) & torch.isfinite(opacities)
     keep &= torch.isfinite(means).all(-1) & torch.isfinite(quats).all(-1) & torch.isfinite(scales).all(-1)

@@ -1,7 +1,6 @@
-"""How pictures depend on single anchors: the error of omitting one, or of rounding its attributes, and their order.
+"""How pictures depend on single anchors: the errors of omitting one or rounding its attributes, and a ranking.
 
-By these measures anchors leave a layer or a model and get their step classes, and slices bring the anchors that matter
-most first.
+These measures decide which anchors leave a layer or a model, their step classes, and their order in slices.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from pd4dgs_codec.scene import ATTRIBUTES, Camera, Scene
 
 Place = tuple[Camera, float]  #: a camera and a normalised time
 
-#: Random pictures of signs per view from which an anchor's weight is estimated.
+#: Random pictures of signs per view for each estimate.
 PROBES = 2
 
 
@@ -37,13 +36,12 @@ def omission_error(
     weights: Tensor | None = None,
     rounding: Rounding = EXACT,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """(float64 [N] the approximate squared error, summed over pixels and colours, of omitting each anchor at `level`;
-    bool [N] whether the anchor may reach the picture; the picture [H, W, 3]). Arguments as for `render`; weights
-    [H, W]: of the pixels' squares.
+    """Estimates the squared error, summed over pixels and colours, of omitting each anchor at `level`.
 
-    The error is ||dI/dg||^2, the picture's derivative by a gate g on the anchor's opacities and scales times its change
-    from 1 to 0: the diagonal of the Gauss-Newton matrix, from products with random signs (Bekas, Kokiopoulou and Saad,
-    An estimator for the diagonal of a matrix, 2007).
+    Arguments as for `render`; weights [H, W] multiply the pixels' squared errors. Returns the errors, float64 [N];
+    bool [N], whether each anchor may reach the picture; and the picture [H, W, 3]. The error is ||dI/dg||^2, g a gate
+    on the anchor's opacities and scales that goes from 1 to 0: the diagonal of the Gauss-Newton matrix, from products
+    with random signs (Bekas, Kokiopoulou and Saad, An estimator for the diagonal of a matrix, 2007).
     """
     image, gate, met = _gated(model, level, t, camera, rounding)
     return _squared(image, gate, generator, weights), met, image.detach()
@@ -52,15 +50,15 @@ def omission_error(
 def anchor_slopes(
     model: Model, level: int, t: float, camera: Camera, generator: torch.Generator, reference: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """(float64 [N] <I - J, dI/dg> of each anchor, I the picture, J the reference [H, W, 3]; float64 [N] ||dI/dg||^2 as
-    in `omission_error`; bool [N] whether the anchor may reach the picture)."""
+    """Returns, for each anchor, <I - J, dI/dg>, float64 [N], with I the picture and J the reference [H, W, 3];
+    ||dI/dg||^2, float64 [N], as in `omission_error`; and bool [N], whether it may reach the picture."""
     image, gate, met = _gated(model, level, t, camera, EXACT)
     (slope,) = torch.autograd.grad((image * (image.detach() - reference)).sum(), gate, retain_graph=True)
     return slope.double(), _squared(image, gate, generator), met
 
 
 def _gated(model: Model, level: int, t: float, camera: Camera, rounding: Rounding) -> tuple[Tensor, Tensor, Tensor]:
-    """(picture [H, W, 3], the gates of the anchors [N], all 1, bool [N] whether an anchor may reach it)."""
+    """Returns the picture [H, W, 3], the anchors' gates [N], all 1, and bool [N], whether each anchor may reach it."""
     with torch.no_grad():
         g = model.gaussians(level, t, camera, rounding)
     gate = torch.ones(len(model.anchor_q), device=g.means.device, requires_grad=True)
@@ -70,14 +68,14 @@ def _gated(model: Model, level: int, t: float, camera: Camera, rounding: Roundin
 
 
 def _met(model: Model, gaussians: Gaussians) -> Tensor:
-    """bool [N]: whether each anchor was evaluated for these Gaussians, so that it may reach their picture."""
+    """Returns bool [N]: whether each anchor was evaluated for these Gaussians, so that it may reach their picture."""
     met = torch.zeros(len(model.anchor_q), dtype=torch.bool, device=gaussians.means.device)
     met[gaussians.anchors] = True
     return met
 
 
 def _squared(image: Tensor, gate: Tensor, generator: torch.Generator, weights: Tensor | None = None) -> Tensor:
-    """float64 [N]: the squared norm of the picture's derivative by each gate, estimated."""
+    """Estimates the squared norm of the picture's derivative by each gate, float64 [N]."""
     total = torch.zeros(len(gate), dtype=torch.float64, device=gate.device)
     for _ in range(PROBES):
         signs = _signs(image, generator, weights)
@@ -96,10 +94,9 @@ def rounding_error(
     weights: Tensor | None = None,
     rounding: Rounding = EXACT,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """(float64 [N] the approximate squared error, summed over pixels and colours, of rounding each anchor's attributes
-    to the model's steps; bool [N] whether the anchor may reach the picture; the picture [H, W, 3]). Arguments and
-    method as for `omission_error`, by the derivative by each scalar; the squared error of a step Q is Q^2 / 12 on
-    average.
+    """Estimates the squared error, summed over pixels and colours, of rounding each anchor's attributes to the model's
+    steps. Arguments, results and method as for `omission_error`, with derivatives by each scalar. The squared error of
+    a step Q is Q^2 / 12 on average.
     """
     slopes, met, image = attribute_slopes(model, level, t, camera, generator, weights=weights, rounding=rounding)
     total = torch.zeros(len(met), dtype=torch.float64, device=image.device)
@@ -118,11 +115,10 @@ def attribute_slopes(
     weights: Tensor | None = None,
     rounding: Rounding = EXACT,
 ) -> tuple[dict[str, Tensor], Tensor, Tensor]:
-    """(by attribute, in its shape, the derivative by it of the picture's product with random signs; bool [N] whether
-    an anchor may reach the picture; the picture [H, W, 3]). Arguments as for `omission_error`.
+    """Returns the derivatives of the picture's product with random signs by each attribute, in its shape; bool [N],
+    whether each anchor may reach the picture; and the picture [H, W, 3]. Arguments as for `omission_error`.
 
-    On average over the signs, products of two derivatives by scalars of one anchor are the entries of its Gauss-Newton
-    matrix.
+    Averaged over the signs, the products of derivatives by two scalars of an anchor are its Gauss-Newton matrix.
     """
     values = [getattr(model, name) for name in ATTRIBUTES]
     with torch.enable_grad():
@@ -142,24 +138,24 @@ def _signs(image: Tensor, generator: torch.Generator, weights: Tensor | None) ->
 
 # -- the order of anchors ----------------------------------------------------------------------------------------------
 
-#: Pixels along the longer side of the pictures that decide: holes are larger than such a pixel.
+#: Longer side, pixels, of the pictures that `utility` compares: holes are larger than such a pixel.
 SIDE = 128
-#: The share of a layer's anchors that stay after each round, and the count below which all leave in one round.
+#: The share of a layer's anchors that stay after each round, and the count at which all leave in one round.
 STAY, FEW = 0.8, 64
 
 
 def utility(
     scene: Scene, places: Sequence[Place], step: Callable[[], None] = lambda: None, fewest: int = 0
 ) -> np.ndarray:
-    """float64 [n]: the order in which the n anchors of the highest layer should come, the highest first: by the gain of
-    the pictures at `places` (times 0..1) per byte, with all earlier layers present. Anchors that reach no picture have
-    0, the least. step is called after each round.
+    """Ranks the n anchors of the highest layer by the gain per byte of the pictures at `places` (times 0..1), with all
+    earlier layers present. Returns float64 [n], higher for anchors that should come earlier, 0 for anchors that reach
+    no picture. step is called after each round.
 
-    Anchors leave one after another, the least first, as in a backward elimination, since the gain of an anchor depends
-    on the others: what stands behind it shows when it is gone. The last `fewest` are equal. Omitting anchor i changes
-    the squared error of a picture I against that of the whole level by about -2 <I - J, dI/dg_i> + ||dI/dg_i||^2, g_i a
-    gate on its opacities and scales that goes from 1 to 0: the first term tells anchors that make up for absent ones
-    from anchors that have become wrong.
+    Backward elimination: the anchors of least gain leave round by round, since the gain of an anchor depends on the
+    others (it may hide them). The last `fewest` are equal. Omitting anchor i changes the squared error of a picture I
+    against the whole level's picture J by about -2 <I - J, dI/dg_i> + ||dI/dg_i||^2, g_i a gate on its opacities and
+    scales that goes from 1 to 0. The first term separates anchors that make up for absent ones from anchors that have
+    become wrong.
     """
     places = [(smaller(camera), time) for camera, time in places]
     level, first = scene.level, scene.rows[-2] if len(scene.rows) > 1 else 0
@@ -188,7 +184,7 @@ def utility(
 
 
 def without(scene: Scene, rows: np.ndarray) -> Scene:
-    """The scene without the anchors `rows`, int64 [M]."""
+    """Returns the scene without the anchors `rows`, int64 [M]."""
     kept = np.ones(len(scene.anchor_q), bool)
     kept[rows] = False
     return replace(
@@ -200,7 +196,7 @@ def without(scene: Scene, rows: np.ndarray) -> Scene:
 
 
 def smaller(camera: Camera) -> Camera:
-    """The same view with about SIDE pixels along the longer side."""
+    """Returns the same view scaled down to at most SIDE pixels along the longer side."""
     factor = min(1.0, SIDE / max(camera.width, camera.height))
     width, height = (max(1, round(side * factor)) for side in (camera.width, camera.height))
     scale = np.array([[width / camera.width], [height / camera.height], [1.0]], np.float32)
