@@ -1018,8 +1018,8 @@ class Lzma:
     def reset(self):
         self.probabilities, self.state, self.distances = {}, 0, [1] * 4
 
-    # 9.3 LZMA2: "A match MUST NOT reach back over the dictionary's reset nor beyond its chunk." "Its first byte MUST be
-    # 0. After its last symbol and the normalisation that follows, the code MUST be 0 and no byte of the chunk left."
+    # 9.3 LZMA2: "A match MUST NOT reach back over the dictionary's reset nor beyond its chunk." "Its first packed byte
+    # MUST be 0. After its last symbol and the normalisation that follows, the code MUST be 0"
     def unpack(self, data, out, start, end):
         """Appends the bytes of a chunk to `out`, up to `end`; the dictionary begins at `start`."""
         self.reader = Reader(data)
@@ -1188,8 +1188,8 @@ def decode_positions(data, count, known=None):
     return cells
 
 
-# 10.2 Counts: "two varints, at most 2^26 each: s, the number of its nodes with one child, and e, the sum of the numbers
-# of children less 2 over its other nodes" "s ≤ N, e ≤ 6·(N − s) and 2·N − s + e ≤ n MUST hold, and after level 1 there
+# 10.2 Counts: "two varints, at most 2^26 each: s, the number of its nodes with one child, and e, the sum of (number of
+# children − 2) over its other nodes" "s ≤ N, e ≤ 6·(N − s) and 2·N − s + e ≤ n MUST hold, and after level 1 there
 # MUST be n nodes, else Malformed."
 def read_levels(reader, depth, count):
     """Per level, from the root's on: (number of nodes, number of nodes with one child)."""
