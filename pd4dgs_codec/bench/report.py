@@ -51,7 +51,7 @@ def spread(found: dict[str, Any] | None) -> str:
 
 
 def clock(work: Callable[[], T], repeats: int, budget: float = BUDGET) -> tuple[T, list[float]]:
-    """Runs `work` up to `repeats` times, never after `budget` seconds. Returns (last result, seconds of each run)."""
+    """Runs `work` up to `repeats` times, but not again after `budget` seconds: (last result, seconds of each run)."""
     seconds: list[float] = []
     while True:
         start = time.perf_counter()

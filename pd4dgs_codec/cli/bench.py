@@ -50,7 +50,7 @@ def _add_views(p: options.Parser, views: int) -> None:
 
 
 def _frames(args: argparse.Namespace, info: SceneInfo) -> list[Frame]:
-    """Returns up to args.views frames: evenly spread held-out (or else training) views of --data, or the own camera."""
+    """Up to args.views frames: evenly spread held-out (or else training) views of --data, or the file's own camera."""
     from pd4dgs_codec.quality.frames import dataset_frames, own_frames
 
     if args.data is None:

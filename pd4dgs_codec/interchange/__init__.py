@@ -1,1 +1,1 @@
-"""Gaussians in and out: the files that other viewers read and that other trainers write."""
+"""Reads the files of other trainers and writes files for other viewers of Gaussians."""

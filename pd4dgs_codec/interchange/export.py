@@ -78,7 +78,7 @@ class Eyes:
         return np.stack([camera_eye(camera) for camera in self.cameras]).astype(np.float32)
 
     def weigh(self, positions: np.ndarray) -> np.ndarray:
-        """Returns float64 [E, n]: each eye's weight for anchors at `positions` [n, 3], OUTSIDE times it if unseen."""
+        """Returns weights [E, n] float64 for anchors at `positions` [n, 3], times OUTSIDE for anchors out of view."""
         inside = np.stack([_inside(camera, positions) for camera in self.cameras])
         return np.asarray(self.weights[:, None] * np.where(inside, 1.0, OUTSIDE))
 
@@ -200,7 +200,7 @@ def refine(
     near: float,
     step: Step = lambda: None,
 ) -> Splats:
-    """Refines Gaussians by Adam (Kingma and Ba 2015) on the squared error; `order` names the target of each step."""
+    """Refines Gaussians by Adam (Kingma and Ba 2015) on the squared error. order: key of each step's target."""
     size = np.maximum(splats.scales.max(axis=1, keepdims=True), SMALLEST)
     values = {
         "means": splats.means / size,

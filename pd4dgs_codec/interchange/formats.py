@@ -45,7 +45,7 @@ SH_SPAN = 4.0
 def checked(
     where: str, means: np.ndarray, quats: np.ndarray, scales: np.ndarray, opacities: np.ndarray, sh: np.ndarray
 ) -> Splats:
-    """Returns the arrays as Splats with unit rotations, without Gaussians that are not finite, huge or invalid. Raises
+    """Returns the arrays as Splats with unit rotations. Drops Gaussians that are huge, invalid or not finite. Raises
     DataError for wrong shapes, or if no Gaussian is left."""
     n = len(means) if means.ndim else 0
     harmonics = sh.shape[-2] if sh.ndim == 3 else 1
@@ -66,7 +66,7 @@ def checked(
 
 
 def finite_rows(parts: dict[str, np.ndarray]) -> np.ndarray:
-    """Returns bool [n]: whether a row of all arrays [n, ...] has only numbers of magnitude up to LARGEST."""
+    """Returns bool [n]: whether a row has only numbers of magnitude up to LARGEST in all arrays [n, ...]."""
     found = [(np.abs(array) <= LARGEST).all(axis=tuple(range(1, array.ndim))) for array in parts.values()]  # not NaN
     return np.asarray(np.logical_and.reduce(found))
 
@@ -135,7 +135,7 @@ def activated(parameters: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _unpacked(path: Path, kind: str) -> bytes:
-    """Converts an SPZ file or a compressed PLY to a PLY by gaussforge."""
+    """Converts an SPZ file or a compressed PLY to a PLY with gaussforge."""
     forge = required("gaussforge", EXTRA, "SPZ files and compressed PLYs").GaussForge()
     data = read_file(path)
     if kind == "spz":
@@ -284,7 +284,7 @@ def spz_bytes(splats: Splats) -> bytes:
 
 
 def fourdgs_bytes(frames: Sequence[tuple[float, Splats, np.ndarray]], seconds: float) -> bytes:
-    """Returns a .4dgs file of `seconds`. A Gaussian is shown during its frame and moves to its slot's next position.
+    """Returns a .4dgs file of `seconds`. Each Gaussian is shown in its frame and moves to its slot in the next frame.
 
     frames: (start in seconds, Gaussians, their slots int64 [N]), ascending from 0.
     """

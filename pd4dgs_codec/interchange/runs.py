@@ -298,7 +298,7 @@ def _field(state: State, name: str) -> tuple[Callable[[np.ndarray, float], np.nd
 
 
 def _planes(state: State, name: str) -> list[np.ndarray]:
-    """Returns one resolution's planes [rows, columns, features] over xy, xz, xt, yz, yt and zt; columns come first."""
+    """Returns one resolution's planes [rows, columns, features] over xy, xz, xt, yz, yt, zt; x is the column of xy."""
     planes = [state.take(f"{name}.0", 1, None, None, None)]
     features = planes[0].shape[1]
     if features > MAX_WIDTH:

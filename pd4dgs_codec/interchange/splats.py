@@ -146,8 +146,8 @@ def quaternions(matrices: np.ndarray) -> np.ndarray:
 
 
 def principal_axes(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Returns (standard deviations [n, 3], NaN for a covariance that is not finite; rotations [n, 3, 3], axes as
-    columns) of covariances [n, 3, 3]."""
+    """Returns (standard deviations [n, 3], rotations [n, 3, 3] with the axes as columns) of covariances [n, 3, 3]. The
+    deviations of a covariance that is not finite are NaN."""
     finite = np.isfinite(covariances).all(axis=(1, 2))
     values, axes = np.linalg.eigh(np.where(finite[:, None, None], covariances, np.eye(3)))
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]

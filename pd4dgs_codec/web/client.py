@@ -328,9 +328,9 @@ def fetch(transfer: Transfer, max_layer: int | None = None, max_bytes: int | Non
     """Fetches a file, or its prefix: the header, and the slices of layers up to max_layer that end within max_bytes.
     Returns fewer bytes if the remote file ends early.
 
-    A whole file takes one request, a prefix two (three with a long header). Of a whole file one byte more is fetched,
-    so that the decoder sees trailing data. Raises as Transfer.read does, DecodeError for an invalid header, and
-    LimitExceeded for bytes beyond MOST_BYTES without max_bytes.
+    A whole file takes one request, a prefix two (three with a long header). A whole file is fetched up to one byte
+    beyond its end, so that the decoder sees trailing data. Raises as Transfer.read does, DecodeError for an invalid
+    header, and LimitExceeded for bytes beyond MOST_BYTES without max_bytes.
     """
     whole = max_layer is None and max_bytes is None
 

@@ -100,7 +100,7 @@ def _duration(seconds: float) -> str:
 
 
 def hls(index: str, video: Video | None = None, playlist: str = "") -> bytes:
-    """Returns the multivariant HLS playlist. index, playlist: names of the JSON index and of the media playlist."""
+    """Returns the multivariant HLS playlist. index: name of the JSON index. playlist: media playlist of `video`."""
     lines = ["#EXTM3U", "#EXT-X-VERSION:7", f'#EXT-X-SESSION-DATA:DATA-ID="{SESSION_DATA_ID}",URI="{index}"']
     if video is not None:
         init, pieces = fragments(video.data)

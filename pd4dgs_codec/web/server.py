@@ -1,7 +1,7 @@
 """A small web server for one folder: ranges, validators, CORS, and a simulated slow link.
 
-It is meant for trials, measurements and demonstrations; `pd4dgs-serve --help` configures nginx or Caddy for the same
-folder.
+It is meant for trials, measurements and demonstrations; docs/player-and-delivery.md configures nginx or Caddy for the
+same folder.
 """
 
 from __future__ import annotations
