@@ -1,15 +1,15 @@
 """The attributes section of mode ans (clauses 8.5 to 8.7): channels as they are, or predicted from each other.
 
-With D feature numbers and G Gaussians, the first P = D + 6 channels are features and log-scalings, the others G offsets
-x, y, z. Form 0 codes all channels at once, by step class if anchors are graded. Form 1 states a prediction block and
-then codes eight *stages*, each decoded before the next:
+With D feature numbers and G Gaussians, the first P = D + 6 channels are features and log-scalings, the others are the
+offsets x, y, z of each Gaussian. Form 0 codes all channels at once, by step class if anchors are graded. Form 1 has a
+prediction block and then eight *stages*, each decoded before the next:
 
 - Stages 0..4 hold residuals of the P channels, each predicted linearly from channels before it (`Terms`).
-- Stage 5 holds the offsets x. Stages 1..5 are split into classes of rows by how large the residuals of the stages
-  before are (`stages.Activity`), because the residuals of an anchor tend to be large together.
-- Stages 6 and 7 hold the offsets y and z, split by how far x and y lie from a centre (`Split`).
+- Stage 5 holds the offsets x. Stages 1..5 are split into classes of rows by the size of the residuals in earlier
+  stages (`stages.Activity`), because the residuals of an anchor tend to be large together.
+- Stages 6 and 7 hold the offsets y and z, split by the distance of x and y from a centre (`Split`).
 
-Form 2, in a slice behind another of its layer, uses the block of that slice (`Past`). All arithmetic is on integers.
+Form 2 uses the block of an earlier slice of the layer (`Past`). All arithmetic is on integers.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ from pd4dgs_codec.scene import MAX_CLASS, Widths
 CONTINUED = 2  #: the form that uses the block of an earlier slice
 WEIGHT_SHIFT = 10
 MAX_WEIGHT = 1 << 15
-#: Where the stages of residuals begin and end for 38 predicted channels; in proportion for other numbers.
+#: Bounds of the stages of residuals for 38 predicted channels, scaled for other numbers of channels.
 STAGES = (0, 6, 12, 20, 29, 38)
 N_STAGES = len(STAGES) + 2
 Y_CLASSES, Z_CLASSES = 5, 7
@@ -88,9 +88,9 @@ class Terms:
         return int(np.abs(self.weights).sum())
 
     def prediction(self, symbols: np.ndarray) -> np.ndarray:
-        """Predictions [n] from symbols [>= max channel + 1, n] of magnitude <= K_MAX. All are integers, in binary64,
-        where sums of products, below 2^45, are exact, or in binary32, where sums below 2^14 are. einsum starts no
-        threads."""
+        """Returns predictions [n] from symbols [>= max channel + 1, n] of magnitude <= K_MAX. Both are integers stored
+        as binary64, which is exact for sums of products (below 2^45), or as binary32, which is exact for sums below
+        2^14. einsum starts no threads."""
         dense = self._dense.astype(symbols.dtype, copy=False)
         predicted: np.ndarray = np.einsum("i,ij->j", dense, symbols[: len(dense)])
         predicted += 0.5
@@ -100,26 +100,26 @@ class Terms:
 
 @dataclass(frozen=True)
 class Split:
-    """The classes of one Gaussian's offsets y and z: flags, and the centres of x and y that distances refer to."""
+    """Classes of one Gaussian's offsets y and z by the distance of x and y from a centre. flags: SPLIT_Y | SPLIT_Z."""
 
     flags: int
     centre_x: int = 0
     centre_y: int = 0
 
     def y_classes(self, x: np.ndarray) -> np.ndarray:
-        """int [n] in 0..4."""
+        """Returns the classes of offsets y, int [n] in 0..4."""
         classes: np.ndarray = np.minimum(np.abs(x - self.centre_x), Y_CLASSES - 1)
         return classes
 
     def z_classes(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """int [n] in 0..6."""
+        """Returns the classes of offsets z, int [n] in 0..6."""
         distance = np.abs(x - self.centre_x) + np.abs(y - self.centre_y)
         classes: np.ndarray = np.minimum(distance, Z_CLASSES - 1)
         return classes
 
 
 def stage_channels(widths: Widths, stage: int) -> range:
-    """The channels of stage 0..5; stage 5 has the offsets x."""
+    """Returns the channels of stage 0..5; stage 5 has the offsets x."""
     if stage == len(STAGES) - 1:
         return range(widths.predicted, widths.channels, 3)
     return range(*(widths.predicted * bound // STAGES[-1] for bound in STAGES[stage : stage + 2]))
@@ -129,9 +129,9 @@ def stage_channels(widths: Widths, stage: int) -> range:
 class Block:
     """The prediction block.
 
-    widths: of the anchors. counts: numbers of classes of stages 1 to 5, of 0 to 5 with step classes. scale, bounds:
-    of the slice that holds the block, set while it is coded: the scale of activities, and by stage the activity
-    [classes - 1] at which each class but the first begins.
+    widths: of the anchors. counts: numbers of classes of stages 1 to 5, or of 0 to 5 with step classes.
+    scale, bounds: set while the slice that holds the block is coded, and used by later slices: the scale of activities,
+    and by stage the activity [classes - 1] at which each class but the first begins.
     """
 
     widths: Widths
@@ -142,7 +142,7 @@ class Block:
     bounds: dict[int, np.ndarray] = field(default_factory=dict)
 
     def classes(self, activity: np.ndarray, stage: int, count: int) -> np.ndarray:
-        """uint8 [n] classes of rows with this activity in the stages before."""
+        """Returns classes uint8 [n] of rows by their activity [n] in earlier stages; sets missing bounds."""
         bounds = self.bounds.get(stage)
         if bounds is None:
             bounds = self.bounds[stage] = activity_bounds(activity, count)
@@ -154,8 +154,8 @@ AnyPrior = TypeVar("AnyPrior", Prior, Fitted)
 
 @dataclass(eq=False)
 class Past(Generic[AnyPrior]):
-    """State of the slices of a layer so far that a later slice may refer to: the latest block, and the priors of each
-    section in order of definition. Attributes have one list of priors for the plain form and one per stage."""
+    """State of a layer's earlier slices that a later slice may use: the latest block, and the priors of each section in
+    order of definition. Attributes have one list of priors for the plain form and one per stage."""
 
     block: Block | None = None
     positions: list[AnyPrior] = field(default_factory=list)
@@ -181,11 +181,11 @@ def write_attributes(
     past: Past[Fitted] | None = None,
     population: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> tuple[bytes, float]:
-    """(section bytes, bits of R(a) over all channels by step class and of the classes) in the smallest form.
+    """Writes the smaller form; returns (section bytes, R(a) in bits of all channels by step class, plus the classes).
 
-    attributes: int32 [channels, n]. classes: int32 [n], or NO_CLASSES. past: of the layer's slices before, to which
-    this one is added. population: (attributes, classes) of all slices that will use the block, to which it is fitted;
-    None for this slice alone.
+    attributes: int32 [channels, n]. classes: int32 [n], or NO_CLASSES. past: state of the layer's earlier slices, to
+    which this one is added. population: (attributes, classes) of all slices that will use the block, which is fitted to
+    them; None for this slice alone.
     """
     past = past or Past()
     everything, grades = (attributes, classes) if population is None else population
@@ -212,7 +212,7 @@ def write_attributes(
 
 
 def by_class(attributes: np.ndarray, classes: np.ndarray) -> Iterator[np.ndarray]:
-    """The channels of form 0: of each channel int [n] its rows of class 0, 1 .. MAX_CLASS, or all without classes."""
+    """Yields the channels of form 0, int [n]: each channel's rows of class 0 .. MAX_CLASS, or all without classes."""
     if not classes.size:
         yield from attributes
         return
@@ -234,8 +234,8 @@ def _fit_block(symbols: np.ndarray, grades: np.ndarray, widths: Widths) -> Block
 
 
 def _residuals(symbols: np.ndarray, terms: Sequence[Terms], channels: Sequence[int]) -> np.ndarray:
-    """int32 [len(channels), n]: the residuals of these channels, ascending, of symbols int32 [channels, n]. Offsets are
-    not predicted."""
+    """Returns the residuals int32 [len(channels), n] of some channels, ascending, of symbols int32 [channels, n].
+    Offsets are not predicted."""
     coded: np.ndarray = symbols[list(channels)]
     for rows in _row_blocks(symbols):
         block = symbols[: min(channels[-1], len(terms)) + 1, rows].astype(np.float64)
@@ -246,12 +246,12 @@ def _residuals(symbols: np.ndarray, terms: Sequence[Terms], channels: Sequence[i
 
 
 def _row_blocks(symbols: np.ndarray) -> Iterator[slice]:
-    """Slices of the rows of symbols [channels, n], small enough for a processor's cache."""
+    """Yields slices of the rows of symbols [channels, n], small enough for a processor's cache."""
     yield from (slice(first, first + BLOCK_ROWS) for first in range(0, symbols.shape[1], BLOCK_ROWS))
 
 
 def _activity(rows: int, grades: np.ndarray, scale: Scale | None = None) -> Activity:
-    """The activity before stage 0: of step classes, GRADE_WEIGHT times that of a channel that holds 2^(6 - class)."""
+    """Returns the activity before stage 0. Step classes count like GRADE_WEIGHT channels that hold 2^(6 - class)."""
     activity = Activity(rows, scale)
     if grades.size:
         activity.add(1 << (MAX_CLASS - grades[None]), GRADE_WEIGHT)
@@ -288,8 +288,8 @@ def _put_block(out: bytearray, block: Block) -> None:
 def _groups(
     symbols: np.ndarray, residuals: Iterator[np.ndarray], grades: np.ndarray, block: Block
 ) -> Iterator[list[Group]]:
-    """The groups that each stage codes. residuals: int32 [channels, n] of each of `_measured_stages`. symbols: int32
-    [channels, n], read for the offsets. Both are read only as far as the stages before have filled them."""
+    """Yields the groups of each stage. residuals: int32 [channels, n] of each of `_measured_stages`. symbols: int32
+    [channels, n], read for the offsets. Both are read only as far as earlier stages have filled them."""
     counts = block.counts if block.widths.graded else [1, *block.counts]
     activity, whole = _activity(symbols.shape[1], grades, block.scale), Places.whole(symbols.shape[1])
     block.scale = activity.scale
@@ -313,17 +313,17 @@ def _groups(
 
 
 def _measured_stages(widths: Widths) -> list[range]:
-    """The channels of the stages of residuals, which later stages are split by."""
+    """Returns the channels of the stages of residuals, whose activity splits later stages."""
     return [stage_channels(widths, stage) for stage in range(len(STAGES) - 1)]
 
 
 def _split_stages(widths: Widths) -> range:
-    """The stages whose channels are split by activity."""
+    """Returns the stages whose channels are split by activity."""
     return range(0 if widths.graded else 1, len(STAGES))
 
 
 def _covariance(symbols: np.ndarray) -> np.ndarray:
-    """float64 [channels, channels] covariance of symbols int32 [channels, n], with ROUNDING_VARIANCE."""
+    """Returns the covariance float64 [channels, channels] of symbols int32 [channels, n], plus ROUNDING_VARIANCE."""
     mean, products = symbols.mean(axis=1, keepdims=True), np.zeros((len(symbols), len(symbols)))
     for rows in _row_blocks(symbols):
         centred = symbols[:, rows] - mean
@@ -333,8 +333,8 @@ def _covariance(symbols: np.ndarray) -> np.ndarray:
 
 
 def _fit_terms(symbols: np.ndarray, covariance: np.ndarray) -> Terms:
-    """Least squares of channel c on the channels before it, from their covariance float64 [c + 1, c + 1], without weak
-    terms; no terms unless they lower the entropy."""
+    """Fits channel c to the channels before it by least squares, without weak terms, from their covariance float64
+    [c + 1, c + 1]. Returns no terms unless they lower the entropy."""
     nothing, c = Terms(np.zeros(0, np.int64), np.zeros(0, np.int64)), len(covariance) - 1
     spread = np.sqrt(np.diag(covariance))
     chosen = np.arange(c)
@@ -384,8 +384,8 @@ def _mode(symbols: np.ndarray) -> int:
 def read_attributes(
     data: bytes, widths: Widths, rows: int, past: Past[Prior] | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(classes int32 [rows] or NO_CLASSES, attributes int32 [channels, rows]); the inverse of write_attributes.
-    rows: checked against the limits already. past: of the layer's slices before, to which this one is added."""
+    """Returns (classes int32 [rows] or NO_CLASSES, attributes int32 [channels, rows]); the inverse of write_attributes.
+    rows: already checked against the limits. past: state of the layer's earlier slices, to which this one is added."""
     reader, block = ByteReader(data), past.block if past else None
     form = reader.byte("the form of the attributes")
     if form not in (PLAIN, STAGED, CONTINUED):
@@ -421,7 +421,7 @@ def _restore(symbols: np.ndarray, terms: Sequence[Terms]) -> None:
 
 
 def _predicted(block: np.ndarray, terms: Sequence[tuple[int, Terms]]) -> tuple[np.ndarray, float]:
-    """(symbols [channels, n], computed in place of their residuals, the largest magnitude among them)."""
+    """Turns residuals [channels, n] into symbols in place. Returns (symbols, their largest magnitude)."""
     with np.errstate(all="ignore"):  # if binary32 overflows, the caller repeats it in binary64
         for c, term in terms:
             block[c] += term.prediction(block)
@@ -436,7 +436,7 @@ def _read_classes(reader: ByteReader, rows: int) -> np.ndarray:
 
 
 def check_classes(classes: np.ndarray) -> None:
-    """Raise Malformed unless int32 [n] are step classes."""
+    """Raise Malformed unless classes int32 [n] are in 0..MAX_CLASS."""
     if classes.size and not (0 <= classes.min() and classes.max() <= MAX_CLASS):
         raise Malformed(f"step classes in {int(classes.min())}..{int(classes.max())}, expected 0..{MAX_CLASS}")
 

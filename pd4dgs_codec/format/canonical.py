@@ -1,4 +1,4 @@
-"""Canonical msgpack (clause 4), in which a value has one byte string, and checked access to its maps and lists.
+"""Canonical msgpack (clause 4), where each value has exactly one encoding, and checked access to its maps and lists.
 
 Values are bool, int, float (a finite binary32), str, bytes, list, and dict with non-negative integer keys. Keys ascend,
 every form is the shortest, and nesting is at most MAX_DEPTH.
@@ -14,14 +14,14 @@ import msgpack
 from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed, UnsupportedFeature
 from pd4dgs_codec.format.registry import MAX_DEPTH
 
-#: Unknown keys from here on are ignored; unknown ones below change what the file means.
+#: Unknown keys from here on are ignored; an unknown key below may change the meaning of the file and is an error.
 FIRST_IGNORABLE_KEY = 64
 
 _SINGLE_MAX = (2.0 - 2.0**-23) * 2.0**127
 
 
 def pack(obj: Any) -> bytes:
-    """Canonical bytes of a value. Raises EncodeError for a value that the format cannot hold."""
+    """Returns the canonical bytes of a value. Raises EncodeError for a value that the format cannot hold."""
     try:
         data: bytes = msgpack.packb(_canonical(obj), use_single_float=True)
     except ValueError as error:
@@ -30,9 +30,9 @@ def pack(obj: Any) -> bytes:
 
 
 def unpack(data: bytes | memoryview, *, offset: int = 0) -> Any:
-    """The value of canonical bytes. Raises Malformed for any other bytes, cut and trailing ones included.
+    """Returns the value of canonical bytes. Raises Malformed for any other bytes, cut and trailing ones included.
 
-    offset: where `data` begins in the file, for messages. Memory is linear in the bytes, whatever they declare.
+    offset: of `data` in the file, for messages. Memory is linear in the number of bytes, whatever they declare.
     """
     reader = _Reader(bytes(data), offset)
     value = reader.value(0)
@@ -41,11 +41,11 @@ def unpack(data: bytes | memoryview, *, offset: int = 0) -> Any:
     return value
 
 
-#: By first byte, of each kind the first one: kind, least numbers that need each of its forms, of 1, 2, .. bytes.
+#: By first byte of a kind's shortest form: kind, least number that needs each form, struct codes of the forms.
 _SIZED = {
     0xC4: ("bytes", (0, 1 << 8, 1 << 16), "BHI"),
     0xCC: ("int", (1 << 7, 1 << 8, 1 << 16, 1 << 32), "BHIQ"),
-    0xD0: ("negative", (1 << 5, 1 << 7, 1 << 15, 1 << 31), "bhiq"),  # of an integer n, the number is -1 - n
+    0xD0: ("negative", (1 << 5, 1 << 7, 1 << 15, 1 << 31), "bhiq"),  # the number of an integer n is -1 - n
     0xD9: ("str", (1 << 5, 1 << 8, 1 << 16), "BHI"),
     0xDC: ("list", (1 << 4, 1 << 16), "HI"),
     0xDE: ("map", (1 << 4, 1 << 16), "HI"),
@@ -59,7 +59,7 @@ _REAL = struct.Struct(">f")
 
 
 class _Reader:
-    """Reads values front to back. The library's own reader believes the declared size of every nested list."""
+    """Reads values front to back. msgpack's own reader trusts the declared size of every nested list."""
 
     def __init__(self, data: bytes, offset: int):
         self.data, self.offset, self.at = data, offset, 0
@@ -89,7 +89,7 @@ class _Reader:
         return entries
 
     def _head(self) -> tuple[str, Any]:
-        """(kind of the next value, its number or how many bytes or entries follow)."""
+        """Reads a value's head: (kind, the number itself or the count of bytes or entries that follow)."""
         (first,) = self._take(1)
         if first < 0x80 or first >= 0xE0:
             return "int", first if first < 0x80 else first - 256
@@ -127,7 +127,7 @@ class _Reader:
 
 
 def _canonical(obj: Any, depth: int = 0) -> Any:
-    """The same value with sorted keys; ValueError for a type, a key, a number or a depth that is not allowed."""
+    """Returns the value with sorted keys. Raises ValueError for a type, key, number or depth that is not allowed."""
     if type(obj) in (dict, list, tuple):
         if depth == MAX_DEPTH:
             raise ValueError(f"nested deeper than {MAX_DEPTH}")
@@ -172,7 +172,7 @@ class Fields:
         return key in self._data
 
     def get(self, key: int) -> object:
-        """The value of `key`, which must be there."""
+        """The value of `key`. Raises Malformed if it is missing."""
         if key not in self._data:
             raise Malformed(f"{self._where}: key {key} is missing")
         return self._data[key]
@@ -182,7 +182,7 @@ class Fields:
         return as_integer(self.get(key), high, f"{self._where} key {key}", low)
 
     def choice(self, key: int, table: dict[str, int]) -> str:
-        """The name of an enumerated value; a number outside the table is a feature this decoder does not know."""
+        """The name of an enumerated value. Raises UnsupportedFeature for a number outside the table."""
         names = {number: name for name, number in table.items()}
         return names[as_registered(self.get(key), names, f"{self._where} key {key}")]
 
@@ -206,7 +206,7 @@ class Fields:
 
 
 def as_integer(value: object, high: int, where: str, low: int = 0) -> int:
-    """`value` as an integer in low..high, else Malformed, or LimitExceeded above `high`."""
+    """Returns `value` as an integer in low..high. Raises LimitExceeded above `high`, Malformed for anything else."""
     if not isinstance(value, int) or isinstance(value, bool):
         raise Malformed(f"{where}: {type(value).__name__}, expected an integer")
     if value > high:
@@ -217,7 +217,7 @@ def as_integer(value: object, high: int, where: str, low: int = 0) -> int:
 
 
 def as_registered(value: object, known: Mapping[int, object], where: str) -> int:
-    """`value` as one of the `known` numbers of a registry; another integer is a feature this decoder does not know."""
+    """Returns `value` as one of the `known` numbers of a registry. Raises UnsupportedFeature for another integer."""
     if not isinstance(value, int) or isinstance(value, bool):
         raise Malformed(f"{where}: {type(value).__name__}, expected an integer")
     if value not in known:
@@ -226,7 +226,7 @@ def as_registered(value: object, known: Mapping[int, object], where: str) -> int
 
 
 def as_list(value: object, where: str, count: int | None = None) -> list[Any]:
-    """`value` as a list, of `count` entries if given."""
+    """Returns `value` as a list, of `count` entries if given. Raises Malformed for anything else."""
     if not isinstance(value, list):
         raise Malformed(f"{where}: {type(value).__name__}, expected a list")
     if count is not None and len(value) != count:

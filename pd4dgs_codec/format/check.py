@@ -1,9 +1,8 @@
-"""Checks of the encoder: of a scene before it is written, and of the errors of its symbols.
+"""Encoder: checks a scene before it is written, and the quantisation errors of its symbols.
 
 By clause 11.5 and rounding half to even, |x - x_hat| <= Q/2 plus half a unit in the last place of x_hat, because the
-product k Q is rounded to binary32. Voxel indices and mask codes are integers and come back exactly. The header declares
-one bound per kind of tensors (clause 5.4), the kinds being the fields of Steps. An anchor of step class c has 2^c
-times the steps and the bounds.
+product k Q is rounded to binary32. Voxel indices and mask codes are integers and decode exactly. The header declares
+one bound per field of Steps (clause 5.4). An anchor of step class c has 2^c times the steps and the bounds.
 """
 
 from collections.abc import Iterator, Mapping
@@ -21,7 +20,7 @@ from pd4dgs_codec.format.symbols import SceneSymbols
 from pd4dgs_codec.morton import MAX_VOXEL
 from pd4dgs_codec.scene import MASK_MIN_CODE, MAX_CLASS, MAX_FEATURE, MAX_SLOTS, Scene
 
-#: |x| / Q <= 2^23 is computed in binary64, off by at most 2^-30, which may turn a tie: allow this share of Q more.
+#: Extra share of Q: |x| / Q <= 2^23 in binary64 is off by at most 2^-30, which may round a tie the other way.
 _TIES = 2.0**-29
 
 
@@ -100,8 +99,8 @@ def _check_info(scene: Scene) -> None:
 
 @dataclass(frozen=True)
 class ErrorBound:
-    """Errors of all tensors that share a step, in the unit of the values. what: the field of Steps. step: Q. bound: the
-    error that the header declares. largest: the largest error."""
+    """Errors of all tensors that share a step, in the unit of the values, divided by 2^c in step class c. what: the
+    field of Steps. step: Q. bound: the error that the header declares. largest: the largest error."""
 
     what: str
     step: float
@@ -110,8 +109,8 @@ class ErrorBound:
 
 
 def rounding_bounds(symbols: SceneSymbols) -> dict[str, float]:
-    """By field of Steps that the symbols use: the largest error of rounding to the nearest symbol, rounded up to
-    binary32. The symbol farthest from 0 has the largest bound."""
+    """Returns the largest error of rounding to the nearest symbol, rounded up to binary32, by field of Steps that the
+    symbols use. The symbol farthest from 0 has the largest bound."""
     farthest: dict[str, int] = {}
     for layer in symbols.layers:
         found = list(symbols.grid.farthest(layer.attributes, layer.classes).items())
@@ -126,10 +125,10 @@ def rounding_bounds(symbols: SceneSymbols) -> dict[str, float]:
 
 
 def verify_errors(given: Scene, symbols: SceneSymbols, declared: Mapping[str, float]) -> list[ErrorBound]:
-    """A row per entry of `declared`, the bounds in the header. given: the planned scene that was quantised.
+    """Returns the errors for each entry of `declared`, the bounds in the header.
 
-    Raises EncodeError naming the field if a dequantised value lies farther from the given one than declared, or than
-    rounding takes it.
+    given: the planned scene that was quantised. Raises EncodeError naming the field if the error of a dequantised value
+    exceeds the declared bound or the bound of rounding.
     """
     steps, largest = vars(symbols.steps), dict.fromkeys(declared, 0.0)
     for what, x, restored, spacing in _pairs(given, symbols):
@@ -144,7 +143,7 @@ def verify_errors(given: Scene, symbols: SceneSymbols, declared: Mapping[str, fl
 
 
 def _pairs(given: Scene, symbols: SceneSymbols) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray | float]]:
-    """(field of Steps, values given, values dequantised, 2^step class of each)."""
+    """Yields (field of Steps, values given, values dequantised, 2^(step class) of each)."""
     for rows, classes, values in symbols.blocks():
         for name, x in values.items():
             spacing = 2.0 ** classes.reshape(-1, *(1,) * (x.ndim - 1)) if classes.size else 1.0
@@ -156,12 +155,12 @@ def _pairs(given: Scene, symbols: SceneSymbols) -> Iterator[tuple[str, np.ndarra
 
 
 def _bounds(magnitudes: np.ndarray, step: float) -> np.ndarray:
-    """float64 error bounds of dequantised values of these float32 magnitudes."""
+    """Returns the error bounds float64 of dequantised values of these float32 magnitudes."""
     last_place: np.ndarray = np.spacing(magnitudes).astype(np.float64)
     return (0.5 + _TIES) * step + 0.5 * last_place
 
 
 def _rounded_up(value: float) -> float:
-    """The least binary32 value that is not below."""
+    """Returns the least binary32 value that is not below `value`."""
     nearest = np.float32(value)
     return float(nearest if nearest >= value else np.nextafter(nearest, np.float32(np.inf)))

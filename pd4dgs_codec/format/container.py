@@ -62,7 +62,7 @@ class Chunk:
 
     @property
     def slice(self) -> int:
-        """Its number within its layer."""
+        """Number of the slice within its layer."""
         return self.flags >> SLICE_SHIFT
 
     @property
@@ -72,17 +72,17 @@ class Chunk:
 
 
 def slice_flags(number: int, of: int) -> int:
-    """The flags of slice `number` of a layer of so many slices."""
+    """Returns the flags of slice `number` of a layer of `of` slices."""
     return number << SLICE_SHIFT | FLAG_MORE * (number + 1 < of)
 
 
 def _reserved(flags: int) -> int:
-    """The bits that must be zero, as far as they are not."""
+    """Returns the bits that are set although they must be zero."""
     return flags & ~FLAG_ANCILLARY if flags & FLAG_ANCILLARY else flags & _RESERVED
 
 
 def write_preamble(header: bytes) -> bytes:
-    """Preamble and header. Raises EncodeError for a header over MAX_HEADER bytes."""
+    """Returns preamble and header. Raises EncodeError for a header over MAX_HEADER bytes."""
     if len(header) > MAX_HEADER:
         raise EncodeError(f"a header of {len(header)} bytes, limit {MAX_HEADER}")
     front = _PREAMBLE.pack(SIGNATURE, MAJOR, MINOR, len(header))
@@ -90,11 +90,11 @@ def write_preamble(header: bytes) -> bytes:
 
 
 def read_preamble(data: Buffer) -> Preamble:
-    """Inverse of write_preamble, from the first bytes of a file; what follows the header is not looked at.
+    """Reads preamble and header from the first bytes of a file; bytes after the header are ignored.
 
     Raises BadSignature, Truncated, UnsupportedVersion (the major version), LimitExceeded or ChecksumMismatch.
     """
-    with memoryview(data) as view:  # one that an error's traceback keeps would fix the size of a stream's buffer
+    with memoryview(data) as view:  # released: kept by an error's traceback, it would fix a buffer's size
         start = bytes(view[: len(SIGNATURE)])
         if not SIGNATURE.startswith(start):
             raise BadSignature(
@@ -114,7 +114,7 @@ def read_preamble(data: Buffer) -> Preamble:
 
 
 def write_chunk(type: int, flags: int, scene_id: bytes, payload: bytes) -> bytes:
-    """One framed chunk. Raises EncodeError for a field out of range."""
+    """Returns one framed chunk. Raises EncodeError for a field out of range."""
     if not (0 <= type < 1 << 16 and 0 <= flags < 1 << 16) or _reserved(flags) or len(scene_id) != SCENE_ID_SIZE:
         raise EncodeError(f"chunk type {type}, flags {flags}, scene id of {len(scene_id)} bytes: out of range")
     if len(payload) > MAX_PAYLOAD:
@@ -133,11 +133,10 @@ def read_chunk(
     index: int | None = None,
     start: int = 0,
 ) -> Chunk:
-    """The chunk at `offset` of a file. type, length (of the payload) and scene_id are what the header announced.
+    """Reads the chunk at `offset` of a file. type, length (of the payload), scene_id: as the header announces them.
 
-    index: the chunk's place in the file, for the error's text. start: where in the file `data` begins. Raises
-    Truncated, LimitExceeded, ChecksumMismatch, or Malformed where the chunk is not the one announced or sets a reserved
-    flag.
+    index: number of the chunk in the file, for messages. start: offset of `data` in the file. Raises Truncated,
+    LimitExceeded, ChecksumMismatch, or Malformed if the chunk is not the one announced or sets a reserved flag.
     """
     with memoryview(data) as view:
         at = offset - start

@@ -1,4 +1,4 @@
-"""Bytes of a `.pd4` file -> Scene, at once or as they arrive. Needs numpy, constriction, msgpack and nothing else."""
+"""Decodes a `.pd4` file at once or as its bytes arrive. Needs only numpy, constriction and msgpack."""
 
 from collections.abc import Callable, Iterator
 
@@ -14,8 +14,8 @@ from pd4dgs_codec.scene import Scene
 
 
 class LayerReader:
-    """Reads a file's chunks in order. It holds neither bytes nor slices: a call gets the bytes from the next chunk on
-    and returns one slice. After a fault it stands where it stood before the slice.
+    """Reads a file's chunks in order. It keeps neither bytes nor slices: each call gets the bytes from the next chunk
+    on and returns one slice. A fault leaves the reader as it was before the slice.
     """
 
     def __init__(self) -> None:
@@ -24,12 +24,12 @@ class LayerReader:
         self.count = 0  #: slices read
         self._scene: GrowingScene | None = None
         self._layer, self._number = -1, -1  # of the latest slice
-        self._following: list[int | None] = []  # by chunk, the layer of the first slice behind those before it
+        self._following: list[int | None] = []  # by chunk, the layer of the first slice from it on
         self._index = 0
         self._scene_id = b""
         self._declared = Declared()
         self._taken = TakenVoxels()
-        self._past: Past[Prior] | None = None  # copied for each slice, as a fault must leave it as it is
+        self._past: Past[Prior] | None = None  # copied for each slice, so that a fault leaves it unchanged
 
     @property
     def complete(self) -> bool:
@@ -38,23 +38,23 @@ class LayerReader:
 
     @property
     def scene(self) -> GrowingScene:
-        """The scene of the slices read so far, once the header is."""
+        """The scene of the slices read so far; requires that the header has been read."""
         assert self._scene is not None
         return self._scene
 
     @property
     def whole(self) -> bool:
-        """Whether the layer of the latest slice has no further ones."""
+        """Whether the layer of the latest slice has no further slices."""
         return self._following[self._index] != self._layer
 
     def next_slice(
         self, data: bytes | bytearray, max_layer: int | None = None, max_bytes: int | None = None, start: int = 0
     ) -> LayerSymbols | None:
-        """One more slice of a layer <= max_layer that ends within the first max_bytes (clause 12), None if there is
-        none. start: where in the file `data` begins, at most `offset`.
+        """Returns the next slice of a layer <= max_layer that ends within the first max_bytes (clause 12), or None.
 
-        Raises Truncated, with nothing consumed that a later call would miss, if `data` ends before its end. Raises
-        Malformed if bytes follow the last chunk of a file that is read whole (without either limit).
+        start: offset of `data` in the file, at most `offset`. Raises Truncated if `data` ends before the slice does; a
+        call with more bytes can then go on. Raises Malformed if bytes follow the last chunk of a file that is read
+        without either limit.
         """
         if self.header is None:
             preamble = read_preamble(data)
@@ -144,7 +144,7 @@ def _read(
     allow_partial: bool = False,
     take: Callable[[LayerSymbols], None] = lambda part: None,
 ) -> bool:
-    """Whether no slice that was asked for is missing; arguments as in `decode`. take: is given each slice."""
+    """Passes each slice to `take`; returns whether no requested slice is missing. Other arguments as in `decode`."""
     if max_layer is not None and max_layer < 0:
         raise ValueError(f"max_layer must be 0 or more, found {max_layer}")
     try:
@@ -160,7 +160,7 @@ def _read(
 
 
 def read_layers(data: bytes, *, max_layer: int | None = None) -> tuple[Header, SceneSymbols]:
-    """(header, what a complete file stores, or its layers <= max_layer). Raises as `decode` does."""
+    """Returns (header, symbols) of a complete file, or of its layers <= max_layer. Raises as `decode` does."""
     reader, layers = LayerReader(), dict[int, list[LayerSymbols]]()
     _read(reader, data, max_layer, take=lambda part: layers.setdefault(part.kind.layer, []).append(part))
     assert reader.header is not None
@@ -171,11 +171,11 @@ def read_layers(data: bytes, *, max_layer: int | None = None) -> tuple[Header, S
 def decode(
     data: bytes, *, max_layer: int | None = None, max_bytes: int | None = None, allow_partial: bool = False
 ) -> Scene:
-    """The scene of a file, of its layers <= max_layer, or of the slices within its first max_bytes bytes, at least one.
-    Bytes after those are not looked at.
+    """Decodes a file, its layers <= max_layer, or the slices within its first max_bytes bytes, at least one. Later
+    bytes are ignored.
 
-    A cut file raises Truncated; with allow_partial it returns the longest valid prefix of slices, at least one. Other
-    faults raise the other DecodeErrors.
+    A cut file raises Truncated, unless allow_partial is set and the file holds at least one slice: then its longest
+    valid prefix of slices is decoded. Other faults raise other subclasses of DecodeError.
     """
     return decode_partial(data, max_layer=max_layer, max_bytes=max_bytes, allow_partial=allow_partial)[0]
 
@@ -183,7 +183,7 @@ def decode(
 def decode_partial(
     data: bytes, *, max_layer: int | None = None, max_bytes: int | None = None, allow_partial: bool = True
 ) -> tuple[Scene, bool]:
-    """(scene, complete): as `decode`, and whether every slice asked for was there."""
+    """Returns (scene as from `decode`, whether every requested slice was there)."""
     reader = LayerReader()
     complete = _read(reader, data, max_layer, max_bytes, allow_partial)
     reader.scene.sort()
@@ -194,13 +194,13 @@ def decode_partial(
 
 
 class Stream:
-    """Decodes a file fed in pieces of any size, which takes about as long as `decode` of them all. The scenes do not
-    depend on where the pieces are cut."""
+    """Decodes a file that arrives in pieces of any size, in about the time of `decode`. The scenes do not depend on
+    where the pieces are cut."""
 
     def __init__(self) -> None:
         self._reader = LayerReader()
         self._buffer = bytearray()  # from byte `consumed` of the file on
-        self._needs = 0  # bytes of the file before which nothing is to be found out
+        self._needs = 0  # bytes of the file that the next step requires
         self._error: DecodeError | None = None
 
     @property
@@ -215,21 +215,21 @@ class Stream:
 
     @property
     def slices(self) -> int:
-        """How many are complete so far."""
+        """Number of slices that are complete so far."""
         return self._reader.count
 
     def feed(self, data: bytes) -> list[Scene]:
-        """The newest scene of each layer that `data` completes a slice of, with all slices up to there.
+        """Decodes further bytes; returns the newest scene of each layer of which they complete a slice.
 
-        The rows of a layer stand in the order in which its slices came until it is whole, and then in that of `decode`.
-        Scenes share their arrays, which are read-only. `every_prefix` has a scene for each slice.
+        The rows of a layer are in order of arrival until its last slice, and then in the order of `decode`. Scenes
+        share their arrays, which are read-only. `every_prefix` yields a scene for each slice.
 
         A fault raises its DecodeError now, or at the next call if this one completes a slice before it, and at every
-        later call until `rewind`. Scenes returned before stay valid.
+        later call until `rewind`. Scenes returned earlier stay valid.
         """
         if self._error is not None:
             raise self._error
-        self._buffer.extend(data)  # `+=` of an array would add numbers
+        self._buffer.extend(data)  # `+=` with a numpy array would add numbers
         if self.consumed + len(self._buffer) < self._needs:
             return []
         scenes, pending = list[Scene](), False
@@ -255,7 +255,7 @@ class Stream:
         self._next()
 
     def rewind(self) -> None:
-        """Forget a fault, and the bytes that are not decoded: feed the file from byte `consumed` on next."""
+        """Forget a fault and all bytes not yet decoded. Then feed the file from byte `consumed` on."""
         self._buffer, self._needs, self._error = bytearray(), 0, None
 
     def _next(self) -> LayerSymbols | None:
@@ -267,12 +267,12 @@ class Stream:
 
 
 def every_prefix(data: bytes) -> Iterator[Scene]:
-    """The scene after each slice of a whole file, as a stream gives them. Raises DecodeError."""
+    """Yields the scene after each slice of a complete file, in the row order of `Stream.feed`. Raises DecodeError."""
     reader = LayerReader()
     while reader.next_slice(data) is not None:
         yield reader.scene.scene(writeable=False)
 
 
 def open_stream() -> Stream:
-    """An empty stream, ready to be fed."""
+    """Returns an empty stream, ready to be fed."""
     return Stream()
