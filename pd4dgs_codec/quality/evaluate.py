@@ -1,4 +1,4 @@
-"""Quality and bytes of the levels of a file, on a dataset's held-out views."""
+"""Evaluates quality and bytes of the levels of a file on a dataset's held-out views."""
 
 import statistics
 from collections.abc import Callable, Mapping, Sequence
@@ -21,9 +21,9 @@ from pd4dgs_codec.quality.levels import Level
 from pd4dgs_codec.quality.perceptual import VGG, Distance, Perceptual
 from pd4dgs_codec.scene import Camera
 
-#: Pictures of the fixed camera over t = 0..1 that the temporal distances compare.
+#: Pictures of one camera over t = 0..1 that the temporal distances compare.
 TEMPORAL_FRAMES = 30
-#: mpsnr and mssim are those of DyCheck. 3dgs adds psnr, ssim and, if it is there, lpips_vgg, all without masks.
+#: dycheck: mpsnr and mssim. 3dgs adds psnr, ssim and, if it is available, lpips_vgg, all without masks.
 PROTOCOLS = ("dycheck", "3dgs")
 
 
@@ -35,10 +35,10 @@ def evaluate(
     perceptual: Perceptual | None = None,
     step: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
-    """The result of `pd4dgs-eval --json`: metrics are means over the views.
+    """Returns the result of `pd4dgs-eval --json`; metrics are means over the views.
 
-    Without held-out views the training views are used and "split" is "train". mpsnr in dB, infinite for equal pictures.
-    protocol: of PROTOCOLS. perceptual: distances to add, see `_row`; the result describes them under
+    Without held-out views the training views are used and "split" is "train". mpsnr is in dB, infinite for equal
+    pictures. protocol: of PROTOCOLS. perceptual: distances to add, see `_row`; the result describes them under
     "perceptual". step is called after each picture of each level.
     """
     views, split = (dataset.test, "test") if dataset.test else (dataset.train, "train")
@@ -71,7 +71,7 @@ def evaluate(
 
 
 def metric_columns(result: dict[str, Any]) -> list[tuple[str, str, int]]:
-    """(heading, key of a level's row, decimals) of each metric of an evaluation."""
+    """Returns (heading, key of a level's row, decimals) for each metric of an evaluation."""
     titles = {name: d["title"] for name, d in result.get("perceptual", {"distances": {}})["distances"].items()}
     vgg = titles.pop(VGG, None)
     m = "m" if result["protocol"] == "dycheck" else ""
@@ -93,11 +93,11 @@ def _row(
     moving: Mapping[View, np.ndarray],
     step: Callable[[], None],
 ) -> dict[str, Any]:
-    """The row of one level. render_ms: median milliseconds per picture, the networks included.
+    """Returns the row of one level. render_ms: median milliseconds per picture, the networks included.
 
-    metrics: key -> metric, whose mean over the views is taken. distances: name -> distance; adds t_<name>, the mean
-    between successive pictures of the first view's camera at TEMPORAL_FRAMES equidistant times from 0 to 1. moving:
-    masks of views, see `moving_regions`; adds moving_mpsnr, the mean over these views of the mPSNR there.
+    metrics: key -> metric, of which the row has the mean over the views. distances: name -> distance; adds t_<name>,
+    the mean distance between successive pictures of the first view's camera at TEMPORAL_FRAMES equidistant times from
+    0 to 1. moving: masks of views, see `moving_regions`; adds moving_mpsnr, the views' mean mPSNR within the masks.
     """
     milliseconds, where_moving = [], []
 

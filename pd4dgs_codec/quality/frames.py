@@ -1,4 +1,4 @@
-"""The pictures to take of a file: a dataset's views, or the file's own camera over time."""
+"""The pictures to render from a file: a dataset's views, or the file's own camera over time."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,13 +10,13 @@ from pd4dgs_codec.data.view import View
 from pd4dgs_codec.errors import RenderError
 from pd4dgs_codec.scene import Camera, SceneInfo
 
-#: The most pixels of a picture by a file's own camera: a .pd4 of a few bytes may name one of 65,535 x 65,535.
+#: The most pixels of a picture by a file's own camera: a .pd4 of a few bytes may declare 65,535 x 65,535.
 MAX_PIXELS = 1 << 25
 
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """One picture to take. time: 0..1. truth: uint8 [H, W, 3], the image that a dataset has there, or None."""
+    """One picture to render. time: 0..1. truth: uint8 [H, W, 3], the dataset's image of this view, or None."""
 
     camera: Camera
     time: float
@@ -24,15 +24,13 @@ class Frame:
 
 
 def dataset_frames(views: Sequence[View]) -> list[Frame]:
-    """The cameras, times and images of a dataset's views."""
+    """Returns the cameras, times and images of a dataset's views."""
     return [Frame(view.camera, view.time, view.image) for view in views]
 
 
 def own_frames(info: SceneInfo, count: int, orbit: float = 0.0, downscale: int = 1) -> list[Frame]:
-    """`count` pictures over the whole time from the file's camera, which orbits its look-at point by `orbit` degrees.
-
-    Raises RenderError if the file has no camera, or one of pictures over MAX_PIXELS.
-    """
+    """Returns `count` frames over the whole time from the file's camera, which orbits its look-at point by `orbit`
+    degrees. Raises RenderError if the file has no camera, or its pictures exceed MAX_PIXELS."""
     if info.camera is None:
         raise RenderError("the file holds no camera of its own; expected --data SOURCE to take cameras from")
     camera = shrunk(info.camera, downscale)
@@ -44,7 +42,7 @@ def own_frames(info: SceneInfo, count: int, orbit: float = 0.0, downscale: int =
         )
     times = np.linspace(0.0, 1.0, count) if count > 1 else np.zeros(1)
     centre = look_at_point(info)
-    # a full sine over the sequence: it starts and ends at rest in the given camera, so that a looped video has no jump
+    # a full sine over the sequence: it starts and ends in the given camera, so that a looped video has no jump
     angles = np.radians(orbit / 2) * np.sin(2 * np.pi * times)
     return [
         Frame(turned(camera, centre, info.up, a) if a else camera, float(t)) for a, t in zip(angles, times, strict=True)
@@ -52,7 +50,7 @@ def own_frames(info: SceneInfo, count: int, orbit: float = 0.0, downscale: int =
 
 
 def shrunk(camera: Camera, downscale: int) -> Camera:
-    """The camera of an image 1/downscale as wide and high, the remainder cropped; pixel centres at +0.5."""
+    """Returns the camera of an image 1/downscale as wide and high, the remainder cropped; pixel centres at +0.5."""
     if downscale == 1:
         return camera
     width, height = max(1, camera.width // downscale), max(1, camera.height // downscale)
@@ -60,7 +58,7 @@ def shrunk(camera: Camera, downscale: int) -> Camera:
 
 
 def look_at_point(info: SceneInfo) -> np.ndarray:
-    """float64 [3] the point of the camera's optical axis nearest to the middle of the scene's box, world."""
+    """Returns the point of the camera's optical axis nearest to the middle of the scene's box, float64 [3], world."""
     assert info.camera is not None
     viewmat = info.camera.viewmat.astype(np.float64)
     eye, axis = -viewmat[:3, :3].T @ viewmat[:3, 3], viewmat[2, :3]
@@ -69,7 +67,7 @@ def look_at_point(info: SceneInfo) -> np.ndarray:
 
 
 def turned(camera: Camera, centre: np.ndarray, up: Sequence[float], angle: float) -> Camera:
-    """The camera carried by `angle` radians around the axis `up` through `centre`, still looking at the same point."""
+    """Returns the camera rotated by `angle` radians around the axis `up` through `centre`."""
     axis = np.asarray(up, np.float64)
     axis = axis / max(float(np.linalg.norm(axis)), 1e-12)
     x, y, z = axis

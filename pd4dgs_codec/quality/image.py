@@ -1,6 +1,6 @@
 """Masked PSNR and SSIM of the DyCheck protocol, SSIM of 3D Gaussian Splatting, in float64 numpy, and means over views.
 
-Images are rounded to 8 bits first, as a written picture would be. Masks are bool [H, W], True = counts.
+Images are rounded to 8 bits first, as in a written picture. Masks are bool [H, W], True for pixels that count.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ GAUSSIAN: np.ndarray = np.exp(-0.5 * ((np.arange(TAPS) - TAPS // 2) / SIGMA) ** 
 GAUSSIAN /= GAUSSIAN.sum()
 C1, C2 = 0.01**2, 0.03**2
 LEAST_WEIGHT = 1e-6
-#: A pixel moves if its true colour changes by more than this, of 255: video noise stays below, moving things do not.
+#: A pixel moves if its true colour changes by more than this, of 255: above video noise, below changes by motion.
 MOVING = 16
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:
-    """uint8 image from reals in 0..1 (clipped, rounded to the nearest level); uint8 passes through. NaN is an error."""
+    """Converts floats in 0..1 (clipped, rounded) to uint8; uint8 passes. Raises DataError for NaN and other dtypes."""
     image = np.asarray(image)
     if image.dtype == np.uint8:
         return image
@@ -38,7 +38,7 @@ def to_uint8(image: np.ndarray) -> np.ndarray:
 
 
 def prepare(pred: np.ndarray, target: np.ndarray, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Both images rounded to 8 bits as float64 [H, W, 3] in 0..1, and the mask as float64 [H, W]."""
+    """Returns both images rounded to 8 bits, [H, W, 3] in 0..1, and the mask [H, W], float64. Raises DataError."""
     a, b = np.asarray(pred), np.asarray(target)
     if a.shape != b.shape or a.ndim != 3 or a.shape[2] != 3:
         raise DataError(f"images have shapes {a.shape} and {b.shape}, expected the same [H, W, 3]")
@@ -49,7 +49,7 @@ def prepare(pred: np.ndarray, target: np.ndarray, mask: np.ndarray | None) -> tu
 
 
 def mpsnr(pred: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """-10 log10(sum(squared error * m) / max(sum(m), 1e-6)) in dB, m over 3 channels; infinite for equal images.
+    """Returns -10 log10(sum(squared error * m) / max(sum(m), 1e-6)) in dB, m over 3 channels; inf for equal images.
 
     pred, target: [H, W, 3] uint8 or floats in 0..1. mask: bool [H, W]; None = all.
     """
@@ -59,7 +59,7 @@ def mpsnr(pred: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) 
 
 
 def _slide(z: np.ndarray, weights: np.ndarray, axis: int) -> np.ndarray:
-    """Correlation along an axis where all of `weights` fits."""
+    """Returns the valid correlation of z with `weights` along an axis."""
     n = z.shape[axis] - len(weights) + 1
     part = [slice(None)] * z.ndim
     total = 0.0
@@ -70,7 +70,7 @@ def _slide(z: np.ndarray, weights: np.ndarray, axis: int) -> np.ndarray:
 
 
 def _blur(z: np.ndarray, m: np.ndarray) -> np.ndarray:
-    """Masked separable Gaussian of z [H, W, C] with mask m [H, W, 1]: rows first, then columns.
+    """Blurs z [H, W, C] with mask m [H, W, 1] by a separable Gaussian, along rows first, then along columns.
 
     Each pass is conv(z m, f) * taps / conv(m, 1), or 0 where no pixel counts; the mask becomes (count != 0).
     """
@@ -113,8 +113,8 @@ def _mean_ssim(mu0: np.ndarray, mu1: np.ndarray, variances: np.ndarray, cov: np.
 
 
 def mean_image_baseline(train: Sequence[View], test: Sequence[View]) -> float | None:
-    """Mean mPSNR in dB over the test views of the mean training image: a model should exceed it. None if images differ
-    in size."""
+    """Returns the mean mPSNR in dB of the mean training image over the test views, which a model should exceed, or None
+    if images differ in size. Raises DataError without training or test views."""
     if not train or not test:
         raise DataError(f"found {len(train)} training and {len(test)} test views, expected at least 1 of each")
     if len({view.image.shape for view in (*train, *test)}) > 1:
@@ -124,9 +124,9 @@ def mean_image_baseline(train: Sequence[View], test: Sequence[View]) -> float | 
 
 
 def moving_regions(views: Sequence[View]) -> dict[View, np.ndarray]:
-    """bool [H, W] of each view whose camera stands still: the valid pixels that change over time there.
+    """Returns masks bool [H, W] of the valid pixels that change over time, for views of static cameras.
 
-    Cameras stand still that took views at two times or more. A pixel changes if a channel of the true image does so by
+    A camera pose with views at two or more times is static. A pixel changes if a channel of the true image changes by
     more than MOVING between any two times at which it is valid. Views without such a pixel are left out.
     """
     cameras: dict[tuple[object, ...], list[View]] = {}
@@ -160,7 +160,7 @@ def mean_scores(
     metrics: Mapping[str, Metric],
     step: Callable[[], None] = lambda: None,
 ) -> dict[str, float]:
-    """Each metric's mean over `views` of its score of draw(view), [H, W, 3] in 0..1. step: called after each view."""
+    """Returns each metric's mean score of draw(view), [H, W, 3] in 0..1, over `views`. step: called after each view."""
     scores: dict[str, list[float]] = {name: [] for name in metrics}
     for view in views:
         picture = draw(view)
@@ -176,5 +176,5 @@ def level_psnr(
     views: Sequence[View],
     step: Callable[[], None] = lambda: None,
 ) -> dict[int, float]:
-    """Per level the mean over `views` of the mPSNR of draw(level, view), dB; infinite for equal pictures."""
+    """Returns per level the mean mPSNR of draw(level, view) over `views`, dB, infinite for equal pictures."""
     return {level: mean_scores(partial(draw, level), views, {"mpsnr": mpsnr}, step)["mpsnr"] for level in levels}

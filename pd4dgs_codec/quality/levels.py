@@ -1,4 +1,4 @@
-"""The levels of a file ready to render, each decoded from the bytes that a receiver would hold at that level.
+"""Loads the levels of a file for rendering, each decoded from the prefix that a receiver has at that level.
 
 `draw.player` renders a decoded level without torch; the torch model renders a checkpoint.
 """
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Level:
-    """One level of a file, rendered by `model`. anchors: active at the level. cumulative_bytes: size of its prefix;
-    decode_seconds: time to decode it; both None for a checkpoint."""
+    """One level of a file, rendered by `model`. anchors: number of active anchors. cumulative_bytes: its prefix's size,
+    decode_seconds: time to decode it, both None for a checkpoint."""
 
     level: int
     model: Player | Model
@@ -36,7 +36,7 @@ class Level:
     decode_seconds: float | None = None
 
     def picture(self, camera: Camera, time: float) -> np.ndarray:
-        """float32 [H, W, 3] in 0..1 at normalised time 0..1."""
+        """Renders float32 [H, W, 3] in 0..1 at normalised time 0..1."""
         if isinstance(self.model, Player):
             return self.model.picture(camera, time)
         from pd4dgs_codec.model.picture import render_image
@@ -44,14 +44,14 @@ class Level:
         return render_image(self.model, self.level, time, camera)
 
     def timed_picture(self, camera: Camera, time: float) -> tuple[np.ndarray, float]:
-        """`picture` and its milliseconds, the networks included."""
+        """Returns `picture` and its milliseconds, the networks included."""
         start = perf_counter()
         image = self.picture(camera, time)
         return image, 1e3 * (perf_counter() - start)
 
 
 def level_of(scene: Scene) -> Level:
-    """The highest level of a decoded scene."""
+    """Returns the highest level of a decoded scene."""
     return Level(scene.level, Player(scene), int((scene.mask[-1] > 0).sum()))
 
 
@@ -63,12 +63,11 @@ def load_levels(
     last_only: bool = False,
     background: tuple[float, float, float] | None = None,
 ) -> list[Level]:
-    """The levels of a `.pd4` file (or its bytes) or of a checkpoint, ascending, up to max_layer; with last_only the
-    last one. max_bytes: of a `.pd4`, decode only the slices within so many bytes. background: RGB to draw in place of
-    the scene's.
+    """Loads the levels of a `.pd4` file (or its bytes) or of a checkpoint, ascending, up to max_layer.
 
-    Each level of a `.pd4` is decoded from its own prefix, so nothing of a later layer can leak into it. Raises
-    DataError for a file that cannot be read, DecodeError.
+    max_bytes: decode only the slices of a `.pd4` within this many bytes. last_only: only the last of these levels.
+    background: RGB in place of the scene's. Each level of a `.pd4` is decoded from its own prefix, so no data of later
+    layers can leak into it. Raises DataError for a file that cannot be read, DecodeError for an invalid `.pd4`.
     """
     data = file if isinstance(file, bytes) else _read(file)
     if isinstance(file, bytes) or data.startswith(SIGNATURE[:4]):

@@ -1,4 +1,4 @@
-"""What packing does to a scene: the error of its pictures, the gain of its layers."""
+"""Measures packed scenes: the error of their pictures, and the gain of their layers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from pd4dgs_codec.scene import Scene
 
 
 class RenderedLoss:
-    """The error of decoded scenes in the pictures of `frames`, relative to `scene` before quantisation, at its levels.
+    """The error of decoded scenes in the pictures of `frames`, relative to the unquantised `scene`, at its levels.
 
     step is called after each picture.
     """
@@ -31,7 +31,7 @@ class RenderedLoss:
         self.references = self._pictures(scene)
 
     def mse(self, scene: Scene) -> dict[int, float]:
-        """Per level the mean squared error over all pictures, colours in 0..1."""
+        """Returns per level the mean squared error over all pictures, colours in 0..1."""
         pictures = self._pictures(scene)
         return {
             level: float(np.mean([np.square(a - b).mean() for a, b in zip(pictures[level], references, strict=True)]))
@@ -39,12 +39,12 @@ class RenderedLoss:
         }
 
     def mean_mse(self, scene: Scene) -> float:
-        """The mean of `mse` over the levels."""
+        """Returns the mean of `mse` over the levels."""
         return float(np.mean(list(self.mse(scene).values())))
 
     def omission_error(self, scene: Scene, level: int) -> np.ndarray:
-        """float64 [N]: an estimate of the squared error, summed over pictures and colours, of leaving out each anchor
-        at `level`, see `omission_error`. Infinite, for unknown, if no picture shows the anchor."""
+        """Estimates the squared error, summed over pictures and colours, of leaving out each anchor at `level`: float64
+        [N], see `sensitivity.omission_error`; infinite, as unknown, for anchors that no picture shows."""
         model = from_scene(scene)
         total, met = np.zeros(len(scene.anchor_q)), np.zeros(len(scene.anchor_q), bool)
         generator = torch.Generator().manual_seed(0)
@@ -69,7 +69,7 @@ class RenderedLoss:
 def true_psnr(
     scene: Scene, views: Sequence[View], step: Callable[[], None] = lambda: None, *, levels: Sequence[int] | None = None
 ) -> dict[int, float]:
-    """The mean mPSNR over views, dB, by level of a decoded scene; `levels` defaults to all."""
+    """Returns the mean mPSNR over views, dB, by level of a decoded scene; `levels` defaults to all."""
     model = from_scene(scene)
 
     def draw(level: int, view: View) -> np.ndarray:
@@ -86,11 +86,11 @@ def leave_out_low_gain(
     options: EncodeOptions = DEFAULTS,
     step: Callable[[], None] = lambda: None,
 ) -> tuple[Scene, list[LeftOut]]:
-    """(scene without the deformations that gain less than min_gain dB per megabyte, each of them with its figures).
+    """Leaves out deformations that gain less than min_gain dB per megabyte. Returns the scene and the parts left out.
 
-    From the highest layer down until one stays, whose trunk reads the planes below it, the scene is quantised with and
+    From the highest layer down until one is kept (its trunk reads the planes below), the scene is quantised with and
     without the layer's deformation. A layer's gain is the increase of the mean mPSNR over `views` at its level. Only
-    the deformation's own bytes count: its anchors pass to a lower layer. The plan drops a layer without a deformation.
+    the deformation's own bytes count: its anchors pass to a lower layer. `plan` drops layers without a deformation.
     The steps of `scene` are binary32.
     """
     left_out: list[LeftOut] = []
@@ -101,7 +101,7 @@ def leave_out_low_gain(
             continue
         if present is None:
             present = _measure(scene, views, options, step)
-        if kind.layer not in present:  # without effect: the plan leaves it out and says why
+        if kind.layer not in present:  # without effect: the plan leaves it out and reports why
             continue
         without = scene.with_tensors(kind.layer, None)
         remaining = _measure(without, views, options, step)
