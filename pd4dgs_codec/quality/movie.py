@@ -1,4 +1,4 @@
-"""Pictures of levels side by side under captions, and sequences of pictures as PNG files, animated GIF or MP4."""
+"""Puts pictures of levels side by side under captions, and writes sequences as PNG files, animated GIF or MP4."""
 
 import contextlib
 import itertools
@@ -16,12 +16,12 @@ from pd4dgs_codec.quality.image import to_uint8
 from pd4dgs_codec.quality.levels import Level
 
 GAP = 4
-CRF = 10  #: of MP4: x264's quality, hardly a visible loss
+CRF = 10  #: x264's quality in MP4: visually almost lossless
 PAPER, INK = (255, 255, 255), (30, 30, 30)
 
 
 class Panel(NamedTuple):
-    """A picture, uint8 [h, w, 3], its caption and the milliseconds that drawing it took."""
+    """A picture, uint8 [h, w, 3], its caption and the milliseconds to draw it."""
 
     picture: np.ndarray
     caption: str
@@ -29,7 +29,7 @@ class Panel(NamedTuple):
 
 
 def level_panels(levels: Sequence[Level], frame: Frame) -> list[Panel]:
-    """The frame at each level."""
+    """Draws the frame at each level."""
     panels = []
     for level in levels:
         image, milliseconds = level.timed_picture(frame.camera, frame.time)
@@ -38,7 +38,7 @@ def level_panels(levels: Sequence[Level], frame: Frame) -> list[Panel]:
 
 
 def side_by_side(panels: Sequence[Panel]) -> np.ndarray:
-    """uint8 [h, w, 3]: panels of one height, left to right on white, each under its caption."""
+    """Joins panels of one height, left to right on white, each under its caption; returns uint8 [h, w, 3]."""
     from PIL import Image, ImageDraw, ImageFont
 
     height = panels[0].picture.shape[0]
@@ -59,14 +59,14 @@ def side_by_side(panels: Sequence[Panel]) -> np.ndarray:
 
 
 def _fitting(text: str, width: int, length: Callable[[str], float]) -> str:
-    """As much of the text's beginning as fits, whole words first."""
+    """Cuts the end of `text` until it fits `width`, by whole words if possible."""
     while length(text) > width and text:
         text = text.rsplit(" ", 1)[0] if " " in text else text[:-1]
     return text
 
 
 def level_caption(level: int, cumulative_bytes: int | None) -> str:
-    """Such as "level 1, 312 kB"."""
+    """Returns a caption such as "level 1, 312 kB"."""
     if cumulative_bytes is None:
         return f"level {level}"
     size = f"{cumulative_bytes / 1e6:.2f} MB" if cumulative_bytes >= 1e6 else f"{cumulative_bytes / 1e3:.0f} kB"
@@ -74,7 +74,7 @@ def level_caption(level: int, cumulative_bytes: int | None) -> str:
 
 
 def write_pictures(frames: Iterator[np.ndarray], paths: list[Path]) -> None:
-    """One uint8 [H, W, 3] frame per path."""
+    """Writes one uint8 [H, W, 3] frame per path."""
     from PIL import Image
 
     for frame, path in zip(frames, paths, strict=True):
@@ -82,7 +82,7 @@ def write_pictures(frames: Iterator[np.ndarray], paths: list[Path]) -> None:
 
 
 def write_gif(frames: Iterator[np.ndarray], path: Path, fps: float) -> None:
-    """A looping GIF; all frames share the palette of the first, so that still parts do not flicker."""
+    """Writes a looping GIF; all frames share the palette of the first, so that still parts do not flicker."""
     from PIL import Image
 
     images = [Image.fromarray(frame) for frame in frames]
@@ -94,10 +94,10 @@ def write_gif(frames: Iterator[np.ndarray], path: Path, fps: float) -> None:
 
 
 def write_mp4(frames: Iterator[np.ndarray], path: Path, fps: float, *, fragment: int | None = None) -> None:
-    """H.264 in 4:2:0, which every browser plays; an odd row or column is cropped. RenderError without ffmpeg, DataError
-    if it cannot write the whole file.
+    """Writes H.264 in 4:2:0, which every browser plays; an odd row or column is cropped.
 
-    fragment: frames per fragment that starts with a key frame, as streaming wants them; None for a plain file.
+    fragment: for streaming, frames per fragment, each of which starts with a key frame; None for a plain file. Raises
+    RenderError without ffmpeg, DataError if ffmpeg cannot write the whole file.
     """
     check_mp4()
     movflags = "+frag_keyframe+empty_moov+default_base_moof"
@@ -115,7 +115,7 @@ def write_mp4(frames: Iterator[np.ndarray], path: Path, fps: float, *, fragment:
 
     with ffmpeg([*source, "-i", "-", *coding, *options, "-f", "mp4", str(path)], stdin=subprocess.PIPE) as run:
         assert run.process.stdin is not None
-        with contextlib.suppress(BrokenPipeError), run.process.stdin as pipe:  # it ended, and says why
+        with contextlib.suppress(BrokenPipeError), run.process.stdin as pipe:  # ffmpeg ended, and reports why
             for frame in itertools.chain([first], frames):
                 pipe.write(np.ascontiguousarray(frame[:height, :width]).data)
         code, said = run.end()
@@ -124,7 +124,7 @@ def write_mp4(frames: Iterator[np.ndarray], path: Path, fps: float, *, fragment:
 
 
 def check_mp4() -> None:
-    """RenderError now, rather than after all frames, if MP4 cannot be written here."""
+    """Raises RenderError if MP4 cannot be written here; called before frames are rendered."""
     try:
         import imageio_ffmpeg
 

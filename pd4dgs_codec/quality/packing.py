@@ -1,4 +1,4 @@
-"""One call from a scene to a `.pd4` file: leaves out layers of too little gain, fits sizes, encodes the rest."""
+"""Packs a scene into a `.pd4` file: leaves out layers of too little gain, fits target sizes, encodes the rest."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ if TYPE_CHECKING:
     from pd4dgs_codec.data.view import Dataset, View
     from pd4dgs_codec.model.model import Model
 
-#: Without views: pictures of the file's own camera, and the degrees of its orbit.
+#: Without views: the number of pictures by the file's own camera, and the degrees of its orbit.
 OWN_PICTURES, OWN_ORBIT = 16, 20.0
 
-#: The current task, in two words -> a context with a function to call after each picture.
+#: The current task in two words -> a context whose value is called after each picture.
 Progress = Callable[[str], AbstractContextManager[Callable[[], None]]]
 
 
 @dataclass(frozen=True)
 class Views:
     """The views that packing uses. source: their dataset, for the report. fitting: for target sizes and the order of
-    slices. held_out: for the gain of layers, which on the views of the fit would be too high."""
+    slices. held_out: for mPSNR, such as the gain of layers, which would be too high on the views of the fit."""
 
     source: str
     fitting: Sequence[View]
@@ -41,7 +41,7 @@ class Views:
 
     @classmethod
     def of(cls, dataset: Dataset, source: str, most: int) -> Views:
-        """About `most` training views and as many held-out ones (training views if there are none), evenly spread."""
+        """Picks about `most` training and as many held-out views (training views if there are none), evenly spread."""
         fitting, held_out = (
             tuple(views[:: -(-len(views) // most)]) for views in (dataset.train, dataset.test or dataset.train)
         )
@@ -50,12 +50,12 @@ class Views:
 
 @dataclass(frozen=True)
 class Packed:
-    """A `.pd4` file. scene: what was encoded, at the steps of the file.
+    """A `.pd4` file. scene: the encoded scene, at the steps of the file.
 
-    target: how target sizes were met, None without any: cameras, pictures, layers (the fields of target.Fit) and levels
-    (level, error_psnr in dB relative to the unquantised pictures, and with held-out views lost_db, their loss of
-    mPSNR). slices: of a sliced file, the criterion of the order of its anchors, its cameras, the number of pictures,
-    and with held-out views the mPSNR in dB after each slice; else None.
+    target: how target sizes were met, or None: cameras, pictures, layers (the fields of target.Fit) and levels (level,
+    error_psnr in dB relative to the unquantised pictures, and with held-out views lost_db, their loss of mPSNR).
+    slices: of a sliced file, or None: order, the criterion by which anchors are sorted, cameras, pictures, and with
+    held-out views psnr, the mPSNR in dB after each slice.
     """
 
     data: bytes
@@ -65,7 +65,7 @@ class Packed:
     slices: dict[str, Any] | None = None
 
     def json(self) -> dict[str, Any]:
-        """The report, with the target and per layer the ratio of payload to R(a)."""
+        """Returns the report with the target, the slices and per layer the ratio of payload to R(a)."""
         more = {"target": self.target, "slices": self.slices}
         result = self.report.json() | {name: value for name, value in more.items() if value is not None}
         for row in result["layers"]:
@@ -84,16 +84,16 @@ def pack(
     metadata: Metadata | None = None,
     progress: Progress = lambda _: nullcontext(lambda: None),
 ) -> Packed:
-    """The file of a scene or a trained model.
+    """Packs a scene or a trained model into a file.
 
     target_sizes: the most bytes that each layer may add to the file, by layer. views: for target sizes, the order of
-    slices and the gain of layers; without them the file's own camera takes the pictures, 1/downscale as wide and high,
-    and layers are kept whatever they gain. min_gain: dB of mPSNR per megabyte below which a layer is left out, if all
-    layers are asked for; 0 keeps all. metadata: stored in the file. With options.slices anchors are ordered by the gain
-    of the pictures per byte, and without target sizes some pass to later layers, see `slicing.in_order`; in a file
-    without views or a camera the largest come first.
+    slices and the gain of layers. Without views the pictures are of the file's own camera, 1/downscale as wide and
+    high, and layers are kept whatever their gain. min_gain: dB of mPSNR per megabyte below which a layer is left out,
+    if options.layers is "auto"; 0 keeps all. metadata: stored in the file. With options.slices anchors are ordered by
+    the pictures' gain per byte, and without target sizes some pass to later layers, see `slicing.in_order`. Without
+    views or a camera the largest anchors come first.
 
-    Only views, target sizes and slices need torch. Raises EncodeError, RenderError for a file without a camera.
+    Only views, target sizes and slices need torch. Raises EncodeError, RenderError for target sizes without a camera.
     """
     if not isinstance(source, Scene):
         from pd4dgs_codec.model.convert import to_scene
@@ -127,7 +127,7 @@ def pack(
 
 @dataclass(frozen=True)
 class _Pictures:
-    """The pictures that packing measures, and the steps that need them."""
+    """The pictures that packing measures, and the parts of packing that need them."""
 
     views: Views | None
     downscale: int
@@ -149,7 +149,7 @@ class _Pictures:
     def fit(
         self, scene: Scene, options: EncodeOptions, target_sizes: Mapping[int, int]
     ) -> tuple[Scene, list[LeftOut], dict[str, Any]]:
-        """(scene whose layers meet the sizes, what that leaves out, the target of the report)."""
+        """Returns the scene whose layers meet the sizes, the parts left out, and the target of the report."""
         from pd4dgs_codec.quality.measure import RenderedLoss, true_psnr
         from pd4dgs_codec.quality.target import fit
 
@@ -179,7 +179,7 @@ class _Pictures:
         *,
         passing: bool,
     ) -> tuple[bytes, Report, dict[str, Any]]:
-        """(sliced file, its report, the slices of the report). passing: whether anchors may pass to later layers."""
+        """Returns (sliced file, report, slices of the report). passing: whether anchors may pass to later layers."""
         from pd4dgs_codec.quality.measure import true_psnr
         from pd4dgs_codec.quality.slicing import in_order
 

@@ -1,6 +1,6 @@
 """LPIPS, ST-LPIPS and FLIP, each if its package and weights are installed; masked, and between successive pictures.
 
-Nothing is downloaded. docs/evaluation.md gives the definitions and says where each package comes from.
+Nothing is downloaded. docs/evaluation.md gives the definitions and the sources of the packages.
 """
 
 import functools
@@ -19,14 +19,14 @@ import numpy as np
 from pd4dgs_codec.errors import DataError, one_line
 from pd4dgs_codec.quality.image import LEAST_WEIGHT, prepare
 
-#: FLIP's viewing conditions, its package's default: metres from the screen, its width in pixels and in metres.
+#: FLIP's default viewing conditions: metres from the screen, and the screen's width in pixels and in metres.
 VIEWING = (0.7, 3840, 0.7)
 #: Smallest side, pixels, for which the networks' strides and paddings leave an output.
 LPIPS_LEAST, STLPIPS_LEAST = 31, 21
 
-#: float32 [H, W] error per pixel, or one number for the whole, of two float32 [H, W, 3] in 0..1
+#: float32 [H, W] error per pixel, or one number for the picture, of two float32 [H, W, 3] in 0..1
 ErrorMap = Callable[[np.ndarray, np.ndarray], np.ndarray]
-#: The distances of `--perceptual`, and that of the protocol 3dgs.
+#: The distances of `--perceptual`, and the distance of the protocol 3dgs.
 PERCEPTUAL, VGG = ("lpips", "stlpips", "flip"), "lpips_vgg"
 
 
@@ -43,7 +43,7 @@ class Distance:
     least: int = 1
 
     def __call__(self, pred: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) -> float:
-        """sum(map * m) / max(sum(m), 1e-6), where map compares pred * m with target * m: DyCheck's rule for mLPIPS.
+        """Returns sum(map * m) / max(sum(m), 1e-6), where map compares pred * m and target * m, as DyCheck's mLPIPS.
 
         pred, target: [H, W, 3] uint8 or floats in 0..1, brought to 8 bits first. mask: bool [H, W]; None = all.
         Raises DataError if shapes differ or the picture is smaller than `least`.
@@ -56,7 +56,7 @@ class Distance:
         return float((self.error_map(*masked) * m).sum() / max(m.sum(), LEAST_WEIGHT))
 
     def temporal(self, frames: Iterable[np.ndarray]) -> float:
-        """Mean distance between successive frames [H, W, 3] of one camera, unmasked. DataError for fewer than two."""
+        """Returns the mean unmasked distance of successive frames [H, W, 3]. Raises DataError for fewer than two."""
         distances = [self(later, earlier) for earlier, later in pairwise(frames)]
         if not distances:
             raise DataError(f"expected at least 2 frames for {self.title} over time")
@@ -65,18 +65,18 @@ class Distance:
 
 @dataclass(frozen=True)
 class Perceptual:
-    """distances: those that can be computed here, by the name of their keys. absent: why each other one cannot."""
+    """distances: available distances by name. absent: the reason for each distance that is not available."""
 
     distances: dict[str, Distance]
     absent: dict[str, str]
 
 
 class _Absent(Exception):
-    """Why a distance cannot be computed here."""
+    """The reason why a distance is not available."""
 
 
 def load_perceptual(names: Iterable[str] = PERCEPTUAL) -> Perceptual:
-    """Loads those of these distances that are installed; takes a second or two."""
+    """Loads the distances `names` that are installed; this takes a second or two."""
     loaders = {"lpips": _lpips, "stlpips": _stlpips, "flip": _flip, VGG: _lpips_vgg}
     distances, absent = {}, {}
     for name in names:
@@ -99,7 +99,7 @@ def _lpips() -> Distance:
 
 
 def _lpips_vgg() -> Distance:
-    """As 3D Gaussian Splatting's code calls it: one number, and pictures in 0..1 where the network expects -1..1."""
+    """As 3D Gaussian Splatting's code calls it: one number, and pictures in 0..1 although the network expects -1..1."""
     from torchvision.models import VGG16_Weights
 
     source, network = _lpips_network("vgg", VGG16_Weights.IMAGENET1K_V1.url, spatial=False)
@@ -107,10 +107,10 @@ def _lpips_vgg() -> Distance:
 
 
 def _lpips_network(net: str, url: str, *, spatial: bool) -> tuple[str, Any]:
-    """Source and module of LPIPS with a network whose ImageNet weights torchvision has from `url`."""
+    """Returns source and module of LPIPS with a network whose ImageNet weights torchvision has at `url`."""
     import torch
 
-    # lpips makes torchvision download the weights if they are not in this folder
+    # lpips would make torchvision download weights that are not in this folder
     weights = Path(torch.hub.get_dir()) / "checkpoints" / Path(url).name
     if not weights.is_file():
         raise _Absent(f"its weights of ImageNet are not in {weights}")
@@ -123,9 +123,9 @@ def _lpips_network(net: str, url: str, *, spatial: bool) -> tuple[str, Any]:
 
 
 def _stlpips() -> Distance:
-    # The package imports these modules without using them for the shift-tolerant AlexNet. sys.modules is restored, so
-    # that no other code gets the stand-ins.
-    from unittest import mock  # a tenth of a second
+    # The package imports these modules but does not use them for the shift-tolerant AlexNet. sys.modules is restored,
+    # so that no other code gets the stand-ins.
+    from unittest import mock  # importing it takes a tenth of a second
 
     names = {"torchvision": "models", "IPython": "embed", "torchsummary": "summary"}
     unused = {module: SimpleNamespace(**{name: None}) for module, name in names.items()}
@@ -137,7 +137,7 @@ def _stlpips() -> Distance:
 
 
 def _of_network(network: Any, low: float = -1.0) -> ErrorMap:
-    """The error of an LPIPS-like module, which is given [1, 3, H, W] in low..1."""
+    """Returns the error map of an LPIPS-like module, whose inputs are [1, 3, H, W] in low..1."""
     import torch
 
     @torch.inference_mode()

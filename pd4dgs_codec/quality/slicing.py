@@ -1,4 +1,4 @@
-"""The order of a sliced file: which anchors of a layer come first, and which wait until the next layer has come."""
+"""The order of anchors in a sliced file: which come first in a layer, and which pass to the next layer."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.model.sensitivity import Place, smaller, utility, without
 from pd4dgs_codec.scene import Scene
 
-#: So many parts of a layer's bytes, after each of which the next layer may begin.
+#: A layer's bytes are divided into so many parts; the next layer may begin after any of them.
 PARTS = 16
 
 
@@ -27,12 +27,12 @@ def in_order(
     *,
     passing: bool = True,
 ) -> tuple[Scene, np.ndarray]:
-    """(a planned scene, some of whose anchors have passed to the next layer, in the order of a file; float64 [N] the
-    utility of all in their layers, see `utility`).
+    """Orders the anchors of a planned scene. Returns the scene in file order, with some anchors passed to the next
+    layer, and float64 [N], the utility of each anchor in its layer, see `utility`.
 
-    A layer keeps its most useful anchors until the next layer's planes and networks gain the pictures at `places` more
-    per byte than its own next anchors would; with `passing` the others pass. The highest level stays as it is. step is
-    called after each round of `utility`.
+    A layer keeps its most useful anchors until the next layer's planes and networks improve the pictures at `places`
+    more per byte than its own next anchors; with `passing` the other anchors pass. The highest level is unchanged. step
+    is called after each round of `utility`.
     """
     shots = [(smaller(camera), time) for camera, time in places]
     whole, found = _pictures(scene, scene.level, shots), list[np.ndarray]()
@@ -58,12 +58,12 @@ def _enough(
     whole: Sequence[np.ndarray],
     options: EncodeOptions,
 ) -> int:
-    """How many anchors of scene.layers[index] come before the next layer. order: int64 [n], its rows, the most useful
-    one first. whole: the pictures of the highest level."""
+    """Returns how many anchors of scene.layers[index] come before the next layer. order: int64 [n], its rows, the most
+    useful one first. whole: the pictures of the highest level."""
     level, above = scene.layers[index : index + 2]
 
     def error(level: int, count: int) -> float:
-        """The squared error of the pictures at `level` with so many of the anchors and none of later layers."""
+        """Returns the pictures' squared error at `level` with `count` of the anchors and none of later layers."""
         prefix = scene.prefix(level)
         later = np.arange(scene.rows[index], prefix.rows[-1])
         shown = _pictures(without(prefix, np.concatenate([order[count:], later])), level, shots)
@@ -84,6 +84,6 @@ def _enough(
 
 
 def _pictures(scene: Scene, level: int, shots: Sequence[Place]) -> list[np.ndarray]:
-    """The pictures [H, W, 3] at `level`."""
+    """Renders the pictures [H, W, 3] at `level`."""
     model = from_scene(scene)
     return [render_image(model, level, time, camera) for camera, time in shots]

@@ -1,13 +1,13 @@
-"""Target sizes per layer at the least loss: which quantisation steps grow, and which anchors leave the layer.
+"""Fits layers to target sizes at the least loss: grows quantisation steps, and moves anchors out of the layer.
 
 Each of a layer's parameters (its steps, the share of its anchors that leave) is tried alone at a few values. The lower
-convex hull of bytes saved and loss added gives the parameter's segments. The segments of all parameters in the order of
-loss per byte form one path from the given setting to the smallest (Shoham and Gersho, Efficient bit allocation for an
-arbitrary set of quantizers, 1988), and bisection along it over real encodes finds the size. This assumes that losses
-and savings add up, which is nearly true: a second search around the first result found nothing better on trained
-scenes.
+convex hull of bytes saved and loss added gives the parameter's segments. The segments of all parameters, sorted by loss
+per byte, form one path from the given setting to the smallest (Shoham and Gersho, Efficient bit allocation for an
+arbitrary set of quantizers, 1988). Bisection along the path over real encodes finds the target size. This assumes that
+losses and savings add up, which is nearly true: on trained scenes a second search around the first result found nothing
+better.
 
-The caller gives the loss and the error of omitted anchors as functions, so that nothing here needs a renderer.
+The caller passes the loss and the error of omitted anchors as functions, so that this module needs no renderer.
 """
 
 import math
@@ -31,7 +31,7 @@ OCTAVES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
 SHARES = (0.0, 0.03, 0.08, 0.15, 0.25, 0.4, 0.6, 0.8)
 #: The parameter of the anchors; the others are fields of Steps.
 ANCHORS = "anchors"
-#: A target is met from this share below it; the search aims at the upper part of that range.
+#: Shares of the target size: the search aims at AIM, and accepts sizes up to SLACK below the target.
 SLACK, AIM = 0.03, 0.995
 #: Coding effort of the search, and the most encodes at the effort of the file.
 SEARCH_EFFORT, FINAL_TRIES = 1, 6
@@ -42,7 +42,7 @@ Setting = Mapping[str, float]
 
 
 class Unreachable(Exception):
-    """No setting is small enough. smallest: the fewest bytes that were reached."""
+    """Raised if no setting is small enough. smallest: the fewest bytes that were reached."""
 
     def __init__(self, smallest: int):
         self.smallest = smallest
@@ -50,7 +50,7 @@ class Unreachable(Exception):
 
 @dataclass(frozen=True)
 class Segment:
-    """A parameter between two neighbouring values of its hull. slope: loss per byte saved."""
+    """A parameter's range between two neighbouring values of its hull. slope: loss per byte saved."""
 
     name: str
     start: float
@@ -65,10 +65,10 @@ def least_loss(
     final_size: Callable[[Setting], int],
     target: int,
 ) -> dict[str, float]:
-    """The setting of least loss found with final_size <= target, if possible at most SLACK below it.
+    """Returns the setting of least loss found with final_size <= target, if possible at most SLACK below it.
 
-    grids: the values to try by parameter, ascending, the first the given one. size: a fast estimate of final_size up to
-    a factor. Raises Unreachable.
+    grids: by parameter the values to try, ascending from the given one. size: a fast estimate of final_size, up to a
+    factor. Raises Unreachable.
     """
     start = {name: grid[0] for name, grid in grids.items()}
     if final_size(start) <= target:
@@ -79,7 +79,7 @@ def least_loss(
 def _path(
     grids: Mapping[str, Sequence[float]], size: Callable[[Setting], int], loss: Callable[[Setting], float]
 ) -> list[Segment]:
-    """The segments of all parameters by slope, each parameter measured with the others as given."""
+    """Returns the segments of all parameters, sorted by slope; each parameter is measured with the others as given."""
     start = {name: grid[0] for name, grid in grids.items()}
     segments = []
     for name, grid in grids.items():
@@ -95,7 +95,7 @@ def _path(
 
 
 def convex_hull(points: Sequence[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
-    """The lower convex hull of points (value, saved, lost) from the first one on, rising in saved and in slope."""
+    """Returns the lower convex hull of points (value, saved, lost) from the first one on, rising in saved and slope."""
 
     def slope(p: tuple[float, float, float], q: tuple[float, float, float]) -> float:
         return (q[2] - p[2]) / (q[1] - p[1])
@@ -117,7 +117,7 @@ def _walk(
     final_size: Callable[[Setting], int],
     target: int,
 ) -> dict[str, float]:
-    """The first setting along the path with final_size within the target."""
+    """Returns the first setting found along the path with final_size <= target. Raises Unreachable."""
 
     def at(place: float) -> dict[str, float]:
         whole = min(math.floor(place), len(path) - 1)
@@ -150,10 +150,10 @@ def _walk(
 
 
 def _first(holds: Callable[[float], bool], low: float, high: float) -> float:
-    """About the least place in low..high where a monotone condition holds; high if it holds nowhere."""
+    """Returns about the least place in low..high where a monotone condition holds, or high if it holds nowhere."""
     while high - low > 1 / 32:
         middle = (low + high) / 2
-        if high - low > 1:  # ends of segments were measured, and are few
+        if high - low > 1:  # try ends of segments first: they were measured, and are few
             middle = float(round(middle))
             if not low < middle < high:
                 middle = (low + high) / 2
@@ -165,9 +165,9 @@ def _first(holds: Callable[[float], bool], low: float, high: float) -> float:
 class Fit:
     """How a layer met its target.
 
-    bytes: what it adds to the file, for layer 0 with the header and HEADER_MARGIN. factors: on the steps, by field of
-    Steps; steps: their products. moved: anchors that left the layer, to_layer where they went, None if they were
-    dropped; harm: the largest omission error among them, None without any.
+    bytes: size that it adds to the file, for layer 0 with the header and HEADER_MARGIN. factors: on the steps, by field
+    of Steps. steps: the resulting steps. moved: number of anchors that left the layer. to_layer: the layer that they
+    went to, None if they were dropped. harm: the largest omission error among them, None without any.
     """
 
     layer: int
@@ -187,11 +187,11 @@ def fit(
     omission_error: Callable[[Scene, int], np.ndarray],
     options: EncodeOptions = DEFAULTS,
 ) -> tuple[Scene, list[LeftOut], list[Fit]]:
-    """(scene whose file meets the targets, dropped anchors, how each layer met its target) of a planned scene.
+    """Fits a planned scene to targets. Returns the scene, the dropped anchors, and how each layer met its target.
 
     targets: most bytes by layer; an absent layer meets any. loss: of a decoded scene, to be minimised. omission_error:
-    float64 [N], the error if an anchor of the scene is missing at a level; anchors of the least error leave first, for
-    the next layer or, from the highest, for good. options: of the file to be written. Raises EncodeError naming the
+    float64 [N], the error of omitting each anchor of the scene at a level; anchors of least error move to the next
+    layer first, or are dropped from the highest. options: of the file to be written. Raises EncodeError naming the
     layer and its smallest size.
     """
     fits, dropped = [], 0
@@ -213,7 +213,7 @@ def fit(
         scene = fitted.apply(found)
     if not dropped:
         return scene, [], fits
-    scene, _ = in_file_order(scene, scene.layers)  # without them, else a plan would report them as well
+    scene, _ = in_file_order(scene, scene.layers)  # removes dropped anchors, else a plan would report them too
     why = "the least error in the pictures, left out for the target size"
     return scene, [LeftOut(f"{dropped} anchors", why, anchors=dropped)], fits
 
@@ -231,7 +231,7 @@ class _Layer:
     ):
         self.scene, self.layer, self.index = scene, layer, scene.layers.index(layer)
         self.of_scene = loss
-        self.options = replace(options, omit="nothing")  # the scene was planned: what no picture needs is gone
+        self.options = replace(options, omit="nothing")  # planning has made unread cells cheap already
         steps = list(scene.attributes) if layer == 0 else []
         if layer == 0 or scene.deformation(layer) is not None:
             steps += LAYER_KINDS[layer].step_names
@@ -252,13 +252,13 @@ class _Layer:
         self._losses: dict[frozenset[tuple[str, float]], float] = {}
 
     def apply(self, setting: Setting) -> Scene:
-        """The scene at a setting, not planned: steps not rounded, rows with the anchors that left."""
+        """Returns the scene at a setting, not planned: steps are not rounded, rows include the anchors that left."""
         given = vars(self.scene.steps)
         steps = replace(self.scene.steps, **{k: given[k] * 2.0**v for k, v in setting.items() if k != ANCHORS})
         return replace(passed(self.scene, self.index, self.order[: self._moved(setting)]), steps=steps)
 
     def size(self, setting: Setting, effort: int = SEARCH_EFFORT) -> int:
-        """Bytes that the layer adds to the file; 0 if the plan leaves it out."""
+        """Returns the bytes that the layer adds to the file, 0 if the plan leaves it out."""
         key = effort, frozenset(setting.items())
         if key not in self._sizes:
             planned = self._planned(setting)
@@ -273,7 +273,7 @@ class _Layer:
         return self.size(setting, self.options.effort)
 
     def loss(self, setting: Setting) -> float:
-        """The given loss of the decoded scene."""
+        """Returns the loss of the decoded scene at a setting."""
         key = frozenset(setting.items())
         if key not in self._losses:
             self._losses[key] = self.of_scene(self._planned(setting).symbols.scene())
@@ -286,7 +286,7 @@ class _Layer:
         return round(setting.get(ANCHORS, 0.0) * len(self.order))
 
     def describe(self, setting: Setting, target: int) -> Fit:
-        """The report of the setting that was chosen."""
+        """Returns the report of the chosen setting."""
         moved, steps = self._moved(setting), vars(self._planned(setting).scene.steps)
         factors = {k: 2.0**v for k, v in setting.items() if k != ANCHORS}
         return Fit(
