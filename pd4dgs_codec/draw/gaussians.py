@@ -1,12 +1,12 @@
-"""Makes Gaussians of anchors for a camera: frustum culling, the scaffold's networks, and their numba kernels.
+"""Evaluates the Gaussians of anchors for a camera: culling, the scaffold's networks, and their numba kernels.
 
 Playback and training on the CPU share these functions; `model.reference` has the plain torch form. An anchor has G
 slots of one Gaussian each. About one in six is drawn, so all networks but opacity are evaluated for kept slots only.
 
 Common arguments, floats of one dtype: keep int64 [K], ascending, anchor * G + offset of each kept Gaussian; anchors
 [n, 9 + D + 3 G], per row position, feature [D], offsets [G, 3] and log scalings [6], the residual heads in the
-registry's order; gaussians [K, 14], per row mean, scales, quaternion, opacity and colour; hidden [n, columns], H of
-them, a multiple of LANES, from `column` on for a layer. Backward passes split the Gaussians over threads between
+registry's order; gaussians [K, 14], per row mean, scales, quaternion, opacity and colour; hidden [n, columns], of
+which a layer reads H, a multiple of LANES, from `column` on. Backward passes split the Gaussians over threads between
 anchors, so that each part owns its rows of the result. Sums over all Gaussians are kept per part and added in order:
 results are bitwise reproducible for a fixed number of parts.
 """
@@ -475,7 +475,7 @@ def assemble(
 
 @kernel(inline=True)
 def _norm(shape: Array, k: int) -> Any:
-    """The norm of the quaternion in row k of shape [K, 7], at least MIN_NORM."""
+    """Returns the norm of the quaternion in row k of shape [K, 7], at least MIN_NORM."""
     square = shape[k, 3] * shape[k, 3] + shape[k, 4] * shape[k, 4]
     square += shape[k, 5] * shape[k, 5] + shape[k, 6] * shape[k, 6]
     return max(math.sqrt(square), shape.dtype.type(MIN_NORM))

@@ -107,7 +107,7 @@ def _linear(table: Array, i: int, step: int, f: Vector) -> tuple[Vector, Vector]
 
 @kernel(inline=True)
 def _bilinear(table: Array, i: int, step_u: int, step_v: int, fu: Vector, fv: Vector) -> tuple[Vector, Vector, Vector]:
-    """(sample, d sample / dfu, d sample / dfv)."""
+    """Returns (sample, d sample / dfu, d sample / dfv)."""
     a, da = _linear(table, i, step_u, fu)
     b, db = _linear(table, i + step_v, step_u, fu)
     return fma(b - a, fv, a), fma(db - da, fv, da), b - a

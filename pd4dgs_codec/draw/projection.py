@@ -102,7 +102,7 @@ def _matmul23(m: Matrix23, r: Matrix3) -> Matrix23:
 
 @kernel()
 def _clip_index(value: float, limit: int) -> int:
-    """int of `value` clamped to 0 .. limit in floating point first, so that huge values convert safely."""
+    """Converts `value` to int, clamped to 0 .. limit in floating point first, so that huge values convert safely."""
     return int(min(max(value, 0.0), float(limit)))
 
 
@@ -180,7 +180,7 @@ def project(
 
 @kernel()
 def _rotation_gradient(unit: Quaternion, inverse_norm: float, g: Matrix3) -> Quaternion:
-    """d/d(unnormalised quaternion) from g = d/dR (9, row-major)."""
+    """Returns d/d(unnormalised quaternion) from g = d/dR (9, row-major)."""
     w, x, y, z = unit
     gw = 2.0 * (x * (g[7] - g[5]) + y * (g[2] - g[6]) + z * (g[3] - g[1]))
     gx = 2.0 * (y * (g[3] + g[1]) + z * (g[6] + g[2]) + w * (g[7] - g[5]) - 2.0 * x * (g[4] + g[8]))
@@ -199,7 +199,7 @@ def _rotation_gradient(unit: Quaternion, inverse_norm: float, g: Matrix3) -> Qua
 def _image_gradient(
     sum_t: float, sum_tt: float, sum_r: float, sum_rr: float, sum_tr: float, k: float, sa: float, sb: float
 ) -> tuple[float, float, float, float, float]:
-    """d/d(mean2d) and the symmetric M = d/d(Sigma2) = 1/2 sum g n n^T, from the slot sums.
+    """Returns d/d(mean2d) and the symmetric M = d/d(Sigma2) = 1/2 sum g n n^T, from the slot sums.
 
     n = Sigma2^-1 delta = 2 ln2 (sa t, sb r - k sa t).
     """

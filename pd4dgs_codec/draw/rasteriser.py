@@ -18,8 +18,8 @@ from pd4dgs_codec.draw.simd import Array, Tasks, kernel, parallel
 from pd4dgs_codec.errors import NotFinite, RenderError
 from pd4dgs_codec.scene import Camera
 
-CHUNKS_PER_THREAD = 4  #: of the depth order while binning
-MAX_COUNT = 2**31  #: of Gaussians, and of pairs of a Gaussian and a tile
+CHUNKS_PER_THREAD = 4  #: chunks of the depth order while binning
+MAX_COUNT = 2**31  #: Gaussians, and pairs of a Gaussian and a tile, must be fewer
 MAX_SIDE = 65535  #: pixels
 #: Least absolute determinant of a viewmat's 3 x 3 part; a rotation has 1.
 LEAST_VOLUME = 1e-9
@@ -91,7 +91,7 @@ def draw(
 
 
 def project(geometry: Geometry, camera: Camera, near_plane: float) -> Projected:
-    """Projects the Gaussians into the camera's picture and sorts them into its tiles."""
+    """Projects the Gaussians and sorts them into the picture's tiles. Raises RenderError from MAX_COUNT on."""
     n, width, height = len(geometry.means), camera.width, camera.height
     if n >= MAX_COUNT:
         raise RenderError(f"{n} Gaussians, expected fewer than 2^31")
@@ -138,7 +138,7 @@ def backward(
 
 
 def _pack_camera(camera: Camera) -> Array:
-    """float64 [20]: R, t, fx, fy, cx, cy and the range of x/z, y/z inside J (gsplat: 1.3 x the field of view)."""
+    """Packs float64 [20]: R, t, fx, fy, cx, cy and the limits of x/z, y/z in J (gsplat: 1.3 x the field of view)."""
     viewmat, K = (np.asarray(a, np.float64) for a in (camera.viewmat, camera.K))
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     margin_x, margin_y = 0.15 * camera.width / fx, 0.15 * camera.height / fy
@@ -167,9 +167,9 @@ def _bin(visible: Array, depths: Array, rects: Array, width: int, height: int) -
 
 @kernel()
 def depth_order(visible: Array, depths: Array) -> Array:
-    """Indices int64 of the visible Gaussians, front to back; equal float32 depths in index order.
+    """Returns the indices int64 of the visible Gaussians, front to back; equal float32 depths stay in index order.
 
-    A stable radix sort of the depths' bits above the smallest, 12 bits a pass: two or three passes.
+    A stable radix sort of the depths' bits minus those of the least depth, 12 bits a pass: two or three passes.
     """
     bits = depths.view(np.int32)
     order, count = np.empty(visible.size, np.int64), 0

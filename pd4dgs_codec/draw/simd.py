@@ -157,7 +157,7 @@ def _readable(array: Any) -> bool:
 
 
 def _address(context: Any, builder: Any, array_type: Any, array: Any, index: Any) -> Any:
-    """Pointer to element `index` of the flattened array."""
+    """Returns a pointer to element `index` of the flattened array."""
     return builder.gep(context.make_array(array_type)(context, builder, array).data, [index])
 
 
@@ -166,14 +166,14 @@ def _constant(kind: Any, value: float) -> Any:
 
 
 def _splat(builder: Any, scalar: Any, kind: Any) -> Any:
-    """The scalar in every lane of a vector of the LLVM type `kind`."""
+    """Returns a vector of the LLVM type `kind` with the scalar in every lane."""
     undefined, index = ir.Constant(kind, ir.Undefined), ir.IntType(32)
     first = builder.insert_element(undefined, scalar, index(0))
     return builder.shuffle_vector(first, undefined, _constant(ir.VectorType(index, kind.count), 0))
 
 
 def _call(builder: Any, name: str, arguments: Sequence[Any]) -> Any:
-    """The LLVM intrinsic `name` of vectors of one type, which is also that of the result."""
+    """Calls the LLVM intrinsic `name` on vectors of one type; the result has the same type."""
     kind = arguments[0].type
     width = 32 if isinstance(kind.element, ir.FloatType) else 64
     function_type = ir.FunctionType(kind, [kind] * len(arguments))
@@ -306,7 +306,7 @@ def _product(rows: int, vectors: int) -> Callable[..., Any]:
             align, index, whole = y.dtype.bitwidth // 8, ir.IntType(64), range(vectors)
 
             def place(first: int, step: Any, row: int) -> Any:
-                """Pointer to row number `row` of the array at argument `first`, whose rows are `step` apart."""
+                """Returns a pointer to row `row` of the array at argument `first`, whose rows are `step` apart."""
                 at = builder.add(args[first + 1], builder.mul(step, index(row)))
                 return _address(context, builder, sig.args[first], args[first], at)
 
@@ -363,7 +363,7 @@ def sqrt(typingctx: Any, a: Any) -> Any:
 
 #: Minimax fit of 2**f, |f| <= 1/2, lowest power first: relative error 7.5e-8 before rounding.
 _EXP2 = (1.00000012, 0.693146944, 0.240221202, 0.0555071309, 0.00967554096, 0.00132764701)
-#: Added to a float32 of magnitude below 2**22 it rounds to an integer, held by the lowest bits of the sum.
+#: Adding it to a float32 of magnitude below 2**22 rounds that to an integer, in the lowest bits of the sum.
 _ROUND = 1.5 * 2.0**23
 
 
@@ -438,7 +438,7 @@ def folded(typingctx: Any, a: Any) -> Any:
 
 @_intrinsic
 def totals(typingctx: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
-    """The sums over lanes of eight vectors as one vector, pairwise in one fixed order, so that results repeat."""
+    """Sums eight vectors over their lanes into one vector, pairwise in one fixed order, so that results repeat."""
     if not _same(a, b, c, d, e, f, g, h) or a.count != LANES:
         return None
 

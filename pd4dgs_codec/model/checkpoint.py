@@ -118,7 +118,7 @@ def _digest(content: dict[str, Any]) -> str:
 
 
 def _build(content: dict[str, Any]) -> Model:
-    """Builds the model from a scene of the same shapes, then fills it: `check_scene` alone checks shapes."""
+    """Builds the model from a scene of the same shapes, which `check_scene` checks, then loads the state."""
     state = {name: tensor.numpy() for name, tensor in content["state"].items()}
     n = len(state["anchor_q"])
 

@@ -35,8 +35,7 @@ Drawn = tuple[Tensor, Tensor, dict[str, Tensor]]
 
 @dataclass
 class Picture:
-    """A rendered image [H, W, 3] (it may exceed 1 slightly by rounding), alpha [H, W], the Gaussians, and the meta of
-    `rasterization`."""
+    """image [H, W, 3], which may exceed 1 by rounding, alpha [H, W], the Gaussians, and meta of `rasterization`."""
 
     image: Tensor
     alpha: Tensor
@@ -47,7 +46,8 @@ class Picture:
 def render(
     model: Model, level: int, t: float, camera: Camera, rounding: Rounding = EXACT, only: Tensor | None = None
 ) -> Picture:
-    """Renders `level` at normalised time t in 0..1, only the anchors `only` (bool [N]) if given."""
+    """Renders `level` at normalised time t in 0..1, only the anchors `only` (bool [N]) if given. Raises RenderError
+    unless t is finite."""
     check_time(t)
     gaussians = model.gaussians(level, t, camera, rounding, only)
     if torch.is_grad_enabled():

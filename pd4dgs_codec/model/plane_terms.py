@@ -98,7 +98,7 @@ def _band(i: int, n: int) -> Band:
 
 @kernel(inline=True)
 def _curve(grid: Array, k: int, i: int, n: int, step: int, band: Band, weight: float) -> Vector:
-    """Returns weight times the product of `band` and the values around flat offset k, which is value i of n."""
+    """Returns weight times the dot product of `band` and the values around flat offset k, value i of n."""
     real = grid.dtype.type
     value = load(grid, k) * splat(real(weight * band[2]))
     value = fma(load(grid, k - min(i, 2) * step), splat(real(weight * band[0])), value)
@@ -230,7 +230,7 @@ def _magnitudes(tasks: Tasks, channel_sums: Array, cell_sums: Array, grid: Array
 
 @kernel(inline=True)
 def _signed(weight: Vector, r: Vector) -> Vector:
-    """The weight with the sign of r, 0 where r is 0."""
+    """Returns the weight with the sign of r, 0 where r is 0."""
     zero = r - r
     return select_gt(r, zero, weight, select_gt(zero, r, zero - weight, zero))
 

@@ -42,7 +42,7 @@ def own_frames(info: SceneInfo, count: int, orbit: float = 0.0, downscale: int =
         )
     times = np.linspace(0.0, 1.0, count) if count > 1 else np.zeros(1)
     centre = look_at_point(info)
-    # a full sine over the sequence: it starts and ends in the given camera, so that a looped video has no jump
+    # a full sine over the sequence: it starts and ends at the given camera pose, so that a looped video has no jump
     angles = np.radians(orbit / 2) * np.sin(2 * np.pi * times)
     return [
         Frame(turned(camera, centre, info.up, a) if a else camera, float(t)) for a, t in zip(angles, times, strict=True)
