@@ -1,8 +1,8 @@
 """A layer's planes and networks for the rest of the codec: symbols, checks, parameters, sections.
 
-Only this module and its part `planes`, which nothing else imports, know what a deformation is made of: planes, and a
-trunk with a network per residual head. The codec passes a `Deformation` on, of float32 values in a scene and of int32
-symbols in a layer. Layer 0 has networks and no planes.
+Only this module and `planes`, which no other module imports, know the parts of a deformation: planes, a trunk, and a
+network per residual head. The rest of the codec passes on a `Deformation`, float32 in a scene and int32 symbols in a
+layer. Layer 0 has networks and no planes.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ NOTHING = Deformation((), {})  #: neither planes nor networks
 
 
 def arrays_of(tensors: Deformation, kind: LayerKind) -> Iterator[tuple[str, str, np.ndarray]]:
-    """(name of its step, its own name, array) in coding order: the planes, scale by scale, then weight and bias of each
-    linear layer of each network, by ascending number. Names are as "planes.0.xy" and "mlp.trunk.weight.0"."""
+    """Yields (name of the step, name, array) in coding order: the planes, scale by scale, then weight and bias of each
+    linear layer of each network, by ascending number. Names are like "planes.0.xy" and "mlp.trunk.weight.0"."""
     for s, scale in enumerate(tensors.planes):
         yield from ((str(kind.planes_step), f"planes.{s}.{name}", scale[name]) for name, _, _ in PLANES)
     for name in (name for name in kind.network_ids if name in tensors.networks):
@@ -63,7 +63,7 @@ def arrays_of(tensors: Deformation, kind: LayerKind) -> Iterator[tuple[str, str,
 
 
 def with_arrays(tensors: Deformation, kind: LayerKind, arrays: Iterable[np.ndarray]) -> Deformation:
-    """A deformation of the structure of `tensors` with these arrays, in the order of `arrays_of`."""
+    """Returns a deformation with the structure of `tensors` and these arrays, in the order of `arrays_of`."""
     depths = {name: len(tensors.networks[name]) for name in kind.network_ids if name in tensors.networks}
     return _assembled(len(tensors.planes), depths, tensors.key, iter(arrays))
 
@@ -75,18 +75,18 @@ def _assembled(scales: int, depths: dict[str, int], key: int | None, arrays: Ite
 
 
 def quantise_tensors(tensors: Deformation, kind: LayerKind, steps: Steps) -> Deformation:
-    """int32 symbols of a layer's planes and networks. Raises EncodeError for a value that has none."""
+    """Returns the int32 symbols of a layer's planes and networks. Raises EncodeError for a value without a symbol."""
     rows = arrays_of(tensors, kind)
     return with_arrays(tensors, kind, [quantise(x, vars(steps)[of], f"{kind.name} {name}") for of, name, x in rows])
 
 
 def dequantise_tensors(symbols: Deformation, kind: LayerKind, steps: Steps) -> Deformation:
-    """The float32 planes and networks that the symbols stand for."""
+    """Returns the float32 planes and networks of int32 symbols."""
     return with_arrays(symbols, kind, [dequantise(k, vars(steps)[of]) for of, _, k in arrays_of(symbols, kind)])
 
 
 def layer_steps(steps: Steps, kind: LayerKind, tensors: Deformation) -> dict[str, float]:
-    """The steps in a layer's chunk by name; none if it has no networks."""
+    """Returns the steps in a layer's chunk by name; none if it has no networks."""
     return {name: float(getattr(steps, name)) for name in kind.step_names} if tensors.networks else {}
 
 
@@ -125,31 +125,31 @@ def check_tensors(tensors: Deformation, kind: LayerKind, widths: Widths, below: 
 
 
 def heads_of(tensors: Deformation) -> list[str]:
-    """The residual heads that a deformation has."""
+    """Returns the names of a deformation's residual heads."""
     return [name for name in tensors.networks if name != TRUNK]
 
 
 def with_heads(tensors: Deformation, heads: Iterable[str]) -> Deformation:
-    """The deformation with these of its heads alone."""
+    """Returns the deformation with only the given heads."""
     return replace(tensors, networks={k: v for k, v in tensors.networks.items() if k == TRUNK or k in [*heads]})
 
 
 def head_alone(tensors: Deformation, head: str) -> Deformation:
-    """The part of the deformation that belongs to one head."""
+    """Returns a deformation of one head's network alone, without planes and trunk."""
     return Deformation((), {head: tensors.networks[head]})
 
 
 def is_zero(tensors: Deformation, head: str) -> bool:
-    """Whether a head's residuals are 0 everywhere, by its last weights; a key instant cancels the last bias."""
+    """Whether the last layer makes a head's residuals 0 everywhere; a key instant cancels the last bias."""
     weight, bias = tensors.networks[head][-1]
     return not weight.any() and (tensors.key is not None or not bias.any())
 
 
 def without_unread(symbols: Deformation, unit: np.ndarray) -> tuple[Deformation, str, float]:
-    """(symbols with values of little cost in the cells of planes that no point reads, how many these are, the bits that
-    this saves by order-0 entropy); `symbols` itself where nothing changes.
+    """Gives plane cells that no point reads values of little cost. unit: float32 [n, 3], points in 0..1 of the box.
 
-    unit: float32 [n, 3], 0..1 in the box.
+    Returns (symbols, text with the number of these cells, bits saved by order-0 entropy); `symbols` itself if nothing
+    changes.
     """
     filled, free, cells, saved = [], 0, 0, 0.0
     for scale, marks in zip(symbols.planes, cells_read(symbols.planes, unit), strict=True):
@@ -177,9 +177,9 @@ class Scale:
 
 @dataclass(frozen=True)
 class Shape:
-    """Sizes of a layer's planes and networks. networks: by name the outputs of its linear layers. inputs: by name the
-    input width of networks of layer 0; those of a deformation follow from the scales, the features of the planes of the
-    layers below, and the trunk. key: as in Deformation."""
+    """Sizes of a layer's planes and networks. networks: output widths of the linear layers by name. inputs: input
+    widths of layer 0's networks by name; None for a deformation, where they follow from the planes and the trunk.
+    key: as in Deformation. below: number of features of the planes in the layers below."""
 
     scales: tuple[Scale, ...] = ()
     networks: dict[str, tuple[int, ...]] | None = None
@@ -189,7 +189,7 @@ class Shape:
 
     @staticmethod
     def of(tensors: Deformation, kind: LayerKind, widths: Widths, below: int) -> Shape:
-        """The shape of a deformation, without predictors."""
+        """Returns the shape of a deformation, without predictors."""
         scales = tuple(Scale(len(scale["xy"]), plane_sides(scale), ()) for scale in tensors.planes)
         names = [name for name in kind.network_ids if name in tensors.networks]
         networks = {name: tuple(len(bias) for _, bias in tensors.networks[name]) for name in names}
@@ -197,7 +197,7 @@ class Shape:
 
     @property
     def channels(self) -> int:
-        """As that of Deformation."""
+        """As in Deformation."""
         return sum(scale.channels for scale in self.scales)
 
     @property
@@ -226,14 +226,14 @@ class Shape:
 
     @property
     def symbols(self) -> int:
-        """Plane samples, weights and biases."""
+        """Number of plane samples, weights and biases."""
         return sum(map(math.prod, self.planes)) + sum(map(math.prod, self.weights))
 
 
 def pack_parameters(
     tensors: Deformation, kind: LayerKind, steps: dict[str, float], predictors: Sequence[int]
 ) -> dict[int, object]:
-    """The entries of the layer parameters for planes and networks; none without networks."""
+    """Returns the entries of the layer parameters for planes and networks; none without networks."""
     if not tensors.networks:
         return {}
     fields: dict[int, object] = {STEPS: [steps[name] for name in kind.step_names]}
@@ -252,8 +252,8 @@ def pack_parameters(
 def unpack_parameters(
     fields: Fields, kind: LayerKind, widths: Widths, below: tuple[Scale, ...], later: bool, where: str
 ) -> tuple[Shape, dict[str, float]]:
-    """(shape, steps by name) of a slice; every count is within its limit. below: the scales of the layers before.
-    later: behind the first of its layer, where it has neither planes nor networks. Raises DecodeError's subclasses."""
+    """Returns (shape, steps by name) of a slice, every count within its limit. below: the scales of the layers below.
+    later: whether it is not the layer's first slice and so has no networks. Raises subclasses of DecodeError."""
     networks = {} if later else _unpack_networks(fields, kind, widths, where)
     scales = _unpack_scales(fields, where, below) if networks and kind.layer > 0 else ()
     for key, expected in ((STEPS, bool(networks)), (SCALES, bool(scales)), (NETWORKS, bool(networks))):
@@ -351,7 +351,7 @@ class Decorrelated:
 
 
 def decorrelate(symbols: Deformation, kind: LayerKind) -> Decorrelated:
-    """Each plane under the predictor that is likely to code it for the fewest bits."""
+    """Applies to each plane the predictor with the fewest estimated bits."""
     tensors = [array for *_, array in arrays_of(symbols, kind)]
     count = len(PLANES) * len(symbols.planes)
     chosen = [choose_predictor(plane) for plane in tensors[:count]]
@@ -360,14 +360,14 @@ def decorrelate(symbols: Deformation, kind: LayerKind) -> Decorrelated:
 
 
 def plane_rate_bits(planes: Planes, step: float) -> float:
-    """The sum of R(a) of the coded residuals of planes at a quantisation step, each plane under the predictor that
-    `decorrelate` picks."""
+    """Returns the sum of R(a) of the residuals of float32 planes quantised at `step`, each plane under the predictor
+    that `decorrelate` picks."""
     chosen = (choose_predictor(quantise(plane, step, name)) for scale in planes for name, plane in scale.items())
     return sum(histogram(channel.ravel()).rate_bits for _, residuals, _ in chosen for channel in residuals)
 
 
 def write_sections(coded: Decorrelated, options: EncodeOptions) -> dict[Section, tuple[bytes, float]]:
-    """(bytes, sum of R(a)) of the sections of mode ans."""
+    """Returns (bytes, sum of R(a)) of each section of mode ans."""
     sections = {}
     if coded.planes:
         sections[Section.PLANES] = write_planes(coded.planes, options.priors, options.effort)
@@ -378,7 +378,7 @@ def write_sections(coded: Decorrelated, options: EncodeOptions) -> dict[Section,
 
 
 def read_sections(take: Callable[[Section, int], bytes], shape: Shape) -> Deformation:
-    """The symbols in the sections of mode ans. take: (section, number of its symbols) -> its bytes."""
+    """Decodes the symbols in the sections of mode ans. take: (section, number of its symbols) -> its bytes."""
     sizes = [math.prod(one) for one in shape.weights]
     data = take(Section.PLANES, sum(map(math.prod, shape.planes)))
     residuals = read_planes(data, shape.planes) if data else []
@@ -386,12 +386,12 @@ def read_sections(take: Callable[[Section, int], bytes], shape: Shape) -> Deform
 
 
 def channel_sizes(shape: Shape) -> tuple[list[int], list[int]]:
-    """Symbols in each channel of the planes, and of the weights and biases."""
+    """Returns the numbers of symbols in the channels of the planes, and of the weights and biases."""
     return [h * w for c, h, w in shape.planes for _ in range(c)], [math.prod(one) for one in shape.weights]
 
 
 def from_channels(planes: Sequence[np.ndarray], weights: Sequence[np.ndarray], shape: Shape) -> Deformation:
-    """The symbols of the channels int32 [n] of planes and weights."""
+    """Returns the symbols of planes and networks from their channels int32 [n], the inverse of `decorrelate`."""
     ends = list(accumulate((c for c, _, _ in shape.planes), initial=0))
     residuals = [
         np.concatenate(planes[first:end]).reshape(one)

@@ -1,4 +1,4 @@
-"""Scene -> bytes of a `.pd4` file, with a report of where the bits went."""
+"""Encodes a scene into the bytes of a `.pd4` file, with a report of the bits of each part."""
 
 import hashlib
 import math
@@ -33,7 +33,7 @@ from pd4dgs_codec.format.symbols import LayerSymbols, SceneSymbols, sliced
 from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.threads import one_blas_thread
 
-#: Most bytes of preamble, header and chunk list of a sliced file, which count with the first slice.
+#: Bytes allowed for the preamble and header of a sliced file, which count with the first slice.
 HEADER = 1000
 TRIES = 4  #: most encodes of one slice to reach its size
 SLACK = 0.97  #: share of the size that a slice aims at
@@ -42,7 +42,7 @@ FULL = 0.92  #: share of the size that is large enough
 
 @dataclass(frozen=True, eq=False)
 class _Slice:
-    """A slice as written. anchors: its number of anchors."""
+    """A slice as written. anchors: number of its anchors."""
 
     anchors: int
     payload: bytes
@@ -51,7 +51,7 @@ class _Slice:
 
 @dataclass(frozen=True)
 class SliceReport:
-    """A slice. bytes: of its whole chunk."""
+    """The report of a slice. bytes: of its whole chunk."""
 
     bytes: int
     anchors: int
@@ -59,9 +59,9 @@ class SliceReport:
 
 @dataclass(frozen=True)
 class LayerReport:
-    """A layer. bytes: of its chunks. slices: each of them. payload_bits and rate_bits: sums over attributes, planes and
-    weights; in mode lzma one stream codes these and the masks together, and payload_bits is all of it. streams: every
-    coded section."""
+    """The report of a layer. bytes: of its chunks. payload_bits, rate_bits: sums over attributes, planes and weights.
+    In mode lzma one stream codes these and the masks, and payload_bits counts all of it. streams: every coded section,
+    summed over the slices."""
 
     layer: int
     bytes: int
@@ -76,9 +76,9 @@ class LayerReport:
 
 @dataclass(frozen=True)
 class Report:
-    """The report of an encode. left_out: rows of what, why, lossless and bytes, about what it would have taken. errors:
-    declared and largest errors by kind of tensors, empty if not verified. metadata_bytes: of the metadata's chunk, 0
-    without one."""
+    """The report of an encode. left_out: rows {what, why, lossless, bytes} with the estimated bytes of each part left
+    out. errors: declared and largest errors by field of Steps, empty if not verified. metadata_bytes: of the metadata
+    chunk, 0 without one."""
 
     mode: str
     bytes: int
@@ -90,13 +90,13 @@ class Report:
     metadata_bytes: int
 
     def added_bytes(self) -> dict[int, int]:
-        """By layer the bytes that it adds to the file, the header counted with layer 0."""
+        """Returns the bytes that each layer adds to the file. The header counts with layer 0."""
         header = self.bytes - sum(row.bytes for row in self.layers) - self.metadata_bytes
         return {row.layer: row.bytes + (header if row.layer == 0 else 0) for row in self.layers}
 
     @property
     def first_bytes(self) -> int:
-        """Bytes before the first picture: the header and the first slice."""
+        """Number of bytes before the first picture: the header and the first slice."""
         return self.added_bytes()[0] - sum(part.bytes for part in self.layers[0].slices[1:])
 
     def json(self) -> dict[str, Any]:
@@ -105,7 +105,7 @@ class Report:
 
 
 def encode(scene: Scene, options: EncodeOptions = DEFAULTS, **changes: Any) -> bytes:
-    """The bytes of a `.pd4` file; options and changes as in encode_with_report."""
+    """Returns the bytes of a `.pd4` file. Options, changes and errors as in encode_with_report."""
     return encode_with_report(scene, options, **changes)[0]
 
 
@@ -119,11 +119,11 @@ def encode_with_report(
     utility: Callable[[Scene], np.ndarray] | None = None,
     **changes: Any,
 ) -> tuple[bytes, Report]:
-    """(file, report) of a scene.
+    """Encodes a scene; returns (bytes of the file, report).
 
-    left_out: parts that the caller has taken out of the scene, to be reported with the others. metadata: of the file.
-    utility: function of the scene as decoded, float [N], the gain of the pictures by each anchor, which orders the
-    anchors of sliced layers; by_size if None. changes: fields of EncodeOptions by name, in place of those of `options`.
+    left_out: parts that the caller has removed from the scene, added to the report. metadata: stored in the file.
+    utility: function of the decoded scene, float [N], the gain in image quality by each anchor. It orders the anchors
+    of sliced layers; by_size if None. changes: fields of EncodeOptions that replace those of `options`.
     Raises EncodeError.
     """
     started = time.perf_counter()
@@ -150,15 +150,15 @@ def encode_with_report(
 
 
 def by_size(scene: Scene) -> np.ndarray:
-    """float32 [N]: the guess at each anchor's utility without views: its mask in the highest layer times the largest
-    area that its Gaussians may cover."""
+    """Estimates each anchor's utility without views, float32 [N]: its mask code in the highest layer times the largest
+    area, relative to other anchors, that its Gaussians may cover."""
     scales = np.sort(scene.scaling_log[:, 3:], axis=1)[:, 1:].sum(axis=1)
     utility: np.ndarray = scene.mask[-1] * np.exp(scales - scales.max(initial=0))
     return utility
 
 
 def with_metadata(data: bytes, metadata: Metadata) -> bytes:
-    """A complete file with another metadata chunk at its end; nothing else changes but the chunk list."""
+    """Returns a complete file with a metadata chunk appended. Only the chunk list in the header changes."""
     preamble = read_preamble(data)
     header, about = unpack_header(preamble.header), write_metadata(metadata)
     packed = pack_header(replace(header, chunks=(*header.chunks, (CHUNK_TYPE, len(about)))))
@@ -169,7 +169,7 @@ def with_metadata(data: bytes, metadata: Metadata) -> bytes:
 def _write_layers(
     symbols: SceneSymbols, options: EncodeOptions, utility: Callable[[Scene], np.ndarray]
 ) -> list[list[_Slice]]:
-    """The slices of each layer."""
+    """Writes the slices of each layer."""
     if not options.slices:
         return [[_Slice(len(layer.anchor_q), *write_layer(layer, options))] for layer in symbols.layers]
     ends = np.cumsum([len(layer.anchor_q) for layer in symbols.layers])[:-1]
@@ -181,12 +181,12 @@ def _write_layers(
 
 
 def _write_slices(layer: LayerSymbols, options: EncodeOptions, utility: np.ndarray) -> list[_Slice]:
-    """The slices of a layer, in order, of about options.slices bytes at most.
+    """Writes the slices of a layer, in order, of about options.slices bytes at most.
 
     utility: float [n], of the layer's anchors; the highest come first. The first slice of layer 0 is full, for the
-    sake of the first picture, that of a later layer of several slices at most half full, so that its motion shows
-    early, and all others are equal. A first slice that planes and networks alone make larger has no anchors, except in
-    layer 0, where a picture needs some.
+    first picture. The first slice of a later layer of several slices is at most half full, so that motion shows early.
+    Further slices are of equal size. If planes and networks alone exceed the size, the first slice has no anchors,
+    except in layer 0, where a picture needs some.
     """
     rows = np.argsort(-utility, kind="stable")
     costs = np.cumsum([0.0, *layer.bits_per_row()[rows]]) / 8  # of the first 0, 1, .. rows
@@ -226,7 +226,7 @@ def _write_slices(layer: LayerSymbols, options: EncodeOptions, utility: np.ndarr
 def _container(
     symbols: SceneSymbols, bounds: dict[str, float], mode: str, written: list[list[_Slice]], metadata: bytes
 ) -> bytes:
-    """The file of these slices. Metadata, if there is any, comes last: a picture does not wait for it."""
+    """Returns the file of these slices. Metadata, if any, comes last, so that no picture waits for it."""
     parts = [
         (layer.kind.layer, slice_flags(number, len(slices)), part.payload)
         for layer, slices in zip(symbols.layers, written, strict=True)
@@ -242,8 +242,8 @@ def _container(
 
 
 def _check_file(data: bytes, fingerprints: list[bytes]) -> None:
-    """Decode `data` and compare its header and layers with what was meant; without fingerprints, read the header and
-    the parameters of all slices, so that no limit of the format is exceeded. Raises EncodeError."""
+    """Decode `data`, check its header and compare its layers with the fingerprints. Without fingerprints, only read the
+    header and the parameters of all slices to check the format's limits. Raises EncodeError."""
     try:
         if not fingerprints:
             info(data)
@@ -263,7 +263,7 @@ def _check_file(data: bytes, fingerprints: list[bytes]) -> None:
 
 
 def _fingerprint(layer: LayerSymbols) -> bytes:
-    """SHA-256 of a layer's steps and symbols, with their shapes."""
+    """Returns the SHA-256 of a layer's steps and symbols, with their shapes."""
     digest = hashlib.sha256(repr(layer.steps).encode())
     for array in layer.arrays():
         digest.update(f"{array.dtype} {array.shape}".encode())
@@ -289,7 +289,7 @@ def _layer_report(layer: LayerSymbols, slices: list[_Slice]) -> LayerReport:
 
 
 def _added(slices: list[_Slice]) -> list[StreamReport]:
-    """Sums over the slices by section; the positions come first."""
+    """Sums the reports of the slices by section; the positions come first."""
     found: dict[str, StreamReport] = {}
     for row in (row for part in slices for row in part.streams):
         other = found.get(row.name, StreamReport(row.name, 0, 0.0, 0))

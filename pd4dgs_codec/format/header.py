@@ -45,11 +45,11 @@ DIGEST_SIZE = 16  #: bytes
 
 @dataclass(frozen=True, eq=False)
 class Header:
-    """chunks: (type, payload length in bytes) in file order.
+    """The file header. chunks: (type, payload length in bytes) in file order.
 
-    grid: of the attributes. error_bounds: by field of Steps, how far a decoded value may lie from the value given to
-    the encoder, in the unit of the values; a binary32 value >= 0. digest: payload_digest of the layers that were
-    encoded together.
+    grid: of the attributes. error_bounds: by field of Steps, the largest distance of a decoded value from the value
+    given to the encoder, in the unit of the values; a binary32 value >= 0. digest: payload_digest of the layers that
+    were encoded together.
     """
 
     chunks: tuple[tuple[int, int], ...]
@@ -65,7 +65,7 @@ def _f32(values: ArrayLike) -> list[float]:
 
 
 def pack_header(header: Header) -> bytes:
-    """The header's bytes. Raises EncodeError for a value that canonical msgpack cannot hold."""
+    """Returns the header's bytes. Raises EncodeError for a value that canonical msgpack cannot hold."""
     info, grid = header.info, header.grid
     fields: dict[int, object] = {
         CHUNKS: [list(chunk) for chunk in header.chunks],
@@ -96,7 +96,7 @@ def pack_header(header: Header) -> bytes:
 
 
 def unpack_header(data: bytes, offset: int = 0) -> Header:
-    """The inverse of pack_header. offset: of the header's first byte, for messages. Raises DecodeError's subclasses."""
+    """The inverse of pack_header. offset: of the header in the file, for messages. Raises subclasses of DecodeError."""
     fields = Fields(canonical.unpack(data, offset=offset), "header", KEYS)
     steps = fields.reals(STEPS, len(ATTRIBUTES))
     voxel_size = fields.real(VOXEL_SIZE)
@@ -137,7 +137,7 @@ def unpack_header(data: bytes, offset: int = 0) -> Header:
 
 
 def info_fault(info: SceneInfo) -> str | None:
-    """The first rule that finite header values break, or None; for the encoder and the decoder."""
+    """Returns the first rule that finite header values break, or None. Encoder and decoder both use it."""
     start, end = info.time_range
     rules = [
         (start <= end, f"time range {start}..{end}, expected it to ascend"),
@@ -152,7 +152,7 @@ def info_fault(info: SceneInfo) -> str | None:
 
 
 def payload_digest(payloads: Iterable[bytes]) -> bytes:
-    """The digest in the header: of the payloads of all layers that were encoded together, in file order."""
+    """Returns the header's digest, 16 bytes of the SHA-256 of the payloads of all encoded layers in file order."""
     digest = hashlib.sha256()
     for payload in payloads:
         digest.update(payload)
@@ -160,8 +160,8 @@ def payload_digest(payloads: Iterable[bytes]) -> bytes:
 
 
 def scene_id_of(header: bytes) -> bytes:
-    """The scene id of every chunk of a file: the first 8 bytes of the SHA-256 of the header's bytes behind its chunk
-    list, so that chunks can be added and removed under the same id. header: canonical, with a chunk list.
+    """Returns the scene id in every chunk of a file: the first 8 bytes of the SHA-256 of the header's bytes after its
+    chunk list. So adding or removing chunks keeps the id. header: canonical, with a chunk list.
     """
     fields = canonical.unpack(header)
     map_head = 1 if len(fields) < 16 else 3
@@ -193,7 +193,7 @@ def _unpack_chunks(rows: list[Any]) -> tuple[tuple[int, int], ...]:
 
 
 def layers_of(chunks: Iterable[tuple[int, int]]) -> list[int]:
-    """The layer of each slice in a chunk list."""
+    """Returns the layer of each slice in a chunk list."""
     return [kind for kind, _ in chunks if kind in BY_CHUNK_TYPE]
 
 

@@ -18,14 +18,14 @@ FORMAT_VERSION = f"{MAJOR}.{MINOR}"
 
 
 def info(data: bytes) -> dict[str, Any]:
-    """Header and layers of a file, or of its first bytes: only the preamble and header must be there.
+    """Returns the header and layers of a file, or of a prefix of it that holds at least the preamble and header.
 
-    layers: {layer, offset, bytes, end, slices} (whole chunks; end = length of the prefix that holds layers 0 .. this
-    one) and, for layers that `data` holds whole, anchors, steps, planes ([C, x, y, z, t] per scale), networks (output
-    widths) and sections (bytes by name; what else the chunks hold is their frames and their parameters). slices:
-    {offset, bytes, end} and, of those that `data` holds whole, anchors.
+    layers: {layer, offset, bytes, end, slices}; bytes counts whole chunks, and end is the length of the prefix with
+    layers 0 .. this one. Layers that `data` holds whole also have anchors, steps, planes ([C, x, y, z, t] per scale),
+    networks (output widths) and sections (bytes by name, without the chunks' frames and parameters).
+    slices: {offset, bytes, end}, and anchors if `data` holds the slice whole.
     metadata: {title, source, licence, command, quality, slices, still_bytes} as far as given, {"fault"} if it cannot be
-    read, None where `data` holds no such chunk.
+    read, None if `data` holds no metadata chunk. Raises DecodeError.
     """
     preamble = read_preamble(data)
     header = unpack_header(preamble.header, offset=PREAMBLE_SIZE)
@@ -84,7 +84,7 @@ def info(data: bytes) -> dict[str, Any]:
 
 
 def metadata_of(data: bytes) -> Metadata | None:
-    """The metadata of a complete file, None if it has none. Raises DecodeError if it cannot be read."""
+    """Returns the metadata of a complete file, None if it has none. Raises DecodeError if it cannot be read."""
     preamble = read_preamble(data)
     offset = preamble.size
     for chunk_type, length in unpack_header(preamble.header, offset=PREAMBLE_SIZE).chunks:
@@ -95,7 +95,7 @@ def metadata_of(data: bytes) -> Metadata | None:
 
 
 def _about(payload: bytes) -> dict[str, Any]:
-    """Metadata as JSON can hold it. A fault in it leaves the layers valid, so it is reported and not raised."""
+    """Returns metadata as JSON can hold it. A fault leaves the layers valid, so it is reported and not raised."""
     try:
         found = read_metadata(payload)
     except DecodeError as error:
@@ -107,14 +107,14 @@ def _about(payload: bytes) -> dict[str, Any]:
 
 
 def hashes(data: bytes, max_layer: int | None = None) -> list[dict[str, Any]]:
-    """Per layer {layer, symbols, tensors}: SHA-256 in hex of the integers and the float32 values of a complete file, or
-    of its layers <= max_layer alone (bytes after those are not looked at). Clause 12.4.
+    """Returns {layer, symbols, tensors} per layer: SHA-256 in hex of the integers and of the float32 values in a
+    complete file, or in its layers <= max_layer (later bytes are ignored). Clause 12.4.
 
     symbols: int32 little-endian, C order, of anchor_q [n, 3], the rise of earlier rows' mask codes, the codes of own
     rows, their step classes if there are any, attributes [channels, n], then planes [C, H, W] scale by scale in the
     order xy xz xt yz yt zt, then weight [out, in] and bias [out] per linear layer, networks by ascending id.
-    tensors: float32 little-endian of anchor [n, 3], feature [n, D], scaling_log [n,
-    6], offset [n, G, 3] of own rows, then planes and networks as above.
+    tensors: float32 little-endian of anchor [n, 3], feature [n, D], scaling_log [n, 6], offset [n, G, 3] of own rows,
+    then planes and networks as above.
     """
     _, symbols = read_layers(data, max_layer=max_layer)
     scene, rows = symbols.scene(), []

@@ -1,7 +1,7 @@
 """Metadata of a file (clause 3.5), in an ancillary chunk that decoders may skip.
 
-The content is a canonical msgpack map in one zstd frame that declares its size. Only the two functions that pack and
-unpack it import zstandard.
+The content is a canonical msgpack map in one zstd frame that declares its size. Only `write_metadata` and
+`read_metadata` import zstandard.
 """
 
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ CHUNK_TYPE = 3  #: ancillary
 TITLE, SOURCE, LICENCE, COMMAND, QUALITY, STILL, SLICES = range(1, 8)
 TEXTS = {"title": TITLE, "source": SOURCE, "licence": LICENCE, "command": COMMAND}
 
-MAX_COMPRESSED = MAX_CONTENT = 1 << 18  #: bytes; a reader allocates no more than the second
+MAX_COMPRESSED = MAX_CONTENT = 1 << 18  #: bytes; a reader allocates no more than MAX_CONTENT
 MAX_TEXT = 4096  #: bytes of UTF-8 in one text
 MAX_STILL = 1 << 17  #: bytes of the picture's file
 MAX_LEVEL = 2
@@ -46,7 +46,7 @@ class Metadata:
 
 
 def write_metadata(metadata: Metadata) -> bytes:
-    """The content of the chunk. Raises EncodeError for metadata over a limit; dB are rounded to binary32."""
+    """Returns the content of the chunk, with dB rounded to binary32. Raises EncodeError for metadata over a limit."""
     import zstandard
 
     fields: dict[int, object] = {key: vars(metadata)[name] for name, key in TEXTS.items() if vars(metadata)[name]}
@@ -68,8 +68,8 @@ def write_metadata(metadata: Metadata) -> bytes:
 
 
 def read_metadata(data: bytes) -> Metadata:
-    """The inverse of write_metadata. Raises LimitExceeded, before anything is decompressed, for a declared size over
-    its limit, UnsupportedFeature for an unknown critical key and Malformed for any other fault."""
+    """The inverse of write_metadata. Raises LimitExceeded for a size over its limit, before anything is decompressed,
+    UnsupportedFeature for an unknown critical key, and Malformed for any other fault."""
     import zstandard
 
     _check_size("compressed", len(data), MAX_COMPRESSED, LimitExceeded)

@@ -1,4 +1,4 @@
-"""Scene -> a flat dict of arrays under stable names, for numpy.savez and readers without this package."""
+"""Converts a scene to a flat dict of arrays under stable names, for numpy.savez and readers without this package."""
 
 import numpy as np
 
@@ -12,14 +12,14 @@ OWNERS = {0: "", 1: "global", 2: "local"}
 
 
 def to_npz_dict(scene: Scene, symbols: bool = False) -> dict[str, np.ndarray]:
-    """Arrays by key: anchor, feature, scaling_log, offset (float32, one row per anchor); mask_L per layer L present
-    (float32 masks of the first rows); mlp.NAME.weight.i and .bias.i with NAME opacity, covariance, color, global.trunk,
-    global.position ... local.mean ...; planes.{global,local}.SCALE.PLANE; meta_* for the rest.
+    """Returns arrays by key: anchor, feature, scaling_log, offset (float32, one row per anchor); mask_L per layer L
+    present (float32 masks of the first rows); mlp.NAME.weight.i and .bias.i with NAME opacity, covariance, color,
+    {global,local}.trunk and {global,local}.HEAD; planes.{global,local}.SCALE.PLANE; meta_* for the rest.
 
-    With step classes also step_class (uint8) and NAME_centre (float32) per attribute: its values are the centre plus
+    Step classes add step_class (uint8), and NAME_centre (float32) per attribute, whose values are the centre plus
     multiples of 2^step_class steps.
 
-    symbols: also NAME_q (int32) and NAME_step (float32) for every quantised array; anchor_step is the voxel size.
+    symbols: adds NAME_q (int32) and NAME_step (float32) for every quantised array; anchor_step is the voxel size.
     """
     arrays, steps = {"anchor": scene.anchor, **scene.attributes}, dict[str, float]()
     if scene.grading is not None:

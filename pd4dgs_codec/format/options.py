@@ -1,6 +1,6 @@
-"""Options of the encoder with their defaults and checks; the commands take them from here.
+"""Options of the encoder with their defaults and checks, also for the commands.
 
-Only the standard library is imported, so that `--help` answers at once.
+Imports neither numpy nor torch, so that `--help` answers at once.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ CHOICES: Mapping[str, Sequence[str | int]] = {
     "omit": ("lossless", "nothing"),
 }
 
-#: Least bytes of a slice: its frame and parameters take some 50 bytes, and its channels name a prior each.
+#: Least bytes of a slice: its frame and parameters take some 50 bytes, and each channel names a prior.
 LEAST_SLICE = 1000
 
 
@@ -67,7 +67,7 @@ class EncodeOptions:
             raise EncodeError(f"slices in mode {self.mode}, expected mode ans or one slice per layer")
 
     def apply_scale(self, scene: Scene) -> tuple[Scene, EncodeOptions]:
-        """(`scene` with its steps scaled and rounded to binary32, these options with step_scale 1)."""
+        """Returns (`scene` with its steps scaled and rounded to binary32, these options with step_scale 1)."""
         return replace(scene, steps=scene.steps.scaled(self.step_scale)), replace(self, step_scale=1.0)
 
 
