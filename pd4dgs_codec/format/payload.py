@@ -34,7 +34,7 @@ ROWS, SECTIONS = 1, 2
 #: constant channels cannot make a decoder allocate without end. Real scenes spend over 0.1 bit per symbol.
 FREE_SYMBOLS = 1 << 22
 SYMBOLS_PER_BYTE = 256
-#: The same for anchors: one may cost next to nothing, and its position takes up to 42 symbols.
+#: The same bound for anchors, which may cost almost nothing each; a position takes up to 42 symbols.
 FREE_ROWS = 1 << 13
 ROWS_PER_BYTE = 2
 
@@ -44,8 +44,7 @@ ROWS_PER_BYTE = 2
 
 @dataclass(frozen=True)
 class Declared:
-    """Sums over the slices of a file so far: rows, symbols, the bytes of their payloads; and the scales of their
-    planes."""
+    """Sums over the slices of a file so far: rows, symbols and bytes of payloads. scales: of all their planes."""
 
     rows: int = 0
     symbols: int = 0
@@ -67,18 +66,18 @@ class Parameters:
 
     @property
     def symbols(self) -> int:
-        """Symbols of the slice, voxel indices and masks included."""
+        """Number of symbols of the slice, voxel indices and masks included."""
         return self.rises + self.rows * (self.widths.channels + self.widths.graded + 4) + self.shape.symbols
 
 
 def read_parameters(
     payload: bytes | memoryview, kind: LayerKind, widths: Widths, before: Declared, later: bool = False
 ) -> tuple[Parameters, int, Declared]:
-    """(parameters, offset of the first section, sums with this slice) of a payload, all lengths checked against its
-    size and all counts against their limits.
+    """Returns (parameters, offset of the first section, sums with this slice) of a payload. Checks all lengths against
+    the payload's size and all counts against their limits.
 
-    widths: of the anchors. before: sums over the slices before it. later: behind the first slice of its layer. Raises
-    DecodeError's subclasses.
+    widths: of the anchors. before: sums over earlier slices. later: whether it is not the first slice of its layer.
+    Raises subclasses of DecodeError.
     """
     where = f"layer {kind.layer}"
     if len(payload) < 4:
@@ -144,9 +143,9 @@ def write_layer(
     past: Past[Fitted] | None = None,
     population: LayerSymbols | None = None,
 ) -> tuple[bytes, list[StreamReport]]:
-    """(payload, a report per section, the positions first). The inverse of read_layer.
+    """Returns (payload of a slice, a report per section, the positions first). The inverse of read_layer.
 
-    past: of the layer's slices before this one, which is added. population: the whole layer.
+    past: state of the layer's earlier slices, to which this one is added. population: the whole layer.
     """
     past = past or Past()
     coded = deformation.decorrelate(symbols.tensors, symbols.kind)
@@ -185,7 +184,7 @@ def _write_ans(
     past: Past[Fitted],
     population: LayerSymbols | None,
 ) -> dict[Section, tuple[bytes, float]]:
-    """(bytes, sum of R(a)) by section, those with symbols alone."""
+    """Returns (bytes, sum of R(a)) by section, only for sections with symbols."""
     sections = {}
     masks = [symbols.mask_increase, symbols.mask_own]
     if any(channel.size for channel in masks):
@@ -203,7 +202,8 @@ def _write_ans(
 def _write_lzma(
     symbols: LayerSymbols, coded: deformation.Decorrelated, options: EncodeOptions
 ) -> dict[Section, tuple[bytes, float]]:
-    """The section of all channels, none without symbols. Its rate counts no masks, and attributes by step class."""
+    """Returns one section with all channels, none without symbols. Its rate leaves out masks and splits attributes by
+    step class."""
     graded = [symbols.classes] if symbols.widths.graded else []
     masks, rest = [symbols.mask_increase, symbols.mask_own], [*coded.plane_channels, *coded.weights]
     channels = [*masks, *graded, *symbols.attributes, *rest]
@@ -227,10 +227,10 @@ def read_layer(
     later: bool = False,
     past: Past[Prior] | None = None,
 ) -> tuple[LayerSymbols, Declared]:
-    """(symbols, sums with this slice) of a payload. Arguments as in read_parameters; past: of the layer's slices
-    before, to which this one is added.
+    """Returns (symbols, sums with this slice) of a payload. Arguments as in read_parameters.
 
-    Raises DecodeError's subclasses; nothing is allocated for a count that the limits or the payload do not cover.
+    past: state of the layer's earlier slices, to which this one is added. Raises subclasses of DecodeError; nothing is
+    allocated for a count beyond the limits or the payload.
     """
     parameters, start, declared = read_parameters(payload, kind, widths, before, later)
     sections = _Sections(payload, start, parameters.sections, kind)
@@ -260,14 +260,14 @@ class _Sections:
             start += length
 
     def take(self, section: Section, symbols: int) -> bytes:
-        """Its bytes. Raises Malformed unless it is there exactly if it has symbols."""
+        """Returns a section's bytes. Raises Malformed if it is missing with symbols to code, or there without any."""
         if (section in self._parts) != (symbols > 0):
             found = "there" if section in self._parts else "missing"
             raise Malformed(f"section {section.name.lower()} is {found}, with {symbols} symbols to code")
         return self._parts.pop(section, b"")
 
     def check_empty(self) -> None:
-        """Raise Malformed if a section was not taken."""
+        """Raise Malformed if a section has not been taken."""
         if self._parts:
             where = f"layer {self._kind.layer}: section {min(self._parts)}"
             raise Malformed(f"{where} is there, but nothing is left for it to code")

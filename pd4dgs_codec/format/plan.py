@@ -1,4 +1,4 @@
-"""Encoder: what a file holds of a scene, and what it leaves out.
+"""Encoder: decides which parts of a scene a file holds.
 
 Layer l carries the anchors that become active at level l. Anchors inactive at the highest level kept are dropped. When
 a layer is left out because it has no deformation, its anchors and masks pass to the highest layer kept, so that the
@@ -24,8 +24,8 @@ from pd4dgs_codec.scene import Deformation, Scene, Steps, Widths
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """A part that was not written. Its cost is found by coding `tensors`, else is that of `anchors` average anchors,
-    else `bits`, the order-0 entropy that was saved. lossless: no picture changes."""
+    """A part that was not written. Its cost is that of `anchors` average anchors if there are any, else that of coding
+    `tensors`, else `bits`, the order-0 entropy that was saved. lossless: no picture changes."""
 
     what: str
     why: str
@@ -36,7 +36,7 @@ class LeftOut:
     lossless: bool = False
 
     def row(self, steps: Steps, options: EncodeOptions, kept: int, kept_bits: int) -> dict[str, Any]:
-        """{what, why, lossless, bytes} for the report of a file whose `kept` anchors took kept_bits bits."""
+        """Returns {what, why, lossless, bytes} for the report of a file whose `kept` anchors took kept_bits bits."""
         if self.anchors:
             cost = self.anchors * kept_bits / 8 / kept if kept else 0
         elif self.tensors is not None and self.kind is not None:
@@ -47,7 +47,7 @@ class LeftOut:
 
 
 def tensor_bytes(tensors: Deformation, kind: LayerKind, steps: Steps, options: EncodeOptions) -> int:
-    """Bytes of planes and networks as a layer without anchors."""
+    """Returns the bytes of planes and networks, coded as a layer without anchors."""
     empty = np.zeros(0, np.int32)
     alone = LayerSymbols(
         kind=kind,
@@ -65,8 +65,8 @@ def tensor_bytes(tensors: Deformation, kind: LayerKind, steps: Steps, options: E
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """scene: as given, as far as the file holds it, with other values where an omission changed the symbols. symbols:
-    of that scene, what the file will hold. left_out: the parts of the given scene that it lacks."""
+    """scene: the parts of the given scene that the file holds, with other values where an omission changed symbols.
+    symbols: of that scene, as the file stores them. left_out: the parts of the given scene that the file lacks."""
 
     scene: Scene
     symbols: SceneSymbols
@@ -74,7 +74,7 @@ class Plan:
 
 
 def plan(scene: Scene, options: EncodeOptions = DEFAULTS) -> Plan:
-    """What a file of `scene` holds, by options.layers and options.omit; steps are not scaled.
+    """Plans a file of `scene` by options.layers and options.omit; options.step_scale is not applied.
 
     Steps are rounded to binary32, and rows sorted by (layer, Morton order). Raises EncodeError for a value that has no
     symbol, and for voxels with two anchors.
@@ -100,7 +100,7 @@ def plan(scene: Scene, options: EncodeOptions = DEFAULTS) -> Plan:
 
 
 def _cut(scene: Scene, highest: int) -> tuple[Scene, list[LeftOut]]:
-    """(the layers <= highest as they are, a row for each layer above)."""
+    """Returns (the layers <= highest with the anchors of all layers, a LeftOut for each layer above)."""
     why = f"layers up to {highest} were asked for"
     left_out = [
         LeftOut(f"layer {layer}", why, LAYER_KINDS[layer], scene.deformation(layer))
@@ -118,8 +118,8 @@ def _cut(scene: Scene, highest: int) -> tuple[Scene, list[LeftOut]]:
 
 
 def _drop_heads(scene: Scene, kind: LayerKind) -> tuple[Scene, list[LeftOut]]:
-    """(`scene` without the heads of a layer that are zero after quantisation, or without its deformation if none is
-    left and no layer above reads its planes; the heads left out)."""
+    """Removes the heads of a layer that are zero after quantisation, or its deformation if no head is left and no layer
+    above reads its planes. Returns (scene, parts left out)."""
     given = scene.deformation(kind.layer)
     if given is None:
         return scene, []
@@ -127,7 +127,7 @@ def _drop_heads(scene: Scene, kind: LayerKind) -> tuple[Scene, list[LeftOut]]:
     heads = deformation.heads_of(given)
     zero = [name for name in heads if deformation.is_zero(symbols, name)]
     if len(zero) == len(heads) and any(map(scene.deformation, range(kind.layer + 1, 3))):
-        zero = zero[1:]  # a deformation has a head
+        zero = zero[1:]  # a deformation has at least one head
     why = "zero after quantisation" if heads else "it has no heads"
     if len(zero) == len(heads):
         return scene.with_tensors(kind.layer, None), [LeftOut(kind.name, why, kind, given)]
@@ -137,15 +137,15 @@ def _drop_heads(scene: Scene, kind: LayerKind) -> tuple[Scene, list[LeftOut]]:
 
 
 def passed(scene: Scene, index: int, rows: np.ndarray) -> Scene:
-    """The scene, not planned, in which the anchors `rows` (int64 [n]) of scene.layers[index] come with the next layer:
-    their mask codes of this one are 0."""
+    """Moves the anchors `rows` (int64 [n]) of scene.layers[index] to the next layer by setting their mask codes of this
+    one to 0. The scene returned is not planned."""
     masks = scene.full_masks()
     masks[index][rows] = 0
     return replace(scene, rows=(scene.rows[-1],) * len(masks), mask=tuple(masks))
 
 
 def in_file_order(scene: Scene, kept: tuple[int, ...]) -> tuple[Scene, int]:
-    """(scene with the layers `kept` and rows sorted by (layer, Morton order), number of anchors dropped)."""
+    """Returns (scene with the layers `kept` and rows sorted by (layer, Morton order), number of anchors dropped)."""
     codes = scene.full_masks()
     by_layer = dict(zip(scene.layers, codes, strict=True))
     masks = np.stack([*(by_layer[layer] for layer in kept[:-1]), codes[-1]])
@@ -163,9 +163,9 @@ def in_file_order(scene: Scene, kept: tuple[int, ...]) -> tuple[Scene, int]:
 
 
 def _without_unread(scene: Scene, symbols: SceneSymbols) -> tuple[Scene, SceneSymbols, list[LeftOut]]:
-    """(scene, its symbols, what was left out) with values of little cost in plane cells that no anchor reads.
+    """Gives plane cells that no anchor reads values of little cost. Returns (scene, its symbols, parts left out).
 
-    scene: planned, all rows active at its highest level. Where its symbols change, its values do.
+    scene: planned, with all rows active at its highest level. Its values change where its symbols change.
     """
     low, high = scene.info.box
     unit = np.clip((scene.anchor - low) / np.maximum(high - low, np.finfo(np.float32).tiny), 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""The planes of a HexPlane, for `deformation`: prediction, the coded section, and cells that nothing samples.
+"""The planes of a HexPlane, for `deformation`: prediction, the coded section, and cells that no anchor reads.
 
 A plane is int32 [C, H, W]. A sample at row i, column j of a channel is predicted from its neighbours W = k[i, j-1],
 N = k[i-1, j] and NW = k[i-1, j-1], and the residual k - prediction is coded. In row 0 N and NW are taken equal to W, in
@@ -36,7 +36,7 @@ from pd4dgs_codec.scene import PLANES, Planes, plane_sides
 PlaneShape = tuple[int, int, int]  #: of a plane: channels, rows, columns
 Array = np.ndarray
 
-#: Cells by which a position may be off in another renderer, which rounds its coordinates otherwise.
+#: Largest difference in cells between the positions of two renderers, which round coordinates differently.
 CELL_SLACK = 0.02
 
 
@@ -69,7 +69,7 @@ def _restore_up(r: Array) -> Array:
     return np.cumsum(r, axis=1)
 
 
-#: The ids are those of the bitstream. On time planes "up" is the previous instant.
+#: Predictors by their id in the bitstream. On time planes "up" is the previous instant.
 PREDICTORS: dict[int, Predictor] = {
     0: Predictor("none", lambda w, n, nw: np.zeros_like(w), lambda r: r),
     1: Predictor("left", lambda w, n, nw: w, _restore_left),
@@ -79,7 +79,7 @@ PREDICTORS: dict[int, Predictor] = {
 
 
 def residual(predictor: int, k: Array) -> Array:
-    """int32 [C, H, W] residuals of samples k under PREDICTORS[predictor]; may exceed MAX_SYMBOL in magnitude."""
+    """Returns residuals of samples k, both int32 [C, H, W], under PREDICTORS[predictor]. They may exceed MAX_SYMBOL."""
     w, n, nw = np.zeros_like(k), np.zeros_like(k), np.zeros_like(k)
     w[:, :, 1:], n[:, 1:, :], nw[:, 1:, 1:] = k[:, :, :-1], k[:, :-1, :], k[:, :-1, :-1]
     n[:, 0, :] = nw[:, 0, :] = w[:, 0, :]
@@ -108,8 +108,8 @@ def restore(planes: Sequence[tuple[int, Array]]) -> list[Array]:
 def _scan(planes: Sequence[Array]) -> list[Array]:
     """Undo the median on int32 [C, H, W] along anti-diagonals: all cells with equal i + j are independent.
 
-    Planes of like size go together, so that none has more than twice the diagonals of another: the steps are no more
-    than 4 (H + W) of the largest however many planes there are, and memory stays linear in the cells.
+    Planes are scanned in groups in which none has more than twice the diagonals of another. So there are at most
+    4 (H + W) steps, of the largest plane, whatever the number of planes, and memory is linear in the cells.
     """
     result = list(planes)
     order = sorted(range(len(planes)), key=lambda i: -sum(planes[i].shape[1:]))
@@ -123,18 +123,18 @@ def _scan(planes: Sequence[Array]) -> list[Array]:
 
 
 def _scan_together(planes: Sequence[Array]) -> list[Array]:
-    """`_scan` of planes by descending number of diagonals.
+    """`_scan` of planes in descending order of their number of diagonals.
 
-    Diagonals are the rows of a table, and the rows of all planes its columns: cell (i, j) stands in row i + j, in the
-    column of i. So W stands above it, N above and one to the left, NW one further up, for all cells of a row at once,
-    with no list of neighbours. Those that a border does not have are 0 here, which gives the same median: before a
-    plane's first row stands a column of zeros, and what is left of its first column was never written.
-    The median never leaves its neighbours' range, so a magnitude is at most (h + w) * max|r|: below 2^37 always, and
+    A table has a row per diagonal and a column per row of a plane: cell (i, j) is in table row i + j, in the column of
+    i. So W is above it, N above and one to the left, and NW one row above N, for all cells of a table row at once.
+    Neighbours beyond a border are 0 here, which gives the same median: a column of zeros precedes each plane, and
+    entries left of a plane's first column are never written.
+    The median stays within its neighbours' range, so a magnitude is at most (h + w) * max|r|. That is below 2^37, and
     nearly always small enough for narrow lanes, which take a half or a quarter of the time. The table has at most 4.5
-    lanes a sample: 2.25 if a plane has as many rows as columns (the shorter side are the rows here), and twice that for
-    planes that end early.
+    lanes per sample: 2.25 if a plane has as many rows as columns (its shorter side gives the rows), and twice as many
+    for planes that end early.
     """
-    turned = [r if r.shape[1] <= r.shape[2] else r.swapaxes(1, 2) for r in planes]  # the median does not tell W from N
+    turned = [r if r.shape[1] <= r.shape[2] else r.swapaxes(1, 2) for r in planes]  # the median is symmetric in W and N
     ends = np.cumsum([r.shape[1] + 1 for r in turned])
     zeros = ends - [r.shape[1] + 1 for r in turned]
     diagonals, channels = [sum(r.shape[1:]) - 1 for r in turned], len(turned[0])
@@ -163,15 +163,14 @@ def _scan_together(planes: Sequence[Array]) -> list[Array]:
 
 
 def choose_predictor(k: Array) -> tuple[int, Array, float]:
-    """(id, int32 residuals, estimated bits) of the predictor with the smallest estimate among those within
-    MAX_SYMBOL."""
+    """Returns (id, int32 residuals, estimated bits) of the cheapest predictor with residuals within MAX_SYMBOL."""
     bits, predictor, _, r = min(_candidates((predictor, k) for predictor in PREDICTORS), key=lambda found: found[0])
     return predictor, r, bits
 
 
 def _candidates(planes: Iterable[tuple[int, Array]]) -> Iterator[tuple[float, int, Array, Array]]:
-    """(estimated bits, predictor, samples, residuals) of the (predictor, samples) within MAX_SYMBOL. Predictor 0 always
-    is: its residuals are the samples."""
+    """Yields (estimated bits, predictor, samples, residuals) of each (predictor, samples) within MAX_SYMBOL. Predictor
+    0 always is, because its residuals are the samples."""
     for predictor, k in planes:
         if magnitude(k) <= MAX_SYMBOL:
             r = residual(predictor, k)
@@ -180,8 +179,8 @@ def _candidates(planes: Iterable[tuple[int, Array]]) -> Iterator[tuple[float, in
 
 
 def _estimated_bits(residuals: Array) -> float:
-    """Cost of residuals int32 [C, H, W]: per channel its order-0 entropy, and log2(n) / 2 per distinct value for the
-    description of the distribution. The entropies are sums of integers, so the choice is the same on every machine."""
+    """Estimates the bits of residuals int32 [C, H, W]: per channel, the order-0 entropy and log2(n) / 2 per further
+    distinct value for its distribution. Entropies are sums of integers, so every machine makes the same choice."""
     costs, distinct, size = 0, 0, residuals[0].size
     for channel in residuals.reshape(len(residuals), -1):
         _, counts = symbol_counts(channel)
@@ -194,8 +193,8 @@ def _estimated_bits(residuals: Array) -> float:
 
 
 def cells_read(planes: Planes, unit: Array) -> list[dict[str, Array]]:
-    """Per scale, by plane name, bool [H, W]: the cells that points unit float32 [n, 3], 0..1 in the box, read at some
-    time."""
+    """Marks the cells that points read at any time: per scale, bool [H, W] by plane name. unit: float32 [n, 3], points
+    in 0..1 of the box."""
     read = []
     for scale in planes:
         cells = [_cells(unit[:, axis], side) for axis, side in enumerate(plane_sides(scale)[:3])]
@@ -210,16 +209,15 @@ def cells_read(planes: Planes, unit: Array) -> list[dict[str, Array]]:
 
 
 def _cells(unit: Array, side: int) -> list[Array]:
-    """int64 [n] each: the cells that samples at unit float32 [n], 0..1, may read on an axis of `side` cells."""
+    """Returns the cells, three int64 [n], that samples at unit float32 [n], 0..1, may read among `side` cells."""
     first = np.floor(unit * (side - 1) - CELL_SLACK)
     last = np.floor(unit * (side - 1) + CELL_SLACK) + 1
     return [np.clip(cell, 0, side - 1).astype(np.int64) for cell in (first, first + 1, last)]
 
 
 def fill_plane(k: Array, given: Array) -> tuple[Array, float]:
-    """(samples int32 [C, H, W], estimated bits that they save): equal to `k` where `given` bool [H, W], with values
-    elsewhere that cost little. Under the predictor that codes the plane cheapest the residuals of all free samples are
-    0."""
+    """Replaces samples of k int32 [C, H, W] outside `given` bool [H, W] by values of little cost: their residuals are 0
+    under the predictor that then codes the plane cheapest. Returns (samples, estimated bits saved)."""
     if given.all():
         return k, 0.0
     filled = _candidates((predictor, _filled(k, given, predictor)) for predictor in PREDICTORS)
@@ -228,7 +226,7 @@ def fill_plane(k: Array, given: Array) -> tuple[Array, float]:
 
 
 def _filled(k: Array, given: Array, predictor: int) -> Array:
-    """`k` with predictions in place of the samples that are not given, by anti-diagonals."""
+    """Returns `k` with predictions in place of the samples that are not given, by anti-diagonals."""
     channels, height, width = k.shape
     x = k.reshape(channels, -1).T.astype(np.int64)
     i, j = np.nonzero(~given)
@@ -250,14 +248,14 @@ def _filled(k: Array, given: Array, predictor: int) -> Array:
 
 
 def write_planes(residuals: Sequence[np.ndarray], priors: str, effort: int) -> tuple[bytes, float]:
-    """(section bytes, sum of R(a) over all channels) of residuals int32 [C, H, W] per plane, in the smaller form."""
+    """Writes residuals int32 [C, H, W] per plane in the smaller form: (section bytes, sum of R(a) of all channels)."""
     channels = [channel.ravel() for plane in residuals for channel in plane]
     section, rate_bits = smaller_form(lambda: channels, lambda: _write_staged(residuals, effort), priors, effort)
     return section.data, rate_bits
 
 
 def read_planes(data: bytes, shapes: Sequence[PlaneShape]) -> list[np.ndarray]:
-    """Residuals int32 [C, H, W] per plane; the inverse of write_planes. shapes were checked against the limits."""
+    """Reads residuals int32 [C, H, W] per plane, the inverse of write_planes. shapes: checked against the limits."""
     reader = ByteReader(data)
     form = reader.byte("the form of the planes")
     if form == PLAIN:
@@ -294,17 +292,17 @@ def _write_staged(residuals: Sequence[np.ndarray], effort: int) -> CodedSection:
 
 
 def _stage_count(shapes: Sequence[PlaneShape]) -> int:
-    """All planes of a layer have the same number of channels."""
+    """Returns the number of stages; all planes of a layer have the same number of channels."""
     return max(1, (shapes[0][0] - 1).bit_length())
 
 
 def _bounds(stage: int) -> tuple[int, int]:
-    """Its first channel, and that of the next stage."""
+    """Returns the first channels of a stage and of the next stage."""
     return (1 << stage if stage else 0), 2 << stage
 
 
 def _groups(planes: Sequence[np.ndarray], shapes: Sequence[PlaneShape], counts: Sequence[int]) -> Iterator[list[Group]]:
-    """Per stage, what it codes of each plane. `planes` int32 [C, H * W] are read only as far as the stages before
+    """Yields the groups of each stage, one per plane. planes: int32 [C, H * W], read only as far as earlier stages
     reach."""
     activities = [Activity(plane.shape[1]) for plane in planes]
     for stage, count in enumerate((1, *counts)):
@@ -322,7 +320,7 @@ def _groups(planes: Sequence[np.ndarray], shapes: Sequence[PlaneShape], counts: 
 
 
 def _around(activity: np.ndarray, shape: PlaneShape) -> np.ndarray:
-    """[H * W]: activity [H * W] summed over 3 x 3 cells, the border repeated."""
+    """Returns activity [H * W] summed over 3 x 3 cells, the border repeated."""
     _, height, width = shape
     cells = activity.reshape(height, width)
     around: np.ndarray = _of_three(_of_three(cells).T).T.ravel()
@@ -330,7 +328,7 @@ def _around(activity: np.ndarray, shape: PlaneShape) -> np.ndarray:
 
 
 def _of_three(cells: np.ndarray) -> np.ndarray:
-    """[H, W]: each cell with the one before and the one behind it in its row, the first and the last repeated."""
+    """Returns the sum of each cell and its two neighbours in the row, [H, W], the border repeated."""
     sums: np.ndarray = cells.copy(order="K")
     sums[:, 1:] += cells[:, :-1]
     sums[:, :-1] += cells[:, 1:]

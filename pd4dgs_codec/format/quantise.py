@@ -1,4 +1,4 @@
-"""Uniform scalar quantisation: float32 values <-> int32 symbols, the attributes of anchors channel by channel."""
+"""Uniform scalar quantisation between float32 values and int32 symbols, and the quantisation grid of attributes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def expect(ok: bool, message: str) -> None:
 
 
 def expect_array(name: str, a: np.ndarray, dtype: type, shape: tuple[int, ...]) -> None:
-    """Raise EncodeError unless an array has this dtype and shape, and finite values."""
+    """Raise EncodeError unless an array has this dtype, this shape and finite values."""
     expect(a.dtype == dtype and a.shape == shape, f"{name}: {a.dtype} {a.shape}, expected {np.dtype(dtype)} {shape}")
     if a.dtype.kind == "f":
         expect(bool(np.isfinite(a).all()), f"{name}: a value is NaN or infinite")
@@ -44,7 +44,7 @@ def is_step(value: float) -> bool:
 
 
 def magnitude(k: np.ndarray) -> int:
-    """The largest |k| of an integer array of any shape, 0 for an empty one."""
+    """Returns the largest |k| of an integer array of any shape, 0 for an empty one."""
     return max(int(k.max()), -int(k.min())) if k.size else 0
 
 
@@ -75,7 +75,7 @@ def quantise(
 
 def all_finite(k: np.ndarray, step: float) -> bool:
     """Whether dequantise(k, step) holds no infinity; |k| <= MAX_SYMBOL."""
-    step = float(step)  # not a binary32 of numpy, whose products are binary32 too
+    step = float(step)  # the product with a numpy binary32 would be binary32
     if MAX_SYMBOL * step < _TO_INFINITY:
         return True
     return magnitude(k) * step < _TO_INFINITY
@@ -98,9 +98,9 @@ def dequantise(k: np.ndarray, step: float, centre: Integers = 0, spacing: Intege
 
 
 def mask_codes(mask: np.ndarray) -> np.ndarray:
-    """uint8 codes of masks m in [0, 1]: 0 where m <= MASK_THRESHOLD, else max(MASK_MIN_CODE, round(255 m)).
+    """Returns uint8 codes of masks m in [0, 1]: 0 where m <= MASK_THRESHOLD, else max(MASK_MIN_CODE, round(255 m)).
 
-    Monotone in m, so codes keep the order of the masks. The inverse is m = code * MASK_STEP.
+    Codes keep the order of the masks. The inverse is m = code * MASK_STEP. Raises EncodeError for m outside [0, 1].
     """
     m = np.asarray(mask, dtype=np.float64)
     if not ((m >= 0) & (m <= 1)).all():
@@ -110,17 +110,17 @@ def mask_codes(mask: np.ndarray) -> np.ndarray:
 
 # -- attributes --------------------------------------------------------------------------------------------------------
 
-#: Anchors that are quantised and dequantised at a time: intermediate values are twice as wide.
+#: Anchors that are quantised or dequantised at a time, because intermediate values are twice as wide.
 BLOCK = 4096
 
 
 def row_blocks(n: int) -> Iterator[slice]:
-    """Slices of 0 .. n - 1 of at most BLOCK rows; one empty slice for n = 0."""
+    """Yields slices of 0 .. n - 1 of at most BLOCK rows; one empty slice for n = 0."""
     yield from (slice(first, min(first + BLOCK, n)) for first in range(0, max(n, 1), BLOCK))
 
 
 def attribute_rows(channels: np.ndarray, widths: Widths) -> Iterator[tuple[str, np.ndarray]]:
-    """(name of an attribute, its rows) of an array with a row per channel, in coding order."""
+    """Yields (name of an attribute, its rows) of an array with a row per channel, in coding order."""
     first = 0
     for name in ATTRIBUTES:
         last = first + math.prod(widths.attributes[name])
@@ -129,7 +129,7 @@ def attribute_rows(channels: np.ndarray, widths: Widths) -> Iterator[tuple[str, 
 
 
 def classes_of(scene: Scene) -> np.ndarray:
-    """int32 [N] step classes, or NO_CLASSES."""
+    """Returns the step classes int32 [N] of a scene, or NO_CLASSES."""
     return NO_CLASSES if scene.grading is None else scene.grading.classes.astype(np.int32)
 
 
@@ -148,7 +148,7 @@ class Grid:
 
     @staticmethod
     def of(scene: Scene) -> Grid:
-        """The grid of a scene's attributes at its steps. Raises EncodeError for a centre that has no symbol."""
+        """Returns the grid of a scene's attributes. Raises EncodeError for a centre that has no symbol."""
         steps, widths = scene.steps.attributes, scene.widths
         centre = np.zeros(widths.channels, np.int32)
         if scene.grading is not None:
@@ -166,12 +166,12 @@ class Grid:
         return 1 << classes.astype(np.int64) if self.widths.graded else 1
 
     def _with_centres(self, symbols: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-        """(name of an attribute, its rows of symbols [channels, n], their centres [rows, 1])."""
+        """Yields (name of an attribute, its rows of symbols [channels, n], their centres [rows, 1])."""
         both = (attribute_rows(rows, self.widths) for rows in (symbols, self.centre[:, None]))
         yield from ((name, own, centre) for (name, own), (_, centre) in zip(*both, strict=True))
 
     def farthest(self, symbols: np.ndarray, classes: np.ndarray) -> dict[str, int]:
-        """By attribute, the largest |m + k 2^c|; 0 without anchors."""
+        """Returns the largest |m + k 2^c| by attribute; 0 without anchors."""
         most = dict.fromkeys(ATTRIBUTES, 0)
         for rows in row_blocks(symbols.shape[1]) if self.widths.graded else [slice(None)]:
             at = symbols[:, rows]
@@ -182,7 +182,7 @@ class Grid:
         return most
 
     def quantise(self, values: dict[str, np.ndarray], classes: np.ndarray) -> np.ndarray:
-        """Symbols of float32 [n, *shape] by attribute. Raises EncodeError for a value that has none."""
+        """Returns the symbols of float32 [n, *shape] by attribute. Raises EncodeError for a value without a symbol."""
         symbols = np.empty((self.widths.channels, len(values[ATTRIBUTES[0]])), np.int32)
         for name, own, centre in self._with_centres(symbols):
             for rows in row_blocks(symbols.shape[1]):

@@ -1,4 +1,4 @@
-"""Registries of the bitstream, a row per layer and the sections, and its limits."""
+"""Registries of the bitstream's layers and sections, and its limits."""
 
 from dataclasses import dataclass
 from enum import IntEnum
@@ -8,7 +8,7 @@ from pd4dgs_codec.scene import HEADS, SCAFFOLD_NETWORKS, TRUNK, Widths
 
 @dataclass(frozen=True)
 class LayerKind:
-    """A layer of the format. Its number is its chunk type as well.
+    """A layer of the format. layer: its number, which is also its chunk type.
 
     name: of its planes and networks, in messages and reports. weights_step, planes_step: the fields of Steps that it
     uses; planes_step is None if the layer has no planes.
@@ -21,7 +21,7 @@ class LayerKind:
 
     @property
     def network_ids(self) -> dict[str, int]:
-        """The numbers of its networks in the bitstream, ascending: the order of the tables in `scene`."""
+        """Numbers of the layer's networks in the bitstream, ascending, from the order of the tables in `scene`."""
         names = (TRUNK, *HEADS) if self.layer else SCAFFOLD_NETWORKS
         return {name: number for number, name in enumerate(names)}
 
@@ -45,8 +45,8 @@ BY_CHUNK_TYPE: dict[int, LayerKind] = {kind.layer: kind for kind in LAYER_KINDS}
 
 
 class Section(IntEnum):
-    """Parts of a payload, in order (clause 6.4). A section without symbols is absent. SYMBOLS, of mode lzma, stands for
-    the four before it together."""
+    """Parts of a payload, in order (clause 6.4). A section without symbols is absent. In mode lzma, SYMBOLS replaces
+    the four sections before it."""
 
     POSITIONS = 0
     MASKS = 1

@@ -1,8 +1,8 @@
-"""Stages (clause 8.9): coded channels decoded one after another, each split by the contents of those before it.
+"""Stages (clause 8.9): groups of channels that are decoded in turn, each split by the contents of earlier stages.
 
-The sections of attributes and of planes share this. Residuals of one place (an anchor, a cell of a plane) tend to be
-large together, so a channel is split into classes of places by the *activity* of the channels before it, and each class
-has its own prior. All arithmetic is on integers.
+The sections of attributes and of planes share them. Residuals of one place (an anchor, a cell of a plane) tend to be
+large together, so a channel is split into classes of places by the *activity* of earlier channels, and each class has
+its own prior. All arithmetic is on integers.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from pd4dgs_codec.errors import Malformed
 PLAIN, STAGED = 0, 1
 MAX_CLASSES = 8
 EXACT = 1 << 53  #: binary64 holds every integer up to here
-SHARES = 1 << 16  #: values of an activity computed at a time: many channels of small planes, or one of many anchors
+SHARES = 1 << 16  #: values added to an activity at a time: many channels of small planes, or one of many anchors
 #: Encoder: numbers of classes to try, and about the bits that a further prior costs.
 CLASS_COUNTS = (1, 2, 3, 4, 5, 6, 8)
 PRIOR_BITS = 40
@@ -32,8 +32,8 @@ PRIOR_BITS = 40
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """The scale of relative magnitudes. places: n. sums: of the magnitudes of each channel so far; a magnitude counts
-    as no more than its channel's sum."""
+    """The scale of relative magnitudes. places: n. sums: of the magnitudes of each channel so far. A magnitude above
+    its channel's sum counts as that sum."""
 
     places: int
     sums: list[int] = field(default_factory=list)
@@ -41,8 +41,8 @@ class Scale:
 
 class Activity:
     """Running sum over channels, at each of n places, of the magnitudes of residuals relative to their channel's mean,
-    in units of 1/256; below 2^8 m n after m channels. scale: means to use, of an earlier slice; sums of channels that
-    it lacks are added to it."""
+    in units of 1/256. It is below 2^8 m n after m channels. scale: of an earlier slice, whose means are used; channels
+    that it lacks are added to it."""
 
     def __init__(self, places: int, scale: Scale | None = None):
         self.scale = scale or Scale(places)
@@ -51,7 +51,7 @@ class Activity:
 
     @property
     def now(self) -> np.ndarray:
-        """Integers float64 [n], until more is added."""
+        """The current sum, integers in float64 [n]; the next `add` changes it in place."""
         return self._total
 
     def add(self, residuals: np.ndarray, times: int = 1) -> None:
@@ -70,7 +70,7 @@ class Activity:
         np.minimum(shares, of_each, out=shares)
         unit = self.scale.places << 8
         if (int(of_each.max()) + 1) * unit <= EXACT or int(shares.max(initial=0)) * unit < EXACT:
-            # for integers below 2^53 the rounded quotient has the right floor, and reals divide faster
+            # for integers below 2^53 the rounded quotient has the right floor, and floats divide faster
             shares *= unit
             shares /= of_each + 1
             np.floor(shares, out=shares)
@@ -82,15 +82,15 @@ class Activity:
 
 
 def activity_bounds(activity: np.ndarray, count: int) -> np.ndarray:
-    """[count - 1]: the activities at which all classes but the first begin, for classes of about equal size of places
-    with this activity [n]."""
+    """Returns the activities [count - 1] at which all classes but the first begin, so that places with this activity
+    [n] form classes of about equal size."""
     at = np.arange(1, count) * len(activity) // count
     bounds: np.ndarray = np.sort(activity)[at]  # a tenth of the time of np.partition
     return bounds
 
 
 def classes_within(activity: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-    """uint8 [n]: classes of places by their activity [n] and the bounds of `activity_bounds`."""
+    """Returns the classes uint8 [n] of places by their activity [n] and the bounds of `activity_bounds`."""
     classes = np.zeros(len(activity), np.uint8)
     for bound in bounds:  # at most 7: a search would take several times as long
         classes += (activity >= bound).view(np.uint8)
@@ -98,7 +98,7 @@ def classes_within(activity: np.ndarray, bounds: np.ndarray) -> np.ndarray:
 
 
 def activity_classes(activity: np.ndarray, count: int) -> np.ndarray:
-    """uint8 [n] in 0..count-1: classes of about equal size of places by their activity [n]."""
+    """Returns classes uint8 [n], 0..count-1, of about equal size of places by their activity [n]."""
     return classes_within(activity, activity_bounds(activity, count))
 
 
@@ -114,18 +114,18 @@ class Places:
 
     @staticmethod
     def whole(n: int) -> Places:
-        """All n places, in one class."""
+        """Returns all n places in one class."""
         return Places(slice(None), (n,))
 
     @staticmethod
     def by(classes: np.ndarray, count: int) -> Places:
-        """Places by classes int [n] in 0..count-1, with count below 256; classes may be empty."""
-        classes = classes.astype(np.uint8, copy=False)  # bytes are sorted by counting
+        """Returns places by classes int [n] in 0..count-1, with count below 256; classes may be empty."""
+        classes = classes.astype(np.uint8, copy=False)  # numpy sorts bytes by counting
         sizes = tuple(np.bincount(classes, minlength=count).tolist())
         return Places(np.argsort(classes, kind="stable"), sizes)
 
     def parts(self, channels: np.ndarray) -> Iterator[np.ndarray]:
-        """The coded parts of channels [m, n]: of each channel in turn, each class."""
+        """Yields the coded parts of channels [m, n]: for each channel in turn, each class."""
         for channel in channels:
             ordered, end = channel[self.order], 0
             for size in self.sizes:
@@ -133,7 +133,7 @@ class Places:
                 end += size
 
     def put(self, coded: np.ndarray, channels: np.ndarray) -> None:
-        """Put the concatenated `parts` of channels [m, n] into them."""
+        """Write the concatenated `parts` back into channels [m, n]."""
         rows = coded.reshape(len(channels), -1)
         if isinstance(self.order, slice):
             channels[:, self.order] = rows
@@ -149,7 +149,7 @@ Group = tuple[np.ndarray, Places]
 
 
 def parts_of(groups: Iterable[Group]) -> list[np.ndarray]:
-    """The channels that a stage codes."""
+    """Returns the channels that a stage codes."""
     return [part for channels, places in groups for part in places.parts(channels)]
 
 
@@ -180,10 +180,10 @@ def smaller_form(
     effort: int,
     known: Sequence[Fitted] = (),
 ) -> tuple[CodedSection, float]:
-    """(section, sum of R(a) over all channels): plain, or the result of `staged` if that is shorter.
+    """Returns (section, sum of R(a) over all channels): plain, or the result of `staged` if that is shorter.
 
-    channels: returns the int32 channels at each call. The form is plain with priors "gauss", the model of R(a), at
-    effort 1, and without `staged`. known: priors that the plain form may refer to.
+    channels: returns the int32 channels at each call. The form is always plain with priors "gauss", at effort 1, and
+    without `staged`. known: priors that the plain form may refer to.
     """
     found = list[CodedSection]()
     if staged is not None and priors == "best" and effort > 1:
@@ -203,8 +203,8 @@ def coded_stages(
     effort: int,
     known: Iterable[Sequence[Fitted]] | None = None,
 ) -> CodedSection:
-    """`front`, the lengths of all stages but the last, and their payloads. stages: taken one by one. known: by stage
-    the priors that it may refer to."""
+    """Codes stages to a section: `front`, the payload lengths of all stages but the last, and the payloads.
+    stages: consumed one by one. known: priors that each stage may refer to."""
     out = bytearray(front)
     pairs = zip(stages, repeat(()) if known is None else known, strict=known is not None)
     coded = [encode_channels(stage, effort=effort, known=k) for stage, k in pairs]
@@ -214,7 +214,7 @@ def coded_stages(
 
 
 def read_class_count(reader: ByteReader, stage: int) -> int:
-    """A number of classes, 1..MAX_CLASSES."""
+    """Reads a number of classes, 1..MAX_CLASSES. Raises Malformed or LimitExceeded."""
     count = reader.varint(MAX_CLASSES, f"the number of classes of stage {stage}")
     if not count:
         raise Malformed(f"stage {stage} has 0 classes, expected 1..{MAX_CLASSES}")
@@ -224,8 +224,8 @@ def read_class_count(reader: ByteReader, stage: int) -> int:
 def read_stages(
     reader: ByteReader, number: int, groups: Iterator[list[Group]], known: Sequence[list[Prior]] | None = None
 ) -> None:
-    """Decode `number` stages. groups: yields the targets of each stage once those before are decoded. known: by stage
-    the priors of the slices before, to which its own are appended."""
+    """Decode `number` stages. groups: yields the targets of a stage once all earlier stages are decoded. known: priors
+    of earlier slices by stage, to which new ones are appended."""
     lengths = [reader.varint(reader.remaining, f"the length of stage {stage}") for stage in range(number - 1)]
     rest = reader.rest()
     if sum(lengths) > len(rest):

@@ -17,7 +17,7 @@ from pd4dgs_codec.scene import Deformation, Grading, Scene, SceneInfo, Steps, Wi
 
 @dataclass(frozen=True, eq=False)
 class LayerSymbols:
-    """The content of a layer, or of one slice of it; later slices have anchors with masks and attributes alone.
+    """The content of a layer, or of one slice of it; later slices have only anchors with masks and attributes.
 
     widths: of the anchors. anchor_q: int32 [n, 3] voxel indices of its own anchors, in Morton order. mask_increase:
     int32 [rows before] rise of the earlier anchors' mask codes. mask_own: int32 [n] codes of its own anchors. classes:
@@ -41,7 +41,7 @@ class LayerSymbols:
         return own + [array for *_, array in arrays_of(self.tensors, self.kind)]
 
     def bits_per_row(self) -> np.ndarray:
-        """float64 [n]: about the bits that each anchor takes, by the frequencies of its symbols in their channels."""
+        """Estimates the bits of each anchor, float64 [n], from the frequencies of its symbols in their channels."""
         n = len(self.anchor_q)
         bits = np.full(n, 3.0 * max(n, 2).bit_length())  # of a position
         for channel in (self.mask_own, *self.attributes):
@@ -51,7 +51,7 @@ class LayerSymbols:
 
 
 def layer_symbols(scene: Scene, index: int) -> LayerSymbols:
-    """The symbols of scene.layers[index]. Raises EncodeError for a value that has no symbol."""
+    """Returns the symbols of scene.layers[index]. Raises EncodeError for a value that has no symbol."""
     kind = LAYER_KINDS[scene.layers[index]]
     first, last = (scene.rows[index - 1] if index else 0), scene.rows[index]
     codes = scene.mask[index].astype(np.int32)
@@ -71,7 +71,7 @@ def layer_symbols(scene: Scene, index: int) -> LayerSymbols:
 
 
 def merged(slices: Sequence[LayerSymbols]) -> LayerSymbols:
-    """The layer that consists of these slices, in order from its first one."""
+    """Returns the layer that consists of these slices, in order from its first one."""
     if len(slices) == 1:
         return slices[0]
     anchor_q = np.concatenate([part.anchor_q for part in slices])
@@ -86,7 +86,7 @@ def merged(slices: Sequence[LayerSymbols]) -> LayerSymbols:
 
 
 def sliced(layer: LayerSymbols, rows: np.ndarray, first: bool) -> LayerSymbols:
-    """A slice of a layer with the anchors `rows` int64 [n]. first: it also carries the rest of the layer."""
+    """Returns a slice with the anchors `rows` int64 [n] of a layer. first: whether it carries the layer's rest too."""
     rows = rows[morton_order(layer.anchor_q[rows])]
     part = layer if first else replace(layer, mask_increase=layer.mask_increase[:0], tensors=NOTHING, steps={})
     return replace(
@@ -108,7 +108,7 @@ class SceneSymbols:
 
     @staticmethod
     def of(scene: Scene) -> SceneSymbols:
-        """The symbols of a planned scene. Raises EncodeError for a value that has none."""
+        """Returns the symbols of a planned scene. Raises EncodeError for a value that has no symbol."""
         return SceneSymbols(scene.info, Grid.of(scene), [layer_symbols(scene, i) for i in range(len(scene.layers))])
 
     @property
@@ -117,7 +117,7 @@ class SceneSymbols:
         return Steps(**self.grid.steps, **{name: q for layer in self.layers for name, q in layer.steps.items()})
 
     def blocks(self) -> Iterator[tuple[slice, np.ndarray, dict[str, np.ndarray]]]:
-        """(rows of the scene, their step classes, their attributes float32 [n, ...] by name), a few rows at a time."""
+        """Yields (rows of the scene, step classes, attributes float32 [n, ...] by name), a few rows at a time."""
         first = 0
         for layer in self.layers:
             for rows in row_blocks(len(layer.anchor_q)):
@@ -127,7 +127,7 @@ class SceneSymbols:
             first += len(layer.anchor_q)
 
     def scene(self) -> Scene:
-        """The dequantised scene (clause 11.5)."""
+        """Returns the dequantised scene (clause 11.5)."""
         grown = GrowingScene(self.info, self.grid)
         for layer in self.layers:
             grown.add(layer)
@@ -135,7 +135,7 @@ class SceneSymbols:
 
 
 def float_tensors(scene: Scene, index: int) -> list[np.ndarray]:
-    """The float32 arrays of scene.layers[index] alone: positions, attributes, planes, networks, in coding order."""
+    """Returns the float32 arrays of scene.layers[index] alone: positions, attributes, planes, then networks."""
     kind = LAYER_KINDS[scene.layers[index]]
     own = slice(scene.rows[index - 1] if index else 0, scene.rows[index])
     attributes = [values[own] for values in scene.attributes.values()]
@@ -146,8 +146,8 @@ def float_tensors(scene: Scene, index: int) -> list[np.ndarray]:
 
 
 class _Column:
-    """An array [n, ...] that grows at its end, by a quarter: copies cost little beside decoding. What `give` returned
-    stays as it is."""
+    """An array [n, ...] that grows at its end. Its room grows by a quarter, so that copies take little of the time of
+    decoding. Arrays that `give` returned keep their values."""
 
     def __init__(self, dtype: type, *shape: int):
         self._room: np.ndarray = np.empty((0, *shape), dtype)
@@ -159,12 +159,12 @@ class _Column:
         return self._room[: self.size]
 
     def give(self) -> np.ndarray:
-        """`values`, to be held."""
+        """Returns `values` for a caller that keeps them."""
         self._given = self.size
         return self.values
 
     def grow(self, n: int) -> np.ndarray:
-        """n further rows, to be written."""
+        """Appends n rows and returns them, to be written."""
         end = self.size + n
         if end > len(self._room):
             room = np.empty((max(end, len(self._room) * 5 // 4), *self._room.shape[1:]), self._room.dtype)
@@ -174,7 +174,7 @@ class _Column:
         return self._room[first:end]
 
     def reorder(self, first: int, order: np.ndarray) -> None:
-        """Sort the rows from `first` on, in a copy if others hold one of them."""
+        """Reorder the rows from `first` on, in a copy if `give` returned any of them."""
         values = self.values
         if self._given <= first:
             values[first:] = values[first:][order]
@@ -185,10 +185,10 @@ class _Column:
 
 
 class GrowingScene:
-    """The dequantised scene of the slices so far: each is added once, whatever was read before.
+    """The dequantised scene of the slices so far. Each slice is dequantised only once.
 
-    The rows of a layer stand in the order in which they came until it is whole, or `sort` is called; then in that of
-    clause 12.2.
+    The rows of a layer are in order of arrival until the next layer begins or `sort` is called, and then in the order
+    of clause 12.2.
     """
 
     def __init__(self, info: SceneInfo, grid: Grid):
@@ -204,7 +204,7 @@ class GrowingScene:
         self._centre = grid.centre_values
 
     def add(self, part: LayerSymbols, first: bool = True) -> None:
-        """Add a slice. first: of its layer."""
+        """Add a slice. first: whether it is the first one of its layer."""
         n, layer = len(part.anchor_q), part.kind.layer
         if first:
             self.sort()
@@ -225,7 +225,7 @@ class GrowingScene:
                 rows[name][at] = x
 
     def sort(self) -> None:
-        """Put the rows of the layer in progress in order."""
+        """Sort the rows of the layer in progress by Morton order."""
         if self._sorted:
             return
         order = morton_order(self._columns["anchor_q"].values[self._first :])
@@ -240,7 +240,7 @@ class GrowingScene:
         return self._masks[-1].values if self._masks else np.zeros(0, np.uint8)
 
     def scene(self, writeable: bool = True) -> Scene:
-        """The scene so far, at least one slice. Scenes share their arrays: let no two of them be written to."""
+        """Returns the scene so far, of at least one slice. Scenes share their arrays: write to at most one of them."""
         arrays = {name: column.give() for name, column in self._columns.items()}
         masks = tuple(column.give() for column in self._masks)
         for array in (*arrays.values(), *masks):
@@ -290,7 +290,7 @@ class TakenVoxels:
         self._runs = list[np.ndarray]()  # ascending keys, each run more than twice as long as the next
 
     def take(self, anchor_q: np.ndarray) -> None:
-        """Add voxels int32 [n, 3], which differ among themselves. Raises Malformed if one is taken."""
+        """Add distinct voxels int32 [n, 3]. Raises Malformed if one of them is taken already."""
         keys = np.sort(_voxel_keys(anchor_q))
         for run in self._runs:
             taken = np.flatnonzero(run[np.minimum(np.searchsorted(run, keys), run.size - 1)] == keys)
@@ -302,17 +302,17 @@ class TakenVoxels:
 
 
 def first_duplicate(anchor_q: np.ndarray) -> list[int] | None:
-    """A voxel [x, y, z] that occurs more than once in anchor_q [N, 3], all within ±MAX_VOXEL, or None."""
-    keys = np.sort(_voxel_keys(anchor_q), kind="stable")  # layers are sorted already, if by another key
+    """Returns a voxel [x, y, z] that occurs more than once in anchor_q [N, 3], all within ±MAX_VOXEL, or None."""
+    keys = np.sort(_voxel_keys(anchor_q), kind="stable")  # fast: layers are already sorted, by another key
     same = np.flatnonzero(keys[1:] == keys[:-1])
     return _voxel_of(keys[same[0]]) if same.size else None
 
 
-_SIDE = 2 * MAX_VOXEL + 1  # its third power is just below 2**64
+_SIDE = 2 * MAX_VOXEL + 1  # its third power is below 2**64
 
 
 def _voxel_keys(anchor_q: np.ndarray) -> np.ndarray:
-    """uint64 [N]: a distinct number for each voxel int [N, 3]."""
+    """Returns a distinct number, uint64 [N], for each voxel int [N, 3]."""
     x, y, z = (anchor_q.T.astype(np.int64) + MAX_VOXEL).astype(np.uint64)
     keys: np.ndarray = (x * np.uint64(_SIDE) + y) * np.uint64(_SIDE) + z
     return keys
