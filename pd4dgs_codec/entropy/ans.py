@@ -52,7 +52,7 @@ def models_of_each(cums: np.ndarray, sizes: np.ndarray) -> list[Model | None]:
 
 
 def ans_encode(channels: Sequence[np.ndarray], cums: Sequence[np.ndarray]) -> bytes:
-    """Encode channels (int, 1-D, symbols 0 .. n - 1) in order, each under its own table cum [n + 1].
+    """Encodes channels (int, 1-D, symbols 0 .. n - 1) in order, each under its own table cum [n + 1].
 
     A channel whose table has one symbol costs nothing. Raises EncodeError for a bad symbol, Malformed for a bad table.
     """
@@ -96,7 +96,7 @@ class AnsDecoder:
         return symbols
 
     def finish(self) -> None:
-        """Raise Malformed unless exactly the stream's symbols have been taken: state 0 and no words left.
+        """Raises Malformed unless exactly the stream's symbols have been taken: state 0 and no words left.
 
         This finds nearly every damaged stream, not all: state 0 is a fixed point that yields first symbols for ever, so
         a cut stream can end in it too. Only the chunk's length and CRC-32 guarantee complete bytes.

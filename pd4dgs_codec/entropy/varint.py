@@ -7,7 +7,7 @@ VARINT_MAX = (1 << 7 * _MAX_BYTES) - 1
 
 
 def put_varint(out: bytearray, value: int) -> None:
-    """Append value (0 <= value < 2**35)."""
+    """Appends value (0 <= value < 2**35)."""
     while value >= 0x80:
         out.append(value & 0x7F | 0x80)
         value >>= 7
@@ -15,7 +15,7 @@ def put_varint(out: bytearray, value: int) -> None:
 
 
 def put_zigzag(out: bytearray, value: int) -> None:
-    """Append a signed value: 0, -1, 1, -2, ... become 0, 1, 2, 3, ..."""
+    """Appends a signed value: 0, -1, 1, -2, ... become 0, 1, 2, 3, ..."""
     put_varint(out, 2 * value if value >= 0 else -2 * value - 1)
 
 

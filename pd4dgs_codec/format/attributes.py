@@ -407,7 +407,7 @@ def read_attributes(
 
 
 def _restore(symbols: np.ndarray, terms: Sequence[Terms]) -> None:
-    """Turn residuals int32 [channels, n] into symbols in place. Raises Malformed if one is over K_MAX."""
+    """Turns residuals int32 [channels, n] into symbols in place. Raises Malformed if one is over K_MAX."""
     predicted = [(c, term) for c, term in enumerate(terms, start=1) if term.channels.size]
     reach = max([term.reach for _, term in predicted], default=0)
     for rows in _row_blocks(symbols) if predicted else ():
@@ -436,7 +436,7 @@ def _read_classes(reader: ByteReader, rows: int) -> np.ndarray:
 
 
 def check_classes(classes: np.ndarray) -> None:
-    """Raise Malformed unless classes int32 [n] are in 0..MAX_CLASS."""
+    """Raises Malformed unless classes int32 [n] are in 0..MAX_CLASS."""
     if classes.size and not (0 <= classes.min() and classes.max() <= MAX_CLASS):
         raise Malformed(f"step classes in {int(classes.min())}..{int(classes.max())}, expected 0..{MAX_CLASS}")
 

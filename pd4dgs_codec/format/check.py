@@ -25,7 +25,7 @@ _TIES = 2.0**-29
 
 
 def check_scene(scene: Scene) -> None:
-    """Raise EncodeError unless `scene` has the shapes, dtypes and ranges that scene.Scene documents."""
+    """Raises EncodeError unless `scene` has the shapes, dtypes and ranges that scene.Scene documents."""
     layers, rows = scene.layers, scene.rows
     expect(layers[:1] == (0,) and set(layers) <= {0, 1, 2}, f"layers {layers}, expected 0 first and none but 0, 1, 2")
     expect(all(a < b for a, b in pairwise(layers)), f"layers {layers}, expected ascending numbers")

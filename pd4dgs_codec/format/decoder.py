@@ -83,7 +83,7 @@ class LayerReader:
         self._scene = GrowingScene(header.info, header.grid)
 
     def _read_chunk(self, data: bytes | bytearray, start: int) -> LayerSymbols | None:
-        """Read the next chunk: a slice, or None for an ancillary chunk."""
+        """Reads the next chunk: a slice, or None for an ancillary chunk."""
         assert self.header is not None
         offset, (kind_of, length) = self.offset, self.header.chunks[self._index]
         place = {"type": kind_of, "length": length, "index": self._index, "start": start}
@@ -108,7 +108,7 @@ class LayerReader:
         return part
 
     def _check_place(self, chunk: Chunk, layer: int) -> None:
-        """Raise Malformed unless the slice's flags fit its place (clause 3.6)."""
+        """Raises Malformed unless the slice's flags fit its place (clause 3.6)."""
         expected, message = self._number + 1 if layer == self._layer else 0, ""
         following = self._following[self._index + 1]
         if chunk.slice != expected:
@@ -249,13 +249,13 @@ class Stream:
         return self._reader.scene.scene(writeable=False)
 
     def finish(self) -> None:
-        """End the stream: raises the pending fault, or Truncated if a chunk is missing."""
+        """Ends the stream: raises the pending fault, or Truncated if a chunk is missing."""
         if self._error is not None:
             raise self._error
         self._next()
 
     def rewind(self) -> None:
-        """Forget a fault and all bytes not yet decoded. Then feed the file from byte `consumed` on."""
+        """Forgets a fault and all bytes not yet decoded. Then feed the file from byte `consumed` on."""
         self._buffer, self._needs, self._error = bytearray(), 0, None
 
     def _next(self) -> LayerSymbols | None:

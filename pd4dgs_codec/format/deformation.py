@@ -91,7 +91,7 @@ def layer_steps(steps: Steps, kind: LayerKind, tensors: Deformation) -> dict[str
 
 
 def check_tensors(tensors: Deformation, kind: LayerKind, widths: Widths, below: Deformation | None = None) -> None:
-    """Raise EncodeError unless planes and networks of a layer have the shapes and dtypes that scene.Deformation and
+    """Raises EncodeError unless planes and networks of a layer have the shapes and dtypes that scene.Deformation and
     Widths document, and finite values. below: the deformation of the layer below."""
     own, required = kind.name, (TRUNK,) if kind.layer else tuple(kind.network_ids)
     unknown = [name for name in tensors.networks if name not in kind.network_ids]

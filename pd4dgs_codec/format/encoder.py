@@ -242,8 +242,8 @@ def _container(
 
 
 def _check_file(data: bytes, fingerprints: list[bytes]) -> None:
-    """Decode `data`, check its header and compare its layers with the fingerprints. Without fingerprints, only read the
-    header and the parameters of all slices to check the format's limits. Raises EncodeError."""
+    """Decodes `data`, checks its header and compares its layers with the fingerprints. Without fingerprints, reads only
+    the header and the parameters of all slices, to check the format's limits. Raises EncodeError."""
     try:
         if not fingerprints:
             info(data)

@@ -113,7 +113,7 @@ def read_parameters(
 
 
 def _check_declared(total: Declared, where: str) -> None:
-    """Raise LimitExceeded if the slices so far are too short for what they declare (clause 6.5)."""
+    """Raises LimitExceeded if the slices so far are too short for what they declare (clause 6.5)."""
     for what, found, free, per_byte in (
         ("anchors", total.rows, FREE_ROWS, ROWS_PER_BYTE),
         ("symbols", total.symbols, FREE_SYMBOLS, SYMBOLS_PER_BYTE),
@@ -267,7 +267,7 @@ class _Sections:
         return self._parts.pop(section, b"")
 
     def check_empty(self) -> None:
-        """Raise Malformed if a section has not been taken."""
+        """Raises Malformed if a section has not been taken."""
         if self._parts:
             where = f"layer {self._kind.layer}: section {min(self._parts)}"
             raise Malformed(f"{where} is there, but nothing is left for it to code")

@@ -106,7 +106,7 @@ def restore(planes: Sequence[tuple[int, Array]]) -> list[Array]:
 
 
 def _scan(planes: Sequence[Array]) -> list[Array]:
-    """Undo the median on int32 [C, H, W] along anti-diagonals: all cells with equal i + j are independent.
+    """Undoes the median on int32 [C, H, W] along anti-diagonals: all cells with equal i + j are independent.
 
     Planes are scanned in groups in which none has more than twice the diagonals of another. So there are at most
     4 (H + W) steps, of the largest plane, whatever the number of planes, and memory is linear in the cells.

@@ -26,13 +26,13 @@ Integers = np.ndarray | int
 
 
 def expect(ok: bool, message: str) -> None:
-    """Raise EncodeError with this message unless `ok`."""
+    """Raises EncodeError with this message unless `ok`."""
     if not ok:
         raise EncodeError(message)
 
 
 def expect_array(name: str, a: np.ndarray, dtype: type, shape: tuple[int, ...]) -> None:
-    """Raise EncodeError unless an array has this dtype, this shape and finite values."""
+    """Raises EncodeError unless an array has this dtype, this shape and finite values."""
     expect(a.dtype == dtype and a.shape == shape, f"{name}: {a.dtype} {a.shape}, expected {np.dtype(dtype)} {shape}")
     if a.dtype.kind == "f":
         expect(bool(np.isfinite(a).all()), f"{name}: a value is NaN or infinite")

@@ -55,7 +55,7 @@ class Activity:
         return self._total
 
     def add(self, residuals: np.ndarray, times: int = 1) -> None:
-        """Add channels int [m, n], each `times` times."""
+        """Adds channels int [m, n], each `times` times."""
         step = max(1, SHARES // max(1, residuals.shape[1]))
         for first in range(0, len(residuals), step):
             self._add(residuals[first : first + step], times)
@@ -133,7 +133,7 @@ class Places:
                 end += size
 
     def put(self, coded: np.ndarray, channels: np.ndarray) -> None:
-        """Write the concatenated `parts` back into channels [m, n]."""
+        """Writes the concatenated `parts` back into channels [m, n]."""
         rows = coded.reshape(len(channels), -1)
         if isinstance(self.order, slice):
             channels[:, self.order] = rows
@@ -224,7 +224,7 @@ def read_class_count(reader: ByteReader, stage: int) -> int:
 def read_stages(
     reader: ByteReader, number: int, groups: Iterator[list[Group]], known: Sequence[list[Prior]] | None = None
 ) -> None:
-    """Decode `number` stages. groups: yields the targets of a stage once all earlier stages are decoded. known: priors
+    """Decodes `number` stages. groups: yields the targets of a stage once all earlier stages are decoded. known: priors
     of earlier slices by stage, to which new ones are appended."""
     lengths = [reader.varint(reader.remaining, f"the length of stage {stage}") for stage in range(number - 1)]
     rest = reader.rest()

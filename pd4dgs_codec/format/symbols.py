@@ -174,7 +174,7 @@ class _Column:
         return self._room[first:end]
 
     def reorder(self, first: int, order: np.ndarray) -> None:
-        """Reorder the rows from `first` on, in a copy if `give` returned any of them."""
+        """Reorders the rows from `first` on, in a copy if `give` returned any of them."""
         values = self.values
         if self._given <= first:
             values[first:] = values[first:][order]
@@ -204,7 +204,7 @@ class GrowingScene:
         self._centre = grid.centre_values
 
     def add(self, part: LayerSymbols, first: bool = True) -> None:
-        """Add a slice. first: whether it is the first one of its layer."""
+        """Adds a slice. first: whether it is the first one of its layer."""
         n, layer = len(part.anchor_q), part.kind.layer
         if first:
             self.sort()
@@ -225,7 +225,7 @@ class GrowingScene:
                 rows[name][at] = x
 
     def sort(self) -> None:
-        """Sort the rows of the layer in progress by Morton order."""
+        """Sorts the rows of the layer in progress by Morton order."""
         if self._sorted:
             return
         order = morton_order(self._columns["anchor_q"].values[self._first :])
@@ -264,7 +264,7 @@ class GrowingScene:
 
 
 def check_slice(layer: LayerSymbols, before: np.ndarray, voxel_size: float, grid: Grid) -> None:
-    """Check a slice against the header and the mask codes before it, uint8 [rows before].
+    """Checks a slice against the header and the mask codes before it, uint8 [rows before].
 
     Raises Malformed if a mask code is above 255, an attribute lies too many steps from 0, or a dequantised value would
     not be finite.
@@ -290,7 +290,7 @@ class TakenVoxels:
         self._runs = list[np.ndarray]()  # ascending keys, each run more than twice as long as the next
 
     def take(self, anchor_q: np.ndarray) -> None:
-        """Add distinct voxels int32 [n, 3]. Raises Malformed if one of them is taken already."""
+        """Adds distinct voxels int32 [n, 3]. Raises Malformed if one of them is taken already."""
         keys = np.sort(_voxel_keys(anchor_q))
         for run in self._runs:
             taken = np.flatnonzero(run[np.minimum(np.searchsorted(run, keys), run.size - 1)] == keys)
