@@ -25,7 +25,7 @@ _U32 = np.dtype("<u4")
 _INVALID = f"a frequency table does not ascend from 0 to {TOTAL}"
 
 
-#: A table in constriction. Its own rounding has scale exactly 1 for frequencies less one and reproduces the integers.
+#: constriction's model of a table. Given frequencies less one, its rounding has scale exactly 1 and restores the table.
 Model: TypeAlias = constriction.stream.model.Categorical
 
 
@@ -38,7 +38,7 @@ def model_of(cum: np.ndarray) -> Model | None:
 
 
 def models_of_each(cums: np.ndarray, sizes: np.ndarray) -> list[Model | None]:
-    """Returns `model_of` each of the concatenated tables, int64 [sum of (size + 1)], in one pass."""
+    """Returns the models of concatenated tables int64 [sum of (size + 1)] in one pass; see `model_of`."""
     ends = np.cumsum(sizes + 1)
     firsts = ends - sizes - 1
     frequencies = np.zeros(len(cums))  # the last number belongs to no table; junk there could make numpy warn

@@ -1,4 +1,4 @@
-"""Encoder: finds the cheapest prior for each channel, and priors for several channels. Nothing here is normative.
+"""Encoder: finds the cheapest prior for each channel, and priors that channels share. Nothing here is normative.
 
 Costs are in units of 2^-20 bits and exact, from the integer table and the prior's description; only the cost of
 exceptions is an estimate. Files are the same with and without numba.
@@ -107,7 +107,7 @@ def costs_of(histograms: Sequence[Histogram], priors: Sequence[Fitted]) -> np.nd
 
 
 def fit_gauss(h: Histogram) -> Fitted:
-    """The cheapest of const and gauss, over several windows."""
+    """Fits const and Gaussian priors in several windows; returns the cheapest."""
     if len(h.values) == 1:
         return _const(h, 0)
     candidates = [_fit_gauss_in(h, w) for w in _windows(h)]
@@ -118,7 +118,7 @@ def fit_gauss(h: Histogram) -> Fitted:
 
 
 def fit_best(h: Histogram, effort: int) -> Fitted:
-    """The cheapest of all priors, on the Gaussian's best window."""
+    """Fits priors of all families in the Gaussian's best window; returns the cheapest."""
     found = h.gauss
     if found.prior.window.n == 1:
         return found

@@ -58,7 +58,7 @@ def decode_channels_lzma(payload: bytes | memoryview, counts: Sequence[int]) -> 
 
 
 def _narrowest(low: int, high: int) -> tuple[int, int]:
-    """Returns (base, log2(width)) of the narrowest width; base is 0 if that takes no wider numbers."""
+    """Returns (base, log2(width)) of the narrowest width; base is 0 if numbers without a base fit that width."""
     for log_width, limit in enumerate((1 << 7, 1 << 15)):
         if -limit <= low and high < limit:
             return 0, log_width

@@ -181,7 +181,7 @@ def write_attributes(
     past: Past[Fitted] | None = None,
     population: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> tuple[bytes, float]:
-    """Writes the smaller form; returns (section bytes, R(a) in bits of all channels by step class, plus the classes).
+    """Writes the smaller form: (section bytes, bits of R(a) of all channels by step class and of the step classes).
 
     attributes: int32 [channels, n]. classes: int32 [n], or NO_CLASSES. past: state of the layer's earlier slices, to
     which this one is added. population: (attributes, classes) of all slices that will use the block, which is fitted to

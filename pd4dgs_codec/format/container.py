@@ -94,7 +94,7 @@ def read_preamble(data: Buffer) -> Preamble:
 
     Raises BadSignature, Truncated, UnsupportedVersion (the major version), LimitExceeded or ChecksumMismatch.
     """
-    with memoryview(data) as view:  # released: kept by an error's traceback, it would fix a buffer's size
+    with memoryview(data) as view:  # an open view in a traceback would keep a stream's buffer from growing
         start = bytes(view[: len(SIGNATURE)])
         if not SIGNATURE.startswith(start):
             raise BadSignature(

@@ -53,8 +53,7 @@ class LayerReader:
         """Returns the next slice of a layer <= max_layer that ends within the first max_bytes (clause 12), or None.
 
         start: offset of `data` in the file, at most `offset`. Raises Truncated if `data` ends before the slice does; a
-        call with more bytes can then go on. Raises Malformed if bytes follow the last chunk of a file that is read
-        without either limit.
+        call with more bytes can then go on. Raises Malformed if neither limit is given and bytes follow the last chunk.
         """
         if self.header is None:
             preamble = read_preamble(data)
@@ -175,7 +174,7 @@ def decode(
     bytes are ignored.
 
     A cut file raises Truncated, unless allow_partial is set and the file holds at least one slice: then its longest
-    valid prefix of slices is decoded. Other faults raise other subclasses of DecodeError.
+    valid prefix of slices is decoded. Other faults raise other DecodeErrors; max_layer < 0 raises ValueError.
     """
     return decode_partial(data, max_layer=max_layer, max_bytes=max_bytes, allow_partial=allow_partial)[0]
 

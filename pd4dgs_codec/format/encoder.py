@@ -189,7 +189,7 @@ def _write_slices(layer: LayerSymbols, options: EncodeOptions, utility: np.ndarr
     except in layer 0, where a picture needs some.
     """
     rows = np.argsort(-utility, kind="stable")
-    costs = np.cumsum([0.0, *layer.bits_per_row()[rows]]) / 8  # of the first 0, 1, .. rows
+    costs = np.cumsum([0.0, *layer.bits_per_row()[rows]]) / 8  # bytes of the first 0, 1, .. rows
     done, found, past = 0, list[_Slice](), Past[Fitted]()
     scale = 1.0  # bytes that a slice takes per byte expected
     while done < len(rows) or not found:

@@ -22,7 +22,7 @@ def info(data: bytes) -> dict[str, Any]:
 
     layers: {layer, offset, bytes, end, slices}; bytes counts whole chunks, and end is the length of the prefix with
     layers 0 .. this one. Layers that `data` holds whole also have anchors, steps, planes ([C, x, y, z, t] per scale),
-    networks (output widths) and sections (bytes by name, without the chunks' frames and parameters).
+    networks (output widths), key_instant if any, and sections (bytes by name, without frames and parameters).
     slices: {offset, bytes, end}, and anchors if `data` holds the slice whole.
     metadata: {title, source, licence, command, quality, slices, still_bytes} as far as given, {"fault"} if it cannot be
     read, None if `data` holds no metadata chunk. Raises DecodeError.

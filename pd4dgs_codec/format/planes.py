@@ -109,7 +109,7 @@ def _scan(planes: Sequence[Array]) -> list[Array]:
     """Undoes the median on int32 [C, H, W] along anti-diagonals: all cells with equal i + j are independent.
 
     Planes are scanned in groups in which none has more than twice the diagonals of another. So there are at most
-    4 (H + W) steps, of the largest plane, whatever the number of planes, and memory is linear in the cells.
+    4 (H + W) steps, with the largest plane's H and W, for any number of planes, and memory is linear in the cells.
     """
     result = list(planes)
     order = sorted(range(len(planes)), key=lambda i: -sum(planes[i].shape[1:]))

@@ -21,7 +21,7 @@ class LayerKind:
 
     @property
     def network_ids(self) -> dict[str, int]:
-        """Numbers of the layer's networks in the bitstream, ascending, from the order of the tables in `scene`."""
+        """Numbers of the layer's networks in the bitstream, ascending: the order of the tables in `scene`."""
         names = (TRUNK, *HEADS) if self.layer else SCAFFOLD_NETWORKS
         return {name: number for number, name in enumerate(names)}
 
