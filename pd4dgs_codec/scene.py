@@ -46,7 +46,7 @@ SCAFFOLD_NETWORKS = ("opacity", "covariance", "color")
 
 @dataclass(frozen=True)
 class Widths:
-    """Sizes from which all widths of anchors and networks follow. feature: length D of an anchor's feature. slots:
+    """Sizes from which other widths of anchors and networks follow. feature: length D of an anchor's feature. slots:
     number G of Gaussians per anchor. graded: whether each anchor has a step class. viewing: the scaffold's networks
     that take the view direction as well, in the order of SCAFFOLD_NETWORKS."""
 

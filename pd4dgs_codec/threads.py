@@ -116,7 +116,7 @@ def keep_freed_memory() -> None:
     """Lets glibc reuse large blocks instead of returning each to the system; without glibc it does nothing.
 
     A training step allocates and frees hundreds of megabytes, and the page faults of fresh blocks made element-wise
-    operations several times slower. One-off work gains nothing and takes more memory: encoding a million anchors, 5 %.
+    operations several times slower. One-off work only takes more memory: 5 % for encoding a million anchors.
     """
     mmap_threshold, trim_threshold = -3, -1  # glibc's M_MMAP_THRESHOLD, M_TRIM_THRESHOLD
     try:
