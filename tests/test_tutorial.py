@@ -1,4 +1,4 @@
-"""The tutorial is run as its notebook, with a smaller scene and fewer steps."""
+"""The tutorial is run as its notebook, and the demo, with a smaller scene and fewer steps."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ sys.path.insert(0, str(ROOT / "tools"))
 
 from notebook import cells, notebook  # noqa: E402
 
+DEMO = (ROOT / "tools" / "demo.sh").read_text(encoding="utf-8")
 PAGE = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
 SMALLER = {"synthetic:local": "'synthetic:local?size=64x48&frames=8'", "--max-seconds 150": "--iterations 4"}
 
@@ -58,3 +59,17 @@ def test_the_notebook_has_all_of_the_page():
     plain = re.sub(r"^```(bash|python)\n(.*?)^```\n", r"\2", PAGE, flags=re.MULTILINE | re.DOTALL)
     assert re.sub(r"[!\s]", "", text) == re.sub(r"[!\s]", "", plain)
     assert any("pd4dgs-prepare" in cell["source"] for cell in made["cells"] if cell["cell_type"] == "markdown")
+
+
+def test_the_demo_measures_and_draws_every_level(tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(PRESETS, "tiny", TINY)
+    lines = [line for line in DEMO.splitlines() if line.startswith("pd4dgs-")]
+    for line in lines:
+        small = line.replace("$scene", "synthetic:local?size=48x36&frames=4").replace(
+            "--max-seconds 150", "--iterations 10"
+        )
+        run_command(small)
+    assert "bytes so far" in capfd.readouterr().out
+    made = ("model.pt", "scene.pd4", "levels.png", "levels.gif", "error-time.png")
+    assert len(lines) == 6 and all((tmp_path / name).stat().st_size for name in made)

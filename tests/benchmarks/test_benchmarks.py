@@ -11,7 +11,6 @@ from pathlib import Path
 import browser
 import codec
 import common
-import demo
 import numpy as np
 import page
 import pytest
@@ -222,15 +221,6 @@ def test_other_coders_take_about_the_entropy_of_their_symbols():
     pytest.importorskip("DracoPy")
     cells = np.unique(rng.integers(-50, 50, (3000, 3), dtype=np.int32), axis=0)
     assert 2 * len(cells) < 8 * codec.draco_bytes(cells) < 21 * len(cells)
-
-
-def test_the_demo_writes_all_that_it_names(tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(PRESETS, "tiny", TINY)  # else a busy machine evaluates nothing in these seconds
-    assert demo.main(["--source", QUICK.source, "--max-seconds", "4", "-o", str(tmp_path)]) == 0
-    names = re.findall(r"\S+demo/[\w.-]+", capsys.readouterr().out.replace(",", " "))
-    assert len(names) == 6 and all(Path(name).stat().st_size > 0 for name in names)
-    assert demo.main(["--source", str(tmp_path / "nowhere"), "-o", str(tmp_path)]) == 1
-    assert "demo: error:" in capsys.readouterr().err
 
 
 def test_pictures_of_viewers_say_what_is_missing(monkeypatch, tmp_path):
