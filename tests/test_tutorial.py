@@ -22,9 +22,9 @@ PAGE = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
 SMALLER = {"synthetic:local": "'synthetic:local?size=64x48&frames=8'", "--max-seconds 150": "--iterations 4"}
 
 
-def run_command(line: str) -> None:
-    """A line of the notebook, by the command's own entry point in this process: starting Python anew takes seconds."""
-    for usual, small in SMALLER.items():
+def run_command(line: str, smaller: dict[str, str]) -> None:
+    """A line of a shell with texts replaced, by the command's own entry point: starting Python anew takes seconds."""
+    for usual, small in smaller.items():
         line = line.replace(usual, small)
     name, *argv = shlex.split(line)
     (script,) = entry_points(group="console_scripts", name=name)
@@ -41,7 +41,7 @@ def test_the_tutorial_runs_from_the_first_cell_to_the_last(tmp_path, monkeypatch
     for source in code:
         if source.startswith("!"):
             for line in source.split("\n"):
-                run_command(line[1:])
+                run_command(line[1:], SMALLER)
         else:
             exec(compile(source, "docs/tutorial.md", "exec"), names)
         shown.append("".join(capfd.readouterr()))  # a notebook shows both streams
@@ -66,10 +66,7 @@ def test_the_demo_measures_and_draws_every_level(tmp_path, monkeypatch, capfd):
     monkeypatch.setitem(PRESETS, "tiny", TINY)
     lines = [line for line in DEMO.splitlines() if line.startswith("pd4dgs-")]
     for line in lines:
-        small = line.replace("$scene", "synthetic:local?size=48x36&frames=4").replace(
-            "--max-seconds 150", "--iterations 10"
-        )
-        run_command(small)
+        run_command(line, {"$scene": "synthetic:local?size=48x36&frames=4", "--max-seconds 150": "--iterations 10"})
     assert "bytes so far" in capfd.readouterr().out
     made = ("model.pt", "scene.pd4", "levels.png", "levels.gif", "error-time.png")
     assert len(lines) == 6 and all((tmp_path / name).stat().st_size for name in made)
