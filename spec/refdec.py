@@ -22,6 +22,7 @@ K = (1 << 24) - 1  # clause 14: coded symbols
 MAX_SYMBOL = 1 << 23  # clause 14: symbols of attributes, plane samples and weights
 MAX_VOXEL = 1 << 20
 MAX_COUNT = 1 << 26
+MAX_DICTIONARY = 1 << 26
 FREE_ENTRIES, MORE_ENTRIES = 1 << 18, 1 << 10
 VARINT_MAX = (1 << 35) - 1  # clause 7.1: five bytes of seven bits
 TOTAL = 1 << 24
@@ -1029,7 +1030,7 @@ class Lzma:
             place = len(out) - start
             length = self.take_symbol(out, place)
             need(len(out) + length <= end, "a match beyond its chunk")
-            need(not length or self.distances[0] <= place, "a match before the dictionary")
+            need(not length or self.distances[0] <= min(place, MAX_DICTIONARY), "a match before the dictionary")
             for _ in range(length):
                 out.append(out[-self.distances[0]])
         need(self.code == 0, "an LZMA2 chunk does not end in code 0")
