@@ -117,6 +117,16 @@ def _heed_interrupts() -> Iterator[None]:
     signal.signal(signal.SIGINT, before)
 
 
+@pytest.fixture
+def kernel_threads() -> Iterator[Callable[[int], None]]:
+    """Sets the number of threads of kernels until the test ends."""
+    from pd4dgs_codec import threads
+
+    before = threads.kernel_threads()
+    yield threads.set_kernel_threads
+    threads.set_kernel_threads(before)
+
+
 @pytest.fixture(scope="session")
 def once(tmp_path_factory) -> Callable[[str, Callable[[Path], object]], Path]:
     """once(name, make) -> a folder that make(folder) has filled, in one of all workers: what takes seconds to make and

@@ -16,13 +16,7 @@ from pd4dgs_codec.errors import RenderError
 
 ROOT = Path(__file__).parents[1]
 needs_two = pytest.mark.skipif(threads.available() < 2, reason="needs 2 CPUs")
-
-
-@pytest.fixture(autouse=True)
-def _restore_threads():
-    before = threads.kernel_threads()
-    yield
-    threads.set_kernel_threads(before)
+pytestmark = pytest.mark.usefixtures("kernel_threads")
 
 
 def _run(code: str, **variables: str) -> list[str]:
@@ -63,16 +57,21 @@ def test_what_a_share_raises_reaches_the_caller():
         _shared(8, fail_elsewhere)
 
 
-def test_nobody_waits_for_helpers_that_are_busy():
-    go, done = threading.Event(), []
+@pytest.fixture
+def busy(kernel_threads):
+    """All helpers wait for this event, until the test ends."""
+    go = threading.Event()
     for _ in range(threads.available()):
         threads._helpers().submit(go.wait, 60)
-    threads.set_kernel_threads(2)
-    try:
-        _shared(8, done.append)
-        assert len(done) == 8 and not go.is_set()
-    finally:
-        go.set()
+    kernel_threads(2)
+    yield go
+    go.set()
+
+
+def test_nobody_waits_for_helpers_that_are_busy(busy):
+    done = []
+    _shared(8, done.append)
+    assert len(done) == 8 and not busy.is_set()
 
 
 def test_what_takes_little_is_not_shared():
@@ -105,15 +104,9 @@ def test_what_goes_aside_is_done_once_beside_the_caller_where_there_are_threads(
     assert answer() == 7 and done == [count == 1]
 
 
+@pytest.mark.usefixtures("busy")
 def test_what_goes_aside_while_all_threads_are_busy_the_caller_does():
-    go = threading.Event()
-    for _ in range(threads.available()):
-        threads._helpers().submit(go.wait, 60)
-    threads.set_kernel_threads(2)
-    try:
-        assert threads.aside(threading.current_thread)() is threading.main_thread()
-    finally:
-        go.set()
+    assert threads.aside(threading.current_thread)() is threading.main_thread()
 
 
 @pytest.mark.parametrize("count", [1, pytest.param(2, marks=needs_two)])

@@ -8,7 +8,10 @@ from raster_scenes import camera, draw_with_gradients, scene
 
 from pd4dgs_codec import threads
 
-needs_two = pytest.mark.skipif(threads.available() < 2, reason="needs 2 CPUs")
+pytestmark = [
+    pytest.mark.skipif(threads.available() < 2, reason="needs 2 CPUs"),
+    pytest.mark.usefixtures("kernel_threads"),
+]
 
 
 def _draw(count, seed=0):
@@ -20,14 +23,12 @@ def _same(a, b):
     return all(torch.equal(a[k], b[k]) for k in a if k != "meta")
 
 
-@needs_two
 def test_one_and_two_threads_give_the_same_bits():
     one, two, again = _draw(1), _draw(2), _draw(2)
     assert _same(one, two) and _same(two, again)
     assert not _same(one, _draw(1, seed=1))
 
 
-@needs_two
 def test_two_callers_at_once():
     expected = [_draw(2, seed) for seed in (0, 1)]
     results = [[], []]

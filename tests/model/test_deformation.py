@@ -126,17 +126,13 @@ def test_no_points():
 
 @pytest.mark.skipif(threads.available() < 2, reason="needs two CPUs")
 @pytest.mark.parametrize("multires", [(1,), (1, 2)])
-def test_threads(multires):
+def test_threads(multires, kernel_threads):
     """Bitwise repeatable; one scale on two threads is split over points, two scales are not and so equal one thread."""
     plane, points = plane_of(multires=multires, dtype=torch.float32), points_in(501, dtype=torch.float32)
-    before = threads.kernel_threads()
     runs = {}
-    try:
-        for name, count in (("one", 1), ("two", 2), ("again", 2)):
-            threads.set_kernel_threads(count)
-            runs[name] = value_and_gradients(plane, plane(points, 0.3), points)
-    finally:
-        threads.set_kernel_threads(before)
+    for name, count in (("one", 1), ("two", 2), ("again", 2)):
+        kernel_threads(count)
+        runs[name] = value_and_gradients(plane, plane(points, 0.3), points)
     for one, two, again in zip(*runs.values(), strict=True):
         assert torch.equal(two, again)
         assert torch.equal(one, two) if len(multires) == 2 else torch.allclose(one, two, rtol=1e-4, atol=1e-5)

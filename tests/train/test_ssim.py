@@ -98,16 +98,12 @@ def test_nothing_within_reach_is_cropped(differing, masked):
 
 
 @pytest.mark.skipif(threads.available() < 2, reason="needs two CPUs")
-def test_threads_change_nothing():
+def test_threads_change_nothing(kernel_threads):
     image, target, weights = pair(33, 50, masked=True)
-    before = threads.kernel_threads()
     runs = []
-    try:
-        for count in (1, 2):
-            threads.set_kernel_threads(count)
-            runs.append(terms_and_gradient(image_loss(image, target, weights), image))
-    finally:
-        threads.set_kernel_threads(before)
+    for count in (1, 2):
+        kernel_threads(count)
+        runs.append(terms_and_gradient(image_loss(image, target, weights), image))
     assert all(torch.equal(a, b) for a, b in zip(*runs, strict=True))
 
 
