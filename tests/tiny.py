@@ -1,9 +1,11 @@
-"""What costs milliseconds to train, pack and draw: a preset, pictures, scenes in front of a camera, checkpoints."""
+"""What costs milliseconds to train, pack and draw: a preset, pictures, scenes before a camera, checkpoints, a trap."""
 
 from __future__ import annotations
 
 import json
 import math
+import os
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -42,6 +44,14 @@ def camera_ahead(distance: float = 3.0, focal: float = 30.0, width: int = WIDTH,
     viewmat[2, 3] = distance
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32)
     return Camera(viewmat, K, width, height)
+
+
+def camera_around(rng: np.random.Generator) -> Camera:
+    """48 x 36 pixels, from anywhere 8 away from the origin."""
+    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    camera = camera_ahead(8.0, 40.0, 48, 36)
+    camera.viewmat[:3, :3] = rotation * np.sign(np.linalg.det(rotation))
+    return camera
 
 
 # -- datasets ----------------------------------------------------------------------------------------------------------
@@ -110,8 +120,8 @@ def trained_like_scene() -> Scene:
         offset=rng.normal(0, 0.5, (n, 10, 3)).astype(np.float32),
         mask=tuple(np.full(r, 200, np.uint8) for r in rows),
         networks={name: random_network(rng, 35, 16, width) for name, width in Widths().networks.items()},
-        global_deformation=_deformation(rng, key=40_000),
-        local_deformation=_deformation(rng, below=4),
+        global_deformation=random_deformation(rng, Widths().heads, key=40_000),
+        local_deformation=random_deformation(rng, Widths().heads, below=4),
     )
 
 
@@ -131,13 +141,24 @@ def random_network(rng: np.random.Generator, *widths: int, scale: float = 0.3) -
     )
 
 
-def _deformation(rng: np.random.Generator, key: int | None = None, below: int = 0) -> Deformation:
-    reso = (3, 4, 5, 6)
+def random_deformation(
+    rng: np.random.Generator,
+    heads: dict[str, int],
+    resolutions: Sequence[tuple[int, int, int, int]] = ((3, 4, 5, 6),) * 2,
+    *,
+    channels: int = 2,
+    spread: float = 0.3,
+    trunk: tuple[int, ...] = (8, 8),
+    key: int | None = None,
+    below: int = 0,
+) -> Deformation:
+    """Planes of values around 1, and heads that move little. below: features of the planes of the layer below."""
     planes = tuple(
-        {name: rng.normal(1, 0.3, (2, reso[b], reso[a])).astype(np.float32) for name, a, b in PLANES} for _ in range(2)
+        {name: rng.normal(1, spread, (channels, reso[b], reso[a])).astype(np.float32) for name, a, b in PLANES}
+        for reso in resolutions
     )
-    networks = {"trunk": random_network(rng, below + 4, 8, 8)}
-    networks |= {name: random_network(rng, 8, width, scale=0.05) for name, width in Widths().heads.items()}
+    networks = {"trunk": random_network(rng, below + channels * len(resolutions), *trunk)}
+    networks |= {name: random_network(rng, trunk[-1], width, scale=0.05) for name, width in heads.items()}
     return Deformation(planes, networks, key)
 
 
@@ -148,3 +169,13 @@ def checkpoint_of(scene: Scene, path: Path) -> Path:
 
     checkpoint.save(path, from_scene(scene), {"curve": json.dumps(CURVE), "config": json.dumps({"preset": "tiny"})})
     return path
+
+
+class Trap:
+    """Pickles as a call that creates a folder."""
+
+    def __init__(self, target: Path):
+        self.target = target
+
+    def __reduce__(self) -> tuple[object, tuple[str]]:
+        return os.mkdir, (str(self.target),)

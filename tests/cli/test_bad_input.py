@@ -16,7 +16,8 @@ from pathlib import Path
 import pytest
 import torch
 from PIL import Image
-from tiny import write_views
+from strategies import flipped
+from tiny import Trap, write_views
 
 from pd4dgs_codec import encode
 from pd4dgs_codec.__main__ import MODULES
@@ -127,29 +128,19 @@ CASES = [
 ]  # fmt: skip
 
 
-class _Payload:
-    """Pickles as a call that creates a folder."""
-
-    def __init__(self, target: Path):
-        self.target = target
-
-    def __reduce__(self):
-        return os.mkdir, (str(self.target),)
-
-
 @pytest.fixture(scope="module")
 def bad_files(tmp_path_factory, model_pt, scene_pd4, scene):
     """The files that CASES name."""
     folder = tmp_path_factory.mktemp("bad")
     data = scene_pd4.read_bytes()
     (folder / "cut.pd4").write_bytes(data[:-10])
-    (folder / "flipped.pd4").write_bytes(_flip(data, 400))
+    (folder / "flipped.pd4").write_bytes(flipped(data, 400))
     (folder / "blind.pd4").write_bytes(encode(replace(scene, info=replace(scene.info, camera=None)), effort=1))
     for name, value in (("nan", float("nan")), ("inf", float("inf")), ("huge", 1e20)):
         model, _ = checkpoint.load(model_pt)
         model.feature.data[3, 2] = value
         checkpoint.save(folder / f"{name}.pt", model)
-    torch.save({"format": "pd4dgs-checkpoint", "version": 1, "state": _Payload(folder / "ran")}, folder / "evil.pt")
+    torch.save({"format": "pd4dgs-checkpoint", "version": 1, "state": Trap(folder / "ran")}, folder / "evil.pt")
     (folder / "cut.pt").write_bytes(model_pt.read_bytes()[:-200])
     for name in ("kept.npz", "kept.gif", "notes"):
         (folder / name).write_text("precious")
@@ -188,17 +179,13 @@ def test_bad_input(cli, bad_files, model_pt, scene_pd4, shared_dataset, monkeypa
     assert _listing(bad_files) == before
 
 
-def _flip(data: bytes, at: int) -> bytes:
-    return data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]
-
-
 PD4_FAULTS = {
     "empty": (lambda d: b"", "Truncated"),
     "signature only": (lambda d: d[:8], "Truncated"),
     "cut": (lambda d: d[:-1], "Truncated"),
     "not ours": (lambda d: b"PK\x03\x04" + d, "BadSignature"),
-    "header bit": (lambda d: _flip(d, 30), "ChecksumMismatch"),
-    "payload bit": (lambda d: _flip(d, len(d) // 2), "ChecksumMismatch"),
+    "header bit": (lambda d: flipped(d, 30), "ChecksumMismatch"),
+    "payload bit": (lambda d: flipped(d, len(d) // 2), "ChecksumMismatch"),
     "more behind": (lambda d: d + b"x", "Malformed"),
 }
 

@@ -10,7 +10,7 @@ import sys
 from argparse import Namespace
 
 import pytest
-import torch
+from runs import assert_same_weights, read_log
 from tiny import TINY
 
 from pd4dgs_codec import decode, encode
@@ -40,14 +40,6 @@ def train(cli, shared_dataset):
     return call
 
 
-def _state(path) -> dict:
-    return checkpoint.load(path)[0].state_dict()
-
-
-def _same(a: dict, b: dict) -> bool:
-    return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
-
-
 def test_train_reports_and_logs(train, tmp_path, shared_dataset):
     output, log = tmp_path / "m.pt", tmp_path / "run.jsonl"
     result = train(output, "--json", "--log", log)
@@ -55,7 +47,7 @@ def test_train_reports_and_logs(train, tmp_path, shared_dataset):
     report = result.json
     assert report["iterations"] == report["total"] == 4 and report["finished"] is True
     assert report["phases_not_reached"] == [] and [row["level"] for row in report["levels"]] == [0, 1, 2]
-    assert len([json.loads(line) for line in log.read_text().splitlines()]) == 4
+    assert len(read_log(log)) == 4
     training = checkpoint.load(output)[1]
     config = json.loads(training["config"])
     assert config["source"] == str(shared_dataset) and config["downscale"] == 1 and config["holdout"] == 8
@@ -103,7 +95,7 @@ def test_interrupted_and_resumed_run_repeats_the_uninterrupted_one(train, tmp_pa
     assert "phases not reached: " in cut.err and "exact rounding of attributes" in cut.err and "--resume" in cut.err
     monkeypatch.setattr(Learner, "step", step)
     assert train(tmp_path / "cut.pt", "--resume", tmp_path / "cut.pt", iterations=None).code == 0
-    assert _same(_state(tmp_path / "whole.pt"), _state(tmp_path / "cut.pt"))
+    assert_same_weights(tmp_path / "whole.pt", tmp_path / "cut.pt")
 
 
 def test_resume_refuses_what_contradicts_the_checkpoint(cli, train, tmp_path, shared_dataset):
@@ -249,8 +241,8 @@ def test_a_run_killed_while_saving_resumes_to_the_same_result(train, tmp_path, s
         stream.write('{"iteration": 2')  # a line cut in its middle
     assert train(killed, "--resume", killed, "--log", log, iterations=None).code == 0
     assert train(whole, iterations=10).code == 0
-    assert _same(_state(whole), _state(killed))
-    assert [json.loads(line)["iteration"] for line in log.read_text().splitlines()] == list(range(10))
+    assert_same_weights(whole, killed)
+    assert [record["iteration"] for record in read_log(log)] == list(range(10))
     assert not list(tmp_path.glob(".pd4dgs-*/killed.pt"))
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from PIL import Image
 from strategies import make_scene
+from tiny import camera_ahead, camera_around
 
 from pd4dgs_codec.draw.layers import Layers
 from pd4dgs_codec.draw.player import Player
@@ -22,17 +23,10 @@ from pd4dgs_codec.scene import SCAFFOLD_NETWORKS, Camera, Deformation, Scene, Wi
 
 KEYED = {"key": 40_000}
 ROOT = Path(__file__).parents[2]
-K = np.array([[40, 0, 24], [0, 40, 18], [0, 0, 1]], np.float32)
 
 
 def _camera(seed: int) -> Camera:
-    """48 x 36 pixels, somewhere around the scene."""
-    rng = np.random.default_rng(seed)
-    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-    viewmat = np.eye(4, dtype=np.float32)
-    viewmat[:3, :3] = rotation * np.sign(np.linalg.det(rotation))
-    viewmat[2, 3] = 8
-    return Camera(viewmat, K, 48, 36)
+    return camera_around(np.random.default_rng(seed))
 
 
 def _scene(**changes: object) -> Scene:
@@ -125,9 +119,7 @@ def test_where_shapes_do_not_take_the_direction_another_eye_evaluates_colours_al
 
 def test_scenes_without_gaussians_in_view_show_the_background():
     scene = _scene()
-    away = Camera(np.diag([1, 1, 1, 1]).astype(np.float32), K, 48, 36)
-    away.viewmat[2, 3] = -1000
-    picture = Player(scene).picture(away, 0.5)
+    picture = Player(scene).picture(camera_ahead(-1000.0, 40.0, 48, 36), 0.5)
     np.testing.assert_array_equal(picture, np.broadcast_to(np.float32(scene.info.background), picture.shape))
 
 

@@ -12,7 +12,7 @@ from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.format.planes import PREDICTORS, cells_read, fill_plane, residual
 from pd4dgs_codec.format.symbols import SceneSymbols
-from pd4dgs_codec.scene import DEFAULT_WIDTHS, PLANES, Camera, Deformation, Scene, Widths
+from pd4dgs_codec.scene import DEFAULT_WIDTHS, PLANES, Deformation, Scene, Widths
 
 SIDES = (6, 5, 7, 5)
 
@@ -41,23 +41,20 @@ def test_the_planned_scene_is_rounded_to_the_planned_symbols(widths):
 def test_no_pixel_changes():
     pytest.importorskip("torch")
     pytest.importorskip("numba")
+    from tiny import camera_around
+
     from pd4dgs_codec.model.convert import from_scene
     from pd4dgs_codec.model.picture import render_image
 
     whole, less = (
         from_scene(decode(encode(lively_scene(), layers=2, effort=1, omit=o))) for o in ("nothing", "lossless")
     )
-    K = np.array([[40, 0, 24], [0, 40, 18], [0, 0, 1]], np.float32)
     rng = np.random.default_rng(3)
     seen = 0.0
     for level in (0, 1, 2):
         for _ in range(4):
-            rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
-            viewmat = np.eye(4, dtype=np.float32)
-            viewmat[:3, :3] = rotation * np.sign(np.linalg.det(rotation))
-            viewmat[2, 3] = 8
-            t = float(rng.random())
-            a, b = (render_image(model, level, t, Camera(viewmat, K, 48, 36)) for model in (whole, less))
+            camera, t = camera_around(rng), float(rng.random())
+            a, b = (render_image(model, level, t, camera) for model in (whole, less))
             np.testing.assert_array_equal(a, b)
             seen += float(np.ptp(a))
     assert seen > 1, "the pictures show something"

@@ -119,9 +119,8 @@ NET = "deformation_net."
 OFF = b"Namespace(no_ds=True, no_dr=True, no_do=True"
 
 
-@pytest.mark.parametrize(
-    "change, message",
-    [
+BROKEN = {
+    (FourD, DEFORMATION): [
         (_without(NET + "grid.grids.1.0"), r"feature_out.0.weight has shape \(32, 32\), expected \(any, 16\)"),
         (_without(NET + "grid.grids.1.4"), "has no tensor deformation_net.grid.grids.1.4"),
         (_as(NET + "grid.grids.1.4", torch.ones(1, 15, 3, 3)), r"\(1, 15, 3, 3\), expected \(1, 16, any, any\)"),
@@ -135,21 +134,7 @@ OFF = b"Namespace(no_ds=True, no_dr=True, no_do=True"
         (_as(NET + "pos_deform.3.weight", torch.ones(4, 32)), r"expected \(3, 32\)"),
         (_as(NET + "scales_deform.3.bias", "bell \x07\u202e"), "has no tensor deformation_net.scales_deform.3.bias"),
     ],
-)  # fmt: skip
-def test_broken_networks_of_4dgaussians_are_one_line(tmp_path, change, message):
-    model = FourD(make_splats())
-    run = model.save(tmp_path / "run", make_splats())
-    state = model.state_dict()
-    change(state)
-    torch.save(state, run / DEFORMATION)
-    with pytest.raises(DataError, match=message) as error:
-        read_model(str(run), 30)
-    assert "deformation.pth" in str(error.value) and str(error.value).isprintable()
-
-
-@pytest.mark.parametrize(
-    "change, message",
-    [
+    (Deformable, "deform/iteration_7/deform.pth"): [
         (_without("linear.0.weight"), "has no tensor linear.0.weight"),
         (_without("linear.7.weight"), "linear.4.weight has shape"),  # seven layers have their skip earlier
         (_as("linear.0.weight", torch.ones(64, 93)), r"expected \(any, 84\)"),
@@ -158,15 +143,19 @@ def test_broken_networks_of_4dgaussians_are_one_line(tmp_path, change, message):
         (_as("branch_w.weight", torch.ones(3, 64)), "has no tensor branch_w.bias"),
         (_as("gaussian_rotation.bias", torch.full((4,), np.inf)), "gaussian_rotation.bias holds a NaN or"),
     ],
-)  # fmt: skip
-def test_broken_networks_of_deformable_3dgs_are_one_line(tmp_path, change, message):
-    model = Deformable(make_splats())
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind, file, change, message", [(*of, *case) for of in BROKEN for case in BROKEN[of]])
+def test_broken_networks_are_one_line(tmp_path, kind, file, change, message):
+    model = kind(make_splats())
     run = model.save(tmp_path / "run", make_splats())
     state = model.state_dict()
     change(state)
-    torch.save(state, run / "deform/iteration_7/deform.pth")
-    with pytest.raises(DataError, match=message):
+    torch.save(state, run / file)
+    with pytest.raises(DataError, match=message) as error:
         read_model(str(run), 30)
+    assert Path(file).name in str(error.value) and str(error.value).isprintable()
 
 
 @pytest.mark.parametrize(

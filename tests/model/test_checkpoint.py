@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from strategies import LAYER_SETS, make_scene
+from tiny import Trap
 
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.model import checkpoint
@@ -73,16 +74,6 @@ def test_no_camera_and_no_anchors(tmp_path):
 
 
 # -- files that are refused --------------------------------------------------------------------------------------------
-
-
-class Trap:
-    """Pickles as a call that creates a folder."""
-
-    def __init__(self, target: Path):
-        self.target = target
-
-    def __reduce__(self):
-        return os.mkdir, (str(self.target),)
 
 
 @pytest.mark.parametrize("zipped", [True, False])

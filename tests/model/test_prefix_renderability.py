@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import LAYER_SETS, make_scene, scenes
+from tiny import camera_ahead
 
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import RenderError
@@ -18,6 +19,7 @@ from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.scene import Camera, Deformation, Scene
 
 WIDTH, HEIGHT = 24, 16
+CAMERA = camera_ahead(2.0, 20.0, WIDTH, HEIGHT)
 #: Normalised times; those outside 0..1 are clamped to it.
 TIMES = (-2.5, 0.0, 0.3, 1.0, 17.0)
 
@@ -75,17 +77,16 @@ def test_prefixes_of_a_visible_scene_show_something_at_their_level(layers, chann
     """8 channels go through the kernels, 2 through the reference. A level whose layer is missing looks like the one
     below it, and a moving layer moves."""
     scene = visible_scene(layers, channels)
-    camera = camera_at(scene)
     data = encode(scene, layers=2, effort=1)
     for layer, prefix in prefixes(data):
         model = from_scene(prefix)
-        image = shoot(model, layer, 0.0, camera)
+        image = shoot(model, layer, 0.0, CAMERA)
         assert np.abs(image - np.array(prefix.info.background, np.float32)).max() > 0.1
         for above in range(layer + 1, 3):
-            np.testing.assert_array_equal(shoot(model, above, 0.0, camera), image)
-        moves = shoot(model, layer, 0.7, camera)
+            np.testing.assert_array_equal(shoot(model, above, 0.0, CAMERA), image)
+        moves = shoot(model, layer, 0.7, CAMERA)
         assert np.array_equal(moves, image) == (layer == 0)
-        np.testing.assert_array_equal(shoot(model, layer, -1.0, camera), image)
+        np.testing.assert_array_equal(shoot(model, layer, -1.0, CAMERA), image)
 
 
 @pytest.mark.parametrize("flat", [[0], [0, 1, 2]])
@@ -95,7 +96,7 @@ def test_a_box_without_extent(flat):
     box[1, flat] = box[0, flat]
     data = encode(replace(scene, info=replace(scene.info, box=box)), layers=2, effort=1)
     for layer, prefix in prefixes(data):
-        shoot(from_scene(prefix), layer, 0.3, camera_at(scene))
+        shoot(from_scene(prefix), layer, 0.3, CAMERA)
 
 
 @given(st.integers(0, 2**32 - 1))
@@ -111,7 +112,7 @@ def test_log_scalings_beyond_float32_leave_pictures_finite(seed):
     for layer, prefix in prefixes(encode(scene, layers=2, effort=1, verify=False)):
         model = from_scene(prefix)
         for t in (0.0, 0.6):
-            shoot(model, layer, t, camera_at(scene))
+            shoot(model, layer, t, CAMERA)
 
 
 def test_features_that_overflow_hide_their_gaussians():
@@ -124,10 +125,9 @@ def test_features_that_overflow_hide_their_gaussians():
     networks = {"trunk": ((np.full_like(weight, 1000), bias),), "feature": ((0 * feature, np.full_like(shift, 0.5)),)}
     data = encode(replace(scene, local_deformation=Deformation(planes, networks)), layers=2, effort=1)
     base, top = (from_scene(prefix) for _, prefix in prefixes(data))
-    camera = camera_at(scene)
     background = np.float32(scene.info.background)
-    assert np.abs(shoot(base, 0, 0.3, camera) - background).max() > 0.1
-    np.testing.assert_array_equal(shoot(top, 2, 0.3, camera), np.broadcast_to(background, (HEIGHT, WIDTH, 3)))
+    assert np.abs(shoot(base, 0, 0.3, CAMERA) - background).max() > 0.1
+    np.testing.assert_array_equal(shoot(top, 2, 0.3, CAMERA), np.broadcast_to(background, (HEIGHT, WIDTH, 3)))
 
 
 def visible_scene(layers: tuple[int, ...], channels: int, seed: int = 0) -> Scene:
@@ -141,14 +141,6 @@ def visible_scene(layers: tuple[int, ...], channels: int, seed: int = 0) -> Scen
     codes = np.sort(rng.choice(np.array([0, 100, 255], np.uint8), (len(scaling_log), len(layers))), axis=1)
     codes[: len(codes) // 2] = 255
     return replace(scene, scaling_log=scaling_log, networks=networks, mask=tuple(codes.T.copy()))
-
-
-def camera_at(scene: Scene) -> Camera:
-    """Looks at the origin from a distance of 2."""
-    viewmat = np.eye(4, dtype=np.float32)
-    viewmat[2, 3] = 2
-    K = np.array([[20, 0, WIDTH / 2], [0, 20, HEIGHT / 2], [0, 0, 1]], np.float32)
-    return Camera(viewmat, K, WIDTH, HEIGHT)
 
 
 @pytest.mark.parametrize("t", [float("nan"), float("inf")])

@@ -37,8 +37,8 @@ from browser import (
     wait_for_level,
 )
 from pictures import Rasterised, cameras, decibels, resized, shots
-from strategies import make_scene
-from tiny import random_network
+from strategies import flipped, make_scene
+from tiny import random_deformation, random_network
 
 from pd4dgs_codec import decode, encode, show
 from pd4dgs_codec import scene as scene_module
@@ -46,7 +46,7 @@ from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.interchange.formats import ply_bytes
 from pd4dgs_codec.interchange.splats import Splats
-from pd4dgs_codec.scene import PLANES, Camera, Deformation, Scene, SceneInfo, Steps, Widths
+from pd4dgs_codec.scene import Camera, Deformation, Scene, SceneInfo, Steps, Widths
 from pd4dgs_codec.web.page import page as packed_page
 from pd4dgs_codec.web.server import Link, Server
 
@@ -77,30 +77,6 @@ def browser() -> Iterator[Any]:
 # -- scenes ------------------------------------------------------------------------------------------------------------
 
 
-def _deformation(
-    rng: np.random.Generator,
-    heads: dict[str, int],
-    channels: int,
-    scales: int,
-    trunk: tuple[int, ...],
-    key: int | None,
-    below: int,
-) -> Deformation | None:
-    if not heads:
-        return None
-    sides = (9, 7, 8, 5)
-    planes = tuple(
-        {
-            name: rng.normal(1, 0.4, (channels, sides[b] << (s if b < 3 else 0), sides[a] << s)).astype(np.float32)
-            for name, a, b in PLANES
-        }
-        for s in range(scales)
-    )
-    networks = {"trunk": random_network(rng, (below + scales) * channels, *trunk, scale=0.3)}
-    networks |= {name: random_network(rng, trunk[-1], width, scale=0.05) for name, width in heads.items()}
-    return Deformation(planes, networks, key)
-
-
 def lively_scene(
     anchors: int = 700,
     seed: int = 3,
@@ -123,10 +99,12 @@ def lively_scene(
     K = np.array([[80, 0, WIDTH / 2 + 3], [0, 84, HEIGHT / 2 - 2], [0, 0, 1]], np.float32)
     codes = np.sort(rng.choice(np.array([0, 60, 180, 255], np.uint8), (anchors, 3)), axis=1)
     codes[: anchors // 2] = [140, 200, 255]
-    fields: list[Deformation | None] = []
+    planes = dict(resolutions=[(9 << s, 7 << s, 8 << s, 5) for s in range(scales)], channels=channels, spread=0.4)
+    fields: dict[int, Deformation] = {}
     for layer, names, key in zip((1, 2), heads or (widths.heads, widths.heads), keys, strict=True):
-        below = sum(len(field.planes) for field in fields if field)
-        fields.append(_deformation(rng, names if layer in layers else {}, channels, scales, trunk, key, below))
+        if layer in layers and names:
+            below = fields[1].channels if fields else 0
+            fields[layer] = random_deformation(rng, names, **planes, trunk=trunk, key=key, below=below)
     return Scene(
         info=SceneInfo(
             voxel_size=float(np.float32(1 / 40)),
@@ -151,8 +129,8 @@ def lively_scene(
             name: random_network(rng, widths.inputs[name], *hidden, width, scale=0.4)
             for name, width in widths.networks.items()
         },
-        global_deformation=fields[0],
-        local_deformation=fields[1],
+        global_deformation=fields.get(1),
+        local_deformation=fields.get(2),
     )
 
 
@@ -496,14 +474,10 @@ def element(page: Any, server: Server, attributes: str, code: Server | None = No
     return page.locator("pd4-player")
 
 
-def damaged(data: bytes, at: int) -> bytes:
-    return data[:at] + bytes([data[at] ^ 4]) + data[at + 1 :]
-
-
 FAULTS: dict[str, tuple[Any, int | None, str]] = {
-    "damaged in layer 1": (lambda data, ends: damaged(data, ends[1] - 50), 0, "CRC-32"),
+    "damaged in layer 1": (lambda data, ends: flipped(data, ends[1] - 50, 4), 0, "CRC-32"),
     "cut in layer 2": (lambda data, ends: data[: ends[2] - 20], 1, "needs"),
-    "damaged in layer 0": (lambda data, ends: damaged(data, ends[0] - 50), None, "CRC-32"),
+    "damaged in layer 0": (lambda data, ends: flipped(data, ends[0] - 50, 4), None, "CRC-32"),
     "foreign": (lambda *_: b"<!doctype html><p>no such scene" * 20, None, "pd4"),
     "absent": (lambda *_: None, None, "404"),
     "hostile": (lambda *_: (ROOT / "spec" / "vectors" / "faulty" / "bomb-most-rows.pd4").read_bytes(), None, "limit"),

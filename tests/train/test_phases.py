@@ -86,15 +86,13 @@ def test_phases_that_meet_infinity_are_skipped(dataset, tmp_path, monkeypatch):
     assert len(records) == 30 and not any({"left_model", "step_classes", "prefix"} & set(r) for r in records)
 
 
-def test_short_runs_and_few_views_have_no_measured_phases(dataset, tmp_path, monkeypatch):
+def test_short_runs_and_few_views_have_no_measured_phases(dataset, tmp_path, request):
     views = replace(dataset, train=dataset.train * 12)
     trainer = trainer_of(views, 12, prune=0.5, grading=0.5)
     assert not held_back_views(trainer.learner)
     records = records_of(trainer, tmp_path)
     assert not any({"left_model", "step_classes", "judged_psnr"} & set(record) for record in records)
-    monkeypatch.setattr(phases, "MIN_ITERATIONS", 10)
-    monkeypatch.setattr(opening, "MIN_TRIAL", 3)
-    monkeypatch.setattr(levels, "MIN_PRACTICE", 3)
+    request.getfixturevalue("short_runs_have_phases")
     assert held_back_views(trainer.learner) == {8, 24, 40, 56}
     for off in ({"keep_layers": True}, {"max_layer": 0}, {"rollout": "top"}):
         assert not held_back_views(trainer_of(views, **off).learner)
@@ -285,7 +283,7 @@ def judged(dataset, monkeypatch, least):
         monkeypatch.setattr(levels, name, least)
     monkeypatch.setattr(levels, "SHARE_2", min(least, 0.0))
     monkeypatch.setattr(levels, "MIN_PRACTICE", 3)
-    learner = Trainer(TrainConfig(preset="tiny", iterations=30), replace(dataset, train=dataset.train * 12)).learner
+    learner = trainer_of(replace(dataset, train=dataset.train * 12)).learner
     with torch.no_grad():
         for field in learner.model.deformations.values():
             for parameter in field.weights:
@@ -334,8 +332,7 @@ def test_level_2_needs_a_share_of_all_motion_and_counts_for_level_1(dataset, mon
 @pytest.mark.parametrize("share, steps, due", [(0.67, 660, False), (0.67, 680, True), (None, 400, True)])
 def test_a_timed_run_on_a_busy_machine_keeps_its_levels(dataset, share, steps, due):
     """It has not learnt motion, whatever N it began with."""
-    config = TrainConfig(preset="tiny", iterations=600)
-    learner = Trainer(config, replace(dataset, train=dataset.train * 12)).learner
+    learner = trainer_of(replace(dataset, train=dataset.train * 12), 600).learner
     learner.share, learner._before, learner.iteration = share, 399, steps
     assert learner.levels.due(learner) == due
 
