@@ -155,17 +155,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     if unknown := set(names) - set(DECODERS):
         p.error(f"--decoders: expected some of {', '.join(DECODERS)}, found {', '.join(sorted(unknown))}")
     files, figures = seeds(args.files), Figures()
-    if args.input is not None:
-        print(make_case(files, args.seed, args.input).recipe)
-        figures = examine(files, args.seed, args.input, make_decoders(names), every=True)
+    if args.input is None:
+        parts = run_safely(files, args.seed, range(args.inputs), names)
     else:
-        with contextlib.suppress(KeyboardInterrupt):
-            for found in run_safely(files, args.seed, range(args.inputs), names):
-                figures.add(found)
-    for row in figures.findings:
-        args.out.mkdir(parents=True, exist_ok=True)
-        path = args.out / f"{args.seed}-{row['input']}-{row['kind']}.pd4"
-        path.write_bytes(make_case(files, args.seed, row["input"]).data)
+        print(make_case(files, args.seed, args.input).recipe)
+        parts = iter([examine(files, args.seed, args.input, make_decoders(names), every=True)])
+    with contextlib.suppress(KeyboardInterrupt):
+        for part in parts:
+            figures.add(part)
+            for row in part.findings:  # at once, since a long run may be killed
+                args.out.mkdir(parents=True, exist_ok=True)
+                path = args.out / f"{args.seed}-{row['input']}-{row['kind']}.pd4"
+                path.write_bytes(make_case(files, args.seed, row["input"]).data)
     print(figures.text())
     return 1 if figures.findings else 0
 
