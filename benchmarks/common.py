@@ -171,7 +171,7 @@ class Benchmark:
     """scenes: names in SCENES; none where no scene is measured. measure: the rows of one scene (of None without
     scenes). text: the rows of all scenes as Markdown, without a heading. pictures: draws them into a folder and returns
     the file names. trainings: what it needs of a scene, so that they can run side by side before it measures. measured:
-    the folders of code on which its rows depend."""
+    git pathspecs of the code on which its rows depend."""
 
     name: str
     title: str

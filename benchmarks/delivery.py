@@ -207,5 +207,10 @@ LATENCY = Benchmark("latency", "First picture", ONE, measure_latency, latency_te
 SLICED = (*TWO, "orbit", "static", "global", "local", "fast")
 SLICES = Benchmark("slices", "Slices", SLICED, measure_slices, slices_text, slices_pictures)
 PLAYER = Benchmark(
-    "player", "The player in a browser", ONE, measure_player, player_text, measured=("pd4dgs_codec", "player")
+    "player",
+    "The player in a browser",
+    ONE,
+    measure_player,
+    player_text,
+    measured=("pd4dgs_codec", "player", ":!player/test*", ":!*.md"),
 )

@@ -90,7 +90,7 @@ def aged(sections: Sequence[Row]) -> list[str]:
             known[key] = changed(*key)
         if known[key]:
             path, *others = known[key]
-            more = f" and {len(others)} other files" if others else ""
+            more = f" and {len(others)} more" if others else ""
             lines.append(f"{name}: made at {made}, before changes of {path}{more}")
     return lines
 
