@@ -22,6 +22,8 @@ def upper(verb: str, argv: list[str]) -> tuple[int, str, str]:
             time.sleep(600)
         if word == "fail":
             return 1, "", "first line\npd4dgs-encode: error: not this time"
+    if text == "die":
+        os.kill(os.getpid(), signal.SIGKILL)
     if text == "bad":
         return 1, "", "a long story\npd4dgs-encode: error: never\n"
     if text == "wrong":

@@ -59,8 +59,15 @@ def test_a_job_whose_worker_dies_is_tried_again(filled, temporary):
     assert len(filled.made()) == 9
 
 
-def test_a_job_that_always_kills_its_worker_is_named(filled):
-    filled.add("z.pt", f"die {filled.folder}/no-such-folder/flag")  # touching that fails: an outcome, not a death
+def test_a_job_that_always_kills_its_worker_is_named(filled, temporary):
+    filled.add("z.pt", "die")
+    assert filled.run(workers=1, retries=1)["done"] == 8
+    outcome, tries = filled.outcomes["z.pd4"]
+    assert outcome.state == "failed" and tries == 2 and "worker" in outcome.message
+
+
+def test_what_a_job_raises_is_its_outcome(filled):
+    filled.add("z.pt", f"die {filled.folder}/no-such-folder/flag")  # which cannot be made
     assert filled.run(workers=1, retries=1)["done"] == 8
     outcome, tries = filled.outcomes["z.pd4"]
     assert outcome.state == "failed" and tries == 1 and "no-such-folder" in outcome.message

@@ -82,7 +82,7 @@ FAULTS = {
     ),
     "a quantiser that rounds down and refuses nothing": (
         quantise, "quantise", floor, "quantiser",
-        {"step 1", "halves", "negative zero", "step 0", "value nan"}, "",
+        {"step 1", "halves", "negative zero", "step 0", "value nan"}, "again at step 1",
     ),
     "time that is not clamped": (
         hexplane, "sample_reference", lambda *x: sample(*x) * (1 + max(x[-1] - 1, 0)), "hexplane",
@@ -100,7 +100,7 @@ FAULTS = {
         {"z = near"}, "behind",
     ),
     "an opacity that is not capped": (
-        reference, "ALPHA_MAX", 0.99, "rasteriser", {"64 coincident, opaque", "centre on a pixel"}, "nothing",
+        reference, "ALPHA_MAX", 0.99, "rasteriser", {"64 coincident, opaque", "centre on a pixel"}, "behind",
     ),
     "a picture with a NaN": (
         stable_scenes, "picture_error", lambda model, level, *_: math.nan if level == 2 else 0.0, "as it should be",
