@@ -21,6 +21,7 @@ import os
 import sys
 import time
 from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -83,18 +84,14 @@ def section(benchmark: Benchmark, run: Run, names: Sequence[str], made: Row) -> 
 def aged(sections: Sequence[Row]) -> list[str]:
     """A line for every section whose measured code has changed since it was made."""
     lines, measured = [], {benchmark.name: benchmark.measured for benchmark in ALL}
-    known: dict[tuple[str, ...], list[str]] = {}
     for name, made in ((found["name"], found["commit"]) for found in sections):
-        key = made.partition(",")[0], *measured[name]
-        if key not in known:
-            known[key] = changed(*key)
-        if known[key]:
-            path, *others = known[key]
-            more = f" and {len(others)} more" if others else ""
-            lines.append(f"{name}: made at {made}, before changes of {path}{more}")
+        if paths := changed(made.partition(",")[0], *measured[name]):
+            more = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
+            lines.append(f"{name}: made at {made}, before changes of {paths[0]}{more}")
     return lines
 
 
+@cache
 def changed(commit: str, *folders: str) -> list[str]:
     """The files that do something else than at a commit; all if the commit is not in the history."""
     if not git("cat-file", "-t", commit):
