@@ -13,7 +13,7 @@ from typing import Any
 from browser import PATIENCE_MS, launched
 from common import ONE, TWO, Benchmark, Row, Run, Scene, command, levels, number, seconds_at, table
 
-from pd4dgs_codec.bench.latency import _python
+from pd4dgs_codec.bench.latency import python
 from pd4dgs_codec.bench.report import drawing
 from pd4dgs_codec.errors import DataError
 
@@ -131,7 +131,7 @@ NOTE = """window.noted = [];
 @contextmanager
 def served(folder: Path, *options: str) -> Iterator[str]:
     """The URL of a folder served by `pd4dgs-serve`. Raises DataError if it does not start."""
-    with _python("-m", "pd4dgs_codec", "serve", str(folder), "--port", "0", *options) as lines:
+    with python("-m", "pd4dgs_codec", "serve", str(folder), "--port", "0", *options) as lines:
         url = lines.readline().strip()
         if not url:
             raise DataError("pd4dgs-serve did not start")

@@ -30,7 +30,7 @@ def served(data: bytes, rate: float) -> Iterator[str]:
     """Serves a file over a link of `rate` bits per second by `pd4dgs-serve` in another process; yields its URL."""
     with tempfile.TemporaryDirectory(prefix="pd4dgs-") as folder:
         (Path(folder) / "scene.pd4").write_bytes(data)
-        with _python("-m", "pd4dgs_codec", "serve", folder, "--port", "0", "--rate", repr(rate)) as lines:
+        with python("-m", "pd4dgs_codec", "serve", folder, "--port", "0", "--rate", repr(rate)) as lines:
             line = lines.readline().strip()
             if not line:
                 raise DeliveryError("pd4dgs-serve did not start")
@@ -38,8 +38,12 @@ def served(data: bytes, rate: float) -> Iterator[str]:
 
 
 @contextlib.contextmanager
-def _python(*arguments: str, **environment: str) -> Iterator[IO[str]]:
-    """Runs a Python process within the block and yields its stdout."""
+def python(*arguments: str, **environment: str) -> Iterator[IO[str]]:
+    """Runs a Python process within the block and yields its stdout as text; SIGTERM ends it with the block.
+
+    arguments: of the interpreter, such as "-m", "pd4dgs_codec". environment: variables to set beside those of this
+    process.
+    """
     command, variables = [sys.executable, *arguments], os.environ | environment
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=variables)
     assert process.stdout is not None
@@ -85,7 +89,7 @@ def pictures(url: str, ready: Callable[[], object] = lambda: None) -> Iterator[t
 def cold_start(url: str, **environment: str) -> list[float]:
     """Returns seconds from the start of a viewer's process to each of its images. Raises DeliveryError if it fails."""
     start = time.perf_counter()
-    with _python("-m", "pd4dgs_codec.bench.latency", url, **environment) as lines:
+    with python("-m", "pd4dgs_codec.bench.latency", url, **environment) as lines:
         seconds = [time.perf_counter() - start for _ in lines]
     if not seconds:
         raise DeliveryError(f"{url}: the viewer's process rendered nothing")

@@ -64,7 +64,7 @@ def parser() -> options.Parser:
     add("--workers", type=options.count, metavar="N", help=what)
     what = "threads per scene (default: with local an equal share of -j, else 1)"
     add("--cpus", type=options.positive_int, metavar="N", help=what)
-    add("--gpus", type=options.non_negative_float, default=0, metavar="N", help="GPUs per scene (default: 0)")
+    add("--gpus", type=options.non_negative_float, metavar="N", help="GPUs per scene (default: 0)")
     what = "retry a failed scene up to N times (default: %(default)s)"
     add("--retries", type=options.count, default=2, metavar="N", help=what)
     what = "stop a scene after this time and retry it, such as 90s (default: never)"
@@ -73,7 +73,7 @@ def parser() -> options.Parser:
     what = "address of the Ray cluster (default: RAY_ADDRESS, else one on this machine)"
     add("--address", metavar="A", help=what)
     what = "submitit parameter, such as slurm_partition=gpu; cluster=local runs on this machine"
-    add("--slurm", type=_parameter, action="append", default=[], metavar="KEY=VALUE", help=what)
+    add("--slurm", type=_parameter, action="append", metavar="KEY=VALUE", help=what)
     p.add_common()
     return p
 
@@ -122,6 +122,9 @@ def _scan(args: argparse.Namespace, console: Console) -> int:
 
 
 def _batch(args: argparse.Namespace, console: Console) -> int:
+    options.conditional(args, args.on != "local", "needs --on ray or slurm", gpus=0)
+    options.conditional(args, args.on == "ray", "needs --on ray", address=None)
+    options.conditional(args, args.on == "slurm", "needs --on slurm", slurm=[])
     cores = args.threads or available()
     workers = args.workers if args.workers is not None else {"local": cores, "ray": 0, "slurm": 0}[args.on]
     threads = args.cpus or (max(1, cores // max(1, workers)) if args.on == "local" else 1)

@@ -40,13 +40,23 @@ def _given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
     return {name: getattr(args, name) for name in names if getattr(args, name) is not None}
 
 
+#: Why an option is refused for a file that is not rendered.
+CHECKPOINT = "needs a checkpoint, not a .pd4 file"
+
+
 def _add_views(p: options.Parser, views: int) -> None:
     """Adds the options that choose the images to render. views: their default number."""
     add = p.add_argument
     what = "dataset whose held-out views give the cameras (default: the file's own camera over time)"
     add("--data", metavar="SOURCE", help=what)
-    options.add_reading(p)
-    add("--views", type=options.positive_int, default=views, metavar="N", help=f"number of images (default: {views})")
+    options.add_reading(p, unset=options.READING)
+    add("--views", type=options.positive_int, metavar="N", help=f"number of images (default: {views})")
+
+
+def _complete_views(args: argparse.Namespace, views: int, rendered: bool = True) -> None:
+    """Sets the defaults of `_add_views`. Raises UsageError for an option that needs images or a dataset without one."""
+    options.conditional(args, rendered, CHECKPOINT, data=None, views=views, downscale=1)
+    options.conditional(args, args.data, "needs --data SOURCE", holdout=8)
 
 
 def _frames(args: argparse.Namespace, info: SceneInfo) -> list[Frame]:
@@ -94,13 +104,13 @@ def _codec_options(p: options.Parser) -> None:
 
 def _codec(args: argparse.Namespace, console: Console) -> Outcome:
     data = read_bytes(args.input)
+    _complete_views(args, 6, not is_pd4(data))
+    options.conditional(args, not is_pd4(data), CHECKPOINT, step_scales=None, modes=None, efforts=None, plot=None)
     from pd4dgs_codec.bench import report, runtime
 
     machine = report.machine()
     scales, modes, efforts, repeats = (SWEEP | (QUICK if args.quick else {}) | _given(args, *SWEEP)).values()
     if is_pd4(data):
-        if args.plot is not None:
-            raise UsageError("--plot: a file without its checkpoint has no error to plot; expected a checkpoint")
         points, panels = [runtime.file_point(data, repeats)], []
     else:
         scene = common.checkpoint_scene(args.input, data)
@@ -142,6 +152,7 @@ def _render(args: argparse.Namespace, console: Console) -> Outcome:
     names = args.only or tuple(runtime.BACKENDS)
     if unknown := [name for name in names if name not in runtime.BACKENDS]:
         raise UsageError(f"--only: found {unknown[0]!r}, expected some of {', '.join(runtime.BACKENDS)}")
+    _complete_views(args, 2)
     machine = report.machine()
     level = load_levels(common.named_input(args.input), last_only=True)[-1]
     frames = _frames(args, level.model.info)
@@ -179,7 +190,7 @@ def _train_options(p: options.Parser) -> None:
     add("--presets", nargs="+", choices=presets, metavar="PRESET", help="model sizes (default: tiny small)")
     add("--seconds", type=options.positive_float, metavar="S", help="time limit per preset (default: 120)")
     add("--iterations", type=options.positive_int, metavar="N", help="number of steps instead of a time limit")
-    options.add_reading(p, defaults=False)
+    options.add_reading(p, unset=options.READING)
     add("--seed", type=options.seed, metavar="N", help="seed of each run (default: 0)")
     add("--from", dest="runs", nargs="+", metavar="FILE", help="checkpoints of existing runs")
 

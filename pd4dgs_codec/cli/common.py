@@ -141,6 +141,11 @@ def read_bytes(path: str) -> bytes:
     return sys.stdin.buffer.read()
 
 
+def same_file(path: str, other: str) -> bool:
+    """Whether both name one file, through links too; `-` names none. A missing file is the same under every path."""
+    return STDIO not in (path, other) and os.path.realpath(path) == os.path.realpath(other)
+
+
 def named_input(path: str) -> str | bytes:
     """Returns the path, or all bytes of stdin for `-`, for readers that take either."""
     return read_bytes(path) if path == STDIO else path

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-import os
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -74,9 +73,9 @@ def parser() -> options.Parser:
     views = p.add_argument_group("quality in renderings")
     what = "dataset, see below: its training views fit the sizes, its held-out views decide which layers are kept"
     views.add_argument("--data", metavar="SOURCE", help=what)
-    options.add_reading(views)
+    options.add_reading(views, unset=options.READING)
     what = "use about N views of each split, evenly spread (default: 16)"
-    views.add_argument("--views", type=options.positive_int, default=16, metavar="N", help=what)
+    views.add_argument("--views", type=options.positive_int, metavar="N", help=what)
     what = "with --data, leave out layers that gain less than DB dB mPSNR per megabyte"
     what = f"{what} (default: {ENCODE_MIN_DB_PER_MEGABYTE:g}; 0: keep all)"
     views.add_argument("--min-gain", type=options.non_negative_float, metavar="DB", help=what)
@@ -87,8 +86,11 @@ def parser() -> options.Parser:
 def _encode(args: argparse.Namespace, console: Console) -> int:
     if args.output == STDIO and args.json:
         raise UsageError("-o - and --json both write to stdout; name an output file")
-    if args.min_gain is not None and args.data is None:
-        raise UsageError("--min-gain needs --data SOURCE: gains are measured on its views")
+    options.conditional(
+        args, args.data, "needs --data SOURCE", holdout=8, views=16, min_gain=ENCODE_MIN_DB_PER_MEGABYTE
+    )
+    renders = args.data or args.slices or args.target_size
+    options.conditional(args, renders, "needs --data, --slices or --target-size", downscale=1)
     common.check_output(args.output, args.overwrite)
     chosen = _options(args)
     scene, metadata = _load(args)
@@ -100,7 +102,7 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
         chosen,
         target_sizes=args.target_size,
         views=_views(args, scene.info, console),
-        min_gain=ENCODE_MIN_DB_PER_MEGABYTE if args.min_gain is None else args.min_gain,
+        min_gain=args.min_gain,
         downscale=args.downscale,
         metadata=metadata,
         progress=lambda what: progress_bar(None, "pictures", what),
@@ -128,7 +130,7 @@ def _load(args: argparse.Namespace) -> tuple[Scene, Metadata | None]:
         from pd4dgs_codec.format.info import metadata_of
 
         return decode(data), _metadata(args, metadata_of(data))
-    if args.output != STDIO and os.path.realpath(args.input) == os.path.realpath(args.output):
+    if common.same_file(args.input, args.output):
         raise UsageError(f"-o names the checkpoint {args.input}, which would be lost; expected another name")
     return common.checkpoint_scene(args.input, data), _metadata(args, None)
 

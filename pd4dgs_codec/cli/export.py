@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.cli import common, options
-from pd4dgs_codec.cli.common import OK, Console, UsageError
+from pd4dgs_codec.cli.common import OK, Console
 from pd4dgs_codec.cli.progress import progress_bar
 from pd4dgs_codec.errors import DataError, required
 from pd4dgs_codec.io import check_path, whole_files
@@ -71,7 +71,7 @@ def parser() -> options.Parser:
     p.add_argument("--data", metavar="SOURCE", help="use the training cameras of a dataset as viewpoints")
     what = "measure PSNR before and after exporting on the held-out views of a dataset"
     p.add_argument("--compare", metavar="SOURCE", help=what)
-    options.add_reading(p)
+    options.add_reading(p, unset=options.READING)
     p.add_common()
     return p
 
@@ -106,10 +106,9 @@ main = common.command(parser, _export)
 
 
 def _check_usage(args: argparse.Namespace) -> None:
-    if args.to in SEQUENCES and args.time is not None:
-        raise UsageError(f"found --time with --to {args.to}, expected it with ply, spz or glb")
-    if args.to not in SEQUENCES and args.fps is not None:
-        raise UsageError(f"found --fps with --to {args.to}, expected it with ply-seq or 4dgs")
+    options.conditional(args, args.to not in SEQUENCES, "needs --to ply, spz or glb", time=0.0)
+    options.conditional(args, args.to in SEQUENCES, "needs --to ply-seq or 4dgs", fps=FPS)
+    options.conditional(args, args.data or args.compare, "needs --data or --compare", **options.READING)
 
 
 def _check_folder(path: str, overwrite: bool) -> None:
@@ -149,7 +148,7 @@ def _write_still(args: argparse.Namespace, export: Export, console: Console) -> 
 
     turn = upright(export.player.info.up) if args.to in ("glb", "spz") else UNTURNED
     with progress_bar(args.refine, "steps", "refining") as step:
-        splats, _ = export.splats(args.time or 0.0, turn, step=step)
+        splats, _ = export.splats(args.time, turn, step=step)
     splats = _scaled(splats, args)
     if args.to == "spz" and (size := float(np.median(splats.scales.max(axis=1)))) < 4 * SPZ_STEP:
         what = f"half of the Gaussians are smaller than {size:.2g} units"
@@ -158,7 +157,7 @@ def _write_still(args: argparse.Namespace, export: Export, console: Console) -> 
         )
     data = {"ply": ply_bytes, "spz": spz_bytes, "glb": glb_bytes}[args.to](splats)
     common.write_bytes(args.output, data, args.overwrite)
-    return {"frames": 1, "gaussians": len(splats.means), "bytes": len(data), "time": args.time or 0.0}
+    return {"frames": 1, "gaussians": len(splats.means), "bytes": len(data), "time": args.time}
 
 
 def _scaled(splats: Splats, args: argparse.Namespace) -> Splats:
@@ -182,7 +181,7 @@ def _write_sequence(args: argparse.Namespace, export: Export) -> dict[str, Any]:
     """Writes frames over the whole time range."""
     from pd4dgs_codec.interchange.formats import fourdgs_bytes, ply_bytes
 
-    info, fps = export.player.info, args.fps or FPS
+    info, fps = export.player.info, args.fps
     seconds = info.time_range[1] - info.time_range[0]
     starts = frame_times(info, fps)
     with progress_bar(len(starts), "frames", "exporting") as step:

@@ -6,7 +6,7 @@ A type returns the value, or raises an error of one line with the text found and
 import argparse
 import contextlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, NoReturn, TypeVar
 
 from pd4dgs_codec.cli.common import UsageError, tell
@@ -14,6 +14,8 @@ from pd4dgs_codec.cli.common import UsageError, tell
 T = TypeVar("T")
 
 EXIT_CODES = "exit codes: 0 done, 1 bad data or I/O, 2 wrong usage"
+#: Defaults of the options of `add_reading`.
+READING = {"downscale": 1, "holdout": 8}
 #: Stands for the list of sources in the details of a command; `Parser.format_help` fills it in.
 SOURCES = "<the list of sources>"
 SCENES = """\
@@ -81,12 +83,24 @@ class Parser(argparse.ArgumentParser):
         add("-f", "--overwrite", action="store_true", help="replace existing outputs")
 
 
-def add_reading(options: argparse._ActionsContainer, *, defaults: bool = True) -> None:
-    """Adds --downscale and --holdout for reading a dataset. defaults: if False, options not given are None."""
-    add, (downscale, holdout) = options.add_argument, (1, 8) if defaults else (None, None)
-    add("--downscale", type=positive_int, default=downscale, metavar="K", help="use images at 1/K size (default: 1)")
-    what = "hold out frames with i %% K == K/2 if there are no split files (default: 8; 0: none)"
-    add("--holdout", type=count, default=holdout, metavar="K", help=what)
+def add_reading(options: argparse._ActionsContainer, *, unset: Iterable[str] = ()) -> None:
+    """Adds --downscale and --holdout for reading a dataset. unset: names that are None unless given."""
+    add, default = options.add_argument, READING | dict.fromkeys(unset)
+    what = f"use images at 1/K size (default: {READING['downscale']})"
+    add("--downscale", type=positive_int, default=default["downscale"], metavar="K", help=what)
+    what = f"hold out frames with i %% K == K/2 if there are no split files (default: {READING['holdout']}; 0: none)"
+    add("--holdout", type=count, default=default["holdout"], metavar="K", help=what)
+
+
+def conditional(args: argparse.Namespace, condition: object, otherwise: str, **defaults: Any) -> None:
+    """Sets the defaults (by name) of options that are used under a condition only and were not given. Raises UsageError
+    with the text `otherwise` for one that was given although the condition is false."""
+    for name, default in defaults.items():
+        value = getattr(args, name)
+        if value is None or value is False:
+            setattr(args, name, default)
+        elif not condition:
+            raise UsageError(f"--{name.replace('_', '-')} {otherwise}")
 
 
 def add_background(options: argparse._ActionsContainer, default: str) -> None:
@@ -141,6 +155,7 @@ share = checked(float, lambda value: 0 <= value <= 1, "a number from 0 to 1")
 fps = checked(float, lambda value: 0.01 <= value <= 1000, "a number from 0.01 to 1000")
 named = checked(str, lambda text: text not in ("", "-"), "the name of a file or folder")
 line = checked(str, str.isprintable, "one line of printable text")
+host = checked(str, bool, "a host name or an IP address")
 finite_float = checked(float, math.isfinite, "a number")
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.cli import options
-from pd4dgs_codec.cli.common import OK, STDIO, Console, command, number, read_bytes, table
+from pd4dgs_codec.cli.common import OK, STDIO, Console, command, number, read_bytes, same_file, table
 from pd4dgs_codec.cli.progress import progress_bar
 from pd4dgs_codec.errors import DeliveryError, RenderError
 from pd4dgs_codec.io import temporary_folder, whole_files
@@ -54,7 +54,7 @@ def parser() -> options.Parser:
     p.add_argument("--immutable", action="store_true", help="put digests into file names, for long-lived caches")
     p.add_argument("--no-video", action="store_true", help="leave out the 2D video")
     what = "frame rate of the 2D video (default: 20)"
-    p.add_argument("--fps", type=options.fps, default=20.0, metavar="F", help=what)
+    p.add_argument("--fps", type=options.fps, metavar="F", help=what)
     p.add_common()
     return p
 
@@ -62,6 +62,7 @@ def parser() -> options.Parser:
 def _package(args: argparse.Namespace, console: Console) -> int:
     if args.input != STDIO and Path(args.input).is_dir():
         return _library(args, console)
+    options.conditional(args, not args.no_video, "has no effect with --no-video", fps=20.0)
     data = read_bytes(args.input)
     from pd4dgs_codec.web.package import package
 
@@ -87,7 +88,8 @@ main = command(parser, _package)
 def _library(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.web.package import library
 
-    if Path(args.input).resolve() != Path(args.output).resolve():
+    options.conditional(args, False, "needs a .pd4 file, not a folder", immutable=False, no_video=False, fps=None)
+    if not same_file(args.input, args.output):
         raise DeliveryError(f"-o {args.output}: expected {args.input}: the index is written beside the packages")
     result = {"input": args.input, "output": args.output, "files": _write(args, library(Path(args.input)))}
     console.result(result, _text(result))

@@ -32,7 +32,7 @@ def parser() -> options.Parser:
     add("-o", "--output", required=True, type=options.named, metavar="FOLDER", help="folder to make")
     add("--frames", type=options.count, default=120, metavar="N", help="use at most N frames (default: 120; 0: all)")
     what = "frame rate of a folder of frames (default: 30)"
-    add("--fps", type=options.positive_float, default=30.0, metavar="F", help=what)
+    add("--fps", type=options.positive_float, metavar="F", help=what)
     add("--downscale", type=options.positive_int, default=1, metavar="K", help="write images at 1/K size (default: 1)")
     add("--camera", choices=CAMERAS, default=CAMERAS[0], help=f"COLMAP camera model (default: {CAMERAS[0]})")
     p.add_common()
@@ -42,6 +42,7 @@ def parser() -> options.Parser:
 def _prepare(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.prepare.stages import Choices, prepare
 
+    options.conditional(args, not Path(args.input).is_file(), "needs a folder of frames", fps=30.0)
     choices = Choices(args.frames, args.fps, args.downscale, args.camera, args.threads or -1)
     try:
         report = prepare(Path(args.input), Path(args.output), choices, progress_bar, args.overwrite, console.message)

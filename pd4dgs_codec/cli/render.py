@@ -46,14 +46,14 @@ def parser() -> options.Parser:
     p.add_argument("--max-bytes", type=options.size, metavar="SIZE", help=what)
     options.add_background(p, "the file's")
     p.add_argument("--data", metavar="SOURCE", help="take cameras, times and ground-truth images from a dataset")
-    p.add_argument("--split", choices=("test", "train"), default="test", help="views of the dataset (default: test)")
-    options.add_reading(p)
+    p.add_argument("--split", choices=("test", "train"), help="views of the dataset (default: test)")
+    options.add_reading(p, unset=("holdout",))
     what = "number of frames, evenly over the time range (default: 60); with --data the first N views"
     p.add_argument("--frames", type=options.positive_int, metavar="N", help=what)
     what = "swing the file's camera by DEG degrees around the point it looks at (default: 0)"
     p.add_argument("--orbit", type=options.finite_float, default=0.0, metavar="DEG", help=what)
     what = "frame rate of a video (default: 20)"
-    p.add_argument("--fps", type=options.fps, default=20.0, metavar="F", help=what)
+    p.add_argument("--fps", type=options.fps, metavar="F", help=what)
     what = "show all levels side by side, and the ground truth with --data"
     p.add_argument("--side-by-side", action="store_true", help=what)
     p.add_common()
@@ -109,6 +109,8 @@ def _check_usage(args: argparse.Namespace) -> str:
         raise UsageError(f"found -o {args.output}, expected images such as out/%04d.png, or a .gif or .mp4")
     if args.data and args.orbit:
         raise UsageError("--orbit moves the file's own camera; found --data too, expected one of them")
+    options.conditional(args, args.data, "needs --data SOURCE", split="test", holdout=8)
+    options.conditional(args, kind in VIDEOS, "needs a .gif or .mp4 as -o", fps=20.0)
     if kind not in VIDEOS and "%" in args.output:
         name = Path(args.output).name
         if not re.fullmatch(r"[^%]*%0?\d*d[^%]*", name) or "%" in str(Path(args.output).parent):

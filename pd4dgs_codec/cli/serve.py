@@ -24,7 +24,8 @@ examples:
 def parser() -> options.Parser:
     p = options.Parser("serve", "DIR", "Serve a folder over HTTP, at the rate of a slow link if asked for.", DETAILS)
     p.add_argument("input", metavar="DIR", help="folder to serve")
-    p.add_argument("--host", default="127.0.0.1", metavar="H", help="address to listen on (default: 127.0.0.1)")
+    what = "address to listen on (default: 127.0.0.1)"
+    p.add_argument("--host", type=options.host, default="127.0.0.1", metavar="H", help=what)
     p.add_argument("--port", type=options.port, default=8000, metavar="N", help="port; 0: any free one (default: 8000)")
     add_link(p)
     p.add_common()
@@ -36,17 +37,17 @@ def add_link(p: options.Parser) -> None:
     what = "rate of the link in bits per second, such as 2M (default: unlimited)"
     p.add_argument("--rate", type=options.rate, metavar="BPS", help=what)
     what = "round-trip time of the link, such as 50ms (default: 0)"
-    p.add_argument("--latency", type=options.duration, default=0.0, metavar="T", help=what)
+    p.add_argument("--latency", type=options.duration, metavar="T", help=what)
 
 
 def _serve(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.web.server import Link, Server
 
-    log = console.message if console.verbose else None
-    with Server(args.input, args.host, args.port, link=Link(args.rate), latency=args.latency, log=log) as server:
+    log, latency = console.message if console.verbose else None, args.latency or 0.0
+    with Server(args.input, args.host, args.port, link=Link(args.rate), latency=latency, log=log) as server:
         stop = set_by_signals()
         with server.running():
-            result = {"url": server.url, "folder": str(server.root), "rate": args.rate, "latency": args.latency}
+            result = {"url": server.url, "folder": str(server.root), "rate": args.rate, "latency": latency}
             console.result(result, server.url, on_stdout=True)
             stop.wait()
     return OK

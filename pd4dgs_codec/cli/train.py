@@ -9,7 +9,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.cli import options
+from pd4dgs_codec.cli import common, options
 from pd4dgs_codec.cli.common import OK, Console, UsageError, check_output, command, number, table, write_bytes
 from pd4dgs_codec.cli.progress import TrainingProgress
 from pd4dgs_codec.errors import RenderError, TrainError
@@ -55,7 +55,7 @@ def parser() -> options.Parser:
     add = p.add_argument
     add("source", metavar="SOURCE", help="dataset to train on, see below")
     add("-o", "--output", required=True, type=options.named, metavar="FILE.pt", help="checkpoint to write")
-    options.add_reading(p, defaults=False)
+    options.add_reading(p, unset=options.READING)
     options.add_background(p, "that of the data, white behind pictures with alpha")
     what = "0 (small files) to 100 (high quality), see below (default: 50)"
     add("--quality", type=options.checked(float, lambda q: 0 <= q <= 100, "0 to 100"), metavar="Q", help=what)
@@ -97,8 +97,8 @@ def _add_fields(p: options.Parser) -> None:
 
 def _train(args: argparse.Namespace, console: Console) -> int:
     _check_usage(args)
-    resuming_in_place = args.resume is not None and Path(args.resume).resolve() == Path(args.output).resolve()
-    check_output(args.output, args.overwrite or resuming_in_place)
+    in_place = args.resume is not None and common.same_file(args.resume, args.output)
+    check_output(args.output, args.overwrite or in_place)
     if args.log:
         check_output(args.log, args.overwrite or args.resume is not None)
     from pd4dgs_codec.interchange.teacher import load_source
@@ -142,10 +142,11 @@ main = command(parser, _train)
 
 
 def _check_usage(args: argparse.Namespace) -> None:
+    options.conditional(args, args.rollout in (None, "key"), "needs --rollout key", key_instant=None)
     if args.rate_scale and "rate" in args.without:
         raise UsageError(f"found --rate-scale {args.rate_scale:g} and --without rate, expected one of them")
     for option, name in (("-o", args.output), ("--resume", args.resume)):
-        if args.log and name and os.path.realpath(args.log) == os.path.realpath(name):
+        if args.log and name and common.same_file(args.log, name):
             raise UsageError(f"--log and {option} both name {name}; expected two files")
 
 

@@ -37,7 +37,7 @@ def parser() -> options.Parser:
         help="write one HTML file that shows the scene, and do not serve",
     )
     what = "port to listen on; 0: any free one (default: 0)"
-    p.add_argument("--port", type=options.port, default=0, metavar="N", help=what)
+    p.add_argument("--port", type=options.port, metavar="N", help=what)
     p.add_argument("--no-browser", action="store_true", help="print the address without opening a browser")
     add_link(p)
     p.add_common()
@@ -49,6 +49,7 @@ def _view(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.web.page import page
     from pd4dgs_codec.web.server import Link, Server
 
+    options.conditional(args, not args.output, "has no effect with -o", port=0, rate=None, latency=0.0)
     if args.output:
         check_output(args.output, args.overwrite)
         content = args.input if is_url(args.input) else _packed(args.input, console)

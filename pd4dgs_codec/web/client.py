@@ -319,8 +319,8 @@ def prefix_end(slices: list[tuple[int, int]], max_layer: int | None = None, max_
 
 
 def check_end(end: int) -> None:
-    """Raises LimitExceeded if a file, or the requested prefix of it, ends more than a byte beyond MOST_BYTES."""
-    if end > MOST_BYTES + 1:
+    """Raises LimitExceeded if a file, or the requested prefix of it, ends beyond MOST_BYTES."""
+    if end > MOST_BYTES:
         raise LimitExceeded(f"ends at byte {end:,}, limit {MOST_BYTES:,} without a budget of bytes")
 
 
@@ -345,10 +345,10 @@ def fetch(transfer: Transfer, max_layer: int | None = None, max_bytes: int | Non
             if size is None:
                 return bytes(transfer.data)
             header = bytes(transfer.data[:size])
-            end = info(header)["bytes"] + 1 if whole else prefix_end(slice_ends(header), max_layer, max_bytes)
+            end = info(header)["bytes"] if whole else prefix_end(slice_ends(header), max_layer, max_bytes)
             if max_bytes is None:
                 check_end(end)
-            return fill(max(end, size))
+            return fill(end + 1 if whole else max(end, size))
 
 
 def _header_size(data: bytes | bytearray) -> int | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import platform
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -89,8 +90,9 @@ def test_a_file_alone_has_bytes_and_times_but_no_error(scene_pd4, tmp_path, caps
     assert bench.main(["codec", str(scene_pd4), "--repeats", "1", "--json"]) == 0
     (point,) = json.loads(capsys.readouterr().out)["points"]
     assert point["error"] is None and point["bytes"] == scene_pd4.stat().st_size
-    assert bench.main(["codec", str(scene_pd4), "--plot", str(tmp_path / "p.png")]) == 2
-    assert "no error to plot" in capsys.readouterr().err
+    for ignored in (["--plot", str(tmp_path / "p.png")], ["--efforts", "1"], ["--data", "set"], ["--views", "2"]):
+        assert bench.main(["codec", str(scene_pd4), *ignored]) == 2
+        assert f"{ignored[0]} needs a checkpoint" in capsys.readouterr().err
 
 
 # -- render ------------------------------------------------------------------------------------------------------------
@@ -150,6 +152,15 @@ def test_presets_are_trained_and_compared(tmp_path, capsys, monkeypatch):
 # -- latency -----------------------------------------------------------------------------------------------------------
 
 
+def test_a_process_prints_text_and_ends_with_its_block():
+    with latency.python(
+        "-c", "import os, time; print(os.environ['WORD'], flush=True); time.sleep(60)", WORD="ä"
+    ) as out:
+        assert out.readline() == "ä\n"
+        start = time.monotonic()
+    assert time.monotonic() - start < 30 and out.closed
+
+
 def test_latency_of_a_file(scene_pd4, data, capsys, monkeypatch):
     monkeypatch.setattr(latency, "first_start", lambda data, rate: 12.3)  # takes seconds to compile the kernels
     assert bench.main(["latency", str(scene_pd4), "--rates", "50M", "--runs", "1", "--json"]) == 0
@@ -191,6 +202,7 @@ def test_help_has_examples(report, capsys):
         ("codec none.pt --modes ans,zip", 2, "ans, lzma"),
         ("codec none.pt --plot p.gif", 2, "ends in .png"),
         ("render none.pd4 --only kernel", 2, "kernels"),
+        ("render none.pd4 --holdout 0", 2, "--holdout needs --data"),
         ("train", 2, "--from"),
         ("train synthetic:static --from a.pt", 2, "no SOURCE"),
         ("train synthetic:static --seconds 3 --iterations 3", 2, "one of them"),

@@ -51,7 +51,22 @@ CASES = [
     (2, "encode m.pt -o s.pd4 --effort 10", "--effort"),
     (2, "encode m.pt -o s.pd4 --step-scale -1", "a number > 0"),
     (2, "encode m.pt -o s.pd4 --lay 1", "--lay"),
-    (2, "encode m.pt -o s.pd4 --min-gain 1", "--min-gain needs --data"),
+    # options that would be ignored
+    *((2, f"encode m.pt -o s.pd4 {option}", "needs --data") for option in ("--holdout 0", "--views 3", "--min-gain 1")),
+    (2, "encode m.pt -o s.pd4 --downscale 2", "--downscale needs --data, --slices or --target-size"),
+    *((2, f"render s.pd4 -o a.gif {option}", "needs --data") for option in ("--holdout 0", "--split test")),
+    (2, "render s.pd4 -o %04d.png --fps 5", "--fps needs a .gif or .mp4"),
+    *((2, f"export SCENE -o a --to ply {option}", "needs --data or") for option in ("--holdout 0", "--downscale 2")),
+    (2, "package SCENE -o out --no-video --fps 5", "--fps has no effect with --no-video"),
+    *((2, f"package empty -o empty {option}", "needs a .pd4") for option in ("--fps 5", "--immutable", "--no-video")),
+    *(
+        (2, f"view s.pd4 -o a.html {option}", "has no effect with -o")
+        for option in ("--port 0", "--rate 2M", "--latency 0")
+    ),
+    *((2, f"batch m.jsonl -o out --op encode {option}", "needs --on") for option in ("--gpus 1", "--address a:1")),
+    (2, "batch m.jsonl -o out --op encode --on ray --slurm cluster=local", "--slurm needs --on slurm"),
+    (2, "prepare kept.gif -o out --fps 5", "--fps needs a folder of frames"),
+    (2, "train synthetic:local -o m.pt --rollout top --key-instant 0", "--key-instant needs --rollout key"),
     *((2, f"encode m.pt -o s.pd4 --source '{text}'", "one line of printable text") for text in ("a\nb", "\udcff")),
     *((2, f"render s.pd4 -o a.gif --fps {fps}", "a number from 0.01 to 1000") for fps in (1e-4, 1e308)),
     *(
@@ -74,8 +89,8 @@ CASES = [
     (2, "eval s.pd4 set --downscale half", "an integer >= 1"),
     (2, "export SCENE -o out --to obj", "invalid choice: 'obj'"),
     (2, "export SCENE -o out --to ply --time 1.5", "expected a number from 0 to 1"),
-    (2, "export SCENE -o out --to ply-seq --time 0.5", "found --time with --to ply-seq"),
-    (2, "export SCENE -o out --to ply --fps 5", "found --fps with --to ply"),
+    (2, "export SCENE -o out --to ply-seq --time 0.5", "--time needs --to ply, spz or glb"),
+    (2, "export SCENE -o out --to ply --fps 5", "--fps needs --to ply-seq or 4dgs"),
     (2, "batch m.jsonl -o out", "--op"),
     (2, "batch m.jsonl -o out --op explode", "explode"),
     (2, "batch m.jsonl -o out --op encode --slurm partition", "KEY=VALUE"),

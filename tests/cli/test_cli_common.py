@@ -11,7 +11,7 @@ import pytest
 
 from pd4dgs_codec import FORMAT_VERSION, io
 from pd4dgs_codec import __main__ as dispatcher
-from pd4dgs_codec.cli import options
+from pd4dgs_codec.cli import common, options
 from pd4dgs_codec.data.bodies import MOTIONS, THINGS
 
 VERBS = {verb: import_module(f"pd4dgs_codec.cli.{dispatcher.MODULES.get(verb, verb)}") for verb in dispatcher.VERBS}
@@ -63,6 +63,15 @@ def test_help_and_usage_errors_load_no_heavy_module():
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
     assert done.stdout.strip() == "['numpy']", done.stderr  # by the fields of TrainConfig
+
+
+def test_links_and_other_spellings_name_one_file(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "a").touch()
+    (tmp_path / "link").symlink_to("a")
+    assert common.same_file("a", str(tmp_path / "a")) and common.same_file("./link", "a")
+    assert common.same_file("missing", "./missing") and not common.same_file("a", "b")
+    assert not common.same_file("-", "-") and not common.same_file("-", "./-"), "stdin is no file"
 
 
 def test_rates_are_bits_per_second():

@@ -47,6 +47,7 @@ def test_json_rate_and_latency(folder):
         (["--rate", "0"], 2),
         (["--rate", "nan"], 2),
         (["--latency", "-1ms"], 2),
+        (["--host", ""], 2),
         (["--host", "203.0.113.77", "--port", "0"], 1),
     ],
 )

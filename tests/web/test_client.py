@@ -345,6 +345,17 @@ def test_a_header_that_promises_much_is_refused_before_its_bytes_arrive(monkeypa
         list(client.scenes())
 
 
+@pytest.mark.parametrize("max_layer", [None, 0])
+def test_files_and_prefixes_may_end_at_the_limit_but_not_behind_it(scene_bytes, monkeypatch, max_layer):
+    end = len(scene_bytes) if max_layer is None else slice_ends(scene_bytes)[0][1]
+    with FaultyServer(scene_bytes) as server:
+        monkeypatch.setattr("pd4dgs_codec.web.client.MOST_BYTES", end)
+        assert fetch(Transfer(server.url), max_layer) == scene_bytes[:end]
+        monkeypatch.setattr("pd4dgs_codec.web.client.MOST_BYTES", end - 1)
+        with pytest.raises(LimitExceeded, match=f"ends at byte {end:,}"):
+            fetch(Transfer(server.url), max_layer)
+
+
 def test_a_frame_that_differs_from_the_list_is_refused_as_soon_as_it_is_there(scene_bytes):
     """Before the bytes of the chunk that it announces."""
     start = read_preamble(scene_bytes).size
