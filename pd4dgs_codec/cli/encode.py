@@ -63,7 +63,7 @@ def parser() -> options.Parser:
     what = "multiply all quantisation steps; above 1 files are smaller and coarser (default: %(default)g)"
     add("--step-scale", type=options.positive_float, default=DEFAULTS.step_scale, metavar="X", help=what)
     add("--no-verify", action="store_true", help="do not decode the result to compare every symbol")
-    what = "cut layers into slices of at most SIZE bytes, as far as planes and networks allow (default: no slices)"
+    what = "cut layers into slices: the first of SIZE bytes, later ones of two thirds at most (default: no slices)"
     add("--slices", type=options.size, default=DEFAULTS.slices, metavar="SIZE", help=what)
     what = "upper limits of the layers' bytes (layer 0 with the header), met by coarser steps and fewer anchors"
     add("--target-size", type=options.layer_sizes, default={}, metavar="L0=425k,...", help=what)

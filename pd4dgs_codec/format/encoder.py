@@ -16,13 +16,14 @@ from pd4dgs_codec.format.check import ErrorBound, check_scene, rounding_bounds, 
 from pd4dgs_codec.format.container import (
     CHUNK_OVERHEAD,
     FLAG_ANCILLARY,
+    PREAMBLE_SIZE,
     read_preamble,
     slice_flags,
     write_chunk,
     write_preamble,
 )
 from pd4dgs_codec.format.decoder import read_layers
-from pd4dgs_codec.format.header import Header, pack_header, payload_digest, scene_id_of, unpack_header
+from pd4dgs_codec.format.header import DIGEST_SIZE, Header, pack_header, payload_digest, scene_id_of, unpack_header
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.format.metadata import CHUNK_TYPE, Metadata, write_metadata
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
@@ -33,8 +34,7 @@ from pd4dgs_codec.format.symbols import LayerSymbols, SceneSymbols, sliced
 from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.threads import one_blas_thread
 
-#: Bytes allowed for the preamble and header of a sliced file, which count with the first slice.
-HEADER = 1000
+LATER = 2 / 3  #: size of the slices behind the first one of layer 0, of that one's
 TRIES = 4  #: most encodes of one slice to reach its size
 SLACK = 0.97  #: share of the size that a slice aims at
 FULL = 0.92  #: share of the size that is large enough
@@ -134,7 +134,7 @@ def encode_with_report(
     bounds = rounding_bounds(symbols)
     errors = verify_errors(planned.scene, symbols, bounds) if options.verify else []
     del planned  # as large as the scene
-    written = _write_layers(symbols, options, utility or by_size)
+    written = _write_layers(symbols, bounds, options, utility or by_size)
     about = write_metadata(metadata) if metadata is not None else b""
     data = _container(symbols, bounds, options.mode, written, about)
     reports = [_layer_report(layer, slices) for layer, slices in zip(symbols.layers, written, strict=True)]
@@ -158,7 +158,7 @@ def by_size(scene: Scene) -> np.ndarray:
 
 
 def with_metadata(data: bytes, metadata: Metadata) -> bytes:
-    """Returns a complete file with a metadata chunk appended. Only the chunk list in the header changes."""
+    """Appends metadata to a complete file that has none. In the header only the chunk list changes."""
     preamble = read_preamble(data)
     header, about = unpack_header(preamble.header), write_metadata(metadata)
     packed = pack_header(replace(header, chunks=(*header.chunks, (CHUNK_TYPE, len(about)))))
@@ -167,43 +167,46 @@ def with_metadata(data: bytes, metadata: Metadata) -> bytes:
 
 
 def _write_layers(
-    symbols: SceneSymbols, options: EncodeOptions, utility: Callable[[Scene], np.ndarray]
+    symbols: SceneSymbols, bounds: dict[str, float], options: EncodeOptions, utility: Callable[[Scene], np.ndarray]
 ) -> list[list[_Slice]]:
-    """Writes the slices of each layer."""
+    """Writes the slices of each layer. The preamble and the header count with the first slice."""
     if not options.slices:
         return [[_Slice(len(layer.anchor_q), *write_layer(layer, options))] for layer in symbols.layers]
     ends = np.cumsum([len(layer.anchor_q) for layer in symbols.layers])[:-1]
     values = np.split(utility(symbols.scene()), ends)
-    written = [_write_slices(layer, options, u) for layer, u in zip(symbols.layers, values, strict=True)]
+    bits = sum(float(layer.bits_per_row().sum()) for layer in symbols.layers)
+    most = len(values) + math.ceil(bits / 8 / (LATER * SLACK * options.slices))  # more than there will be
+    head = PREAMBLE_SIZE + len(_header(symbols, bounds, options.mode, ((0, options.slices),) * most))
+    sizes = [options.slices - head, *[LATER * options.slices] * (len(values) - 1)]
+    written = [
+        _write_slices(layer, options, size, u) for layer, size, u in zip(symbols.layers, sizes, values, strict=True)
+    ]
     if (chunks := sum(map(len, written))) > MAX_CHUNKS:
         raise EncodeError(f"{chunks} slices, expected at most {MAX_CHUNKS}: let slices take more bytes")
     return written
 
 
-def _write_slices(layer: LayerSymbols, options: EncodeOptions, utility: np.ndarray) -> list[_Slice]:
-    """Writes the slices of a layer, in order, of about options.slices bytes at most.
+def _write_slices(layer: LayerSymbols, options: EncodeOptions, size: float, utility: np.ndarray) -> list[_Slice]:
+    """Writes the slices of a layer, in order.
 
-    utility: float [n], of the layer's anchors; the highest come first. The first slice of layer 0 is full, for the
-    first picture. The first slice of a later layer of several slices is at most half full, so that motion shows early.
-    Further slices are of equal size. If planes and networks alone exceed the size, the first slice has no anchors,
-    except in layer 0, where a picture needs some.
+    size: most bytes of the first slice; later ones have LATER * options.slices at most and are equal. utility: float
+    [n], of the layer's anchors; the highest come first. If planes and networks alone exceed the size, the first slice
+    has no anchors, except in layer 0, where a picture needs some.
     """
     rows = np.argsort(-utility, kind="stable")
     costs = np.cumsum([0.0, *layer.bits_per_row()[rows]]) / 8  # bytes of the first 0, 1, .. rows
     done, found, past = 0, list[_Slice](), Past[Fitted]()
     scale = 1.0  # bytes that a slice takes per byte expected
+    fixed = len(write_layer(sliced(layer, rows[:0], True), options)[0])  # of planes and networks, in the first slice
     while done < len(rows) or not found:
-        room = float(options.slices - CHUNK_OVERHEAD - (0 if found else HEADER))
+        room = size - CHUNK_OVERHEAD
         least = 1 if found or layer.kind.layer == 0 else 0
-        fixed = 0 if found else len(write_layer(sliced(layer, rows[:0], True), options)[0])
-        left = (costs[-1] - costs[done]) * scale + fixed
         if found:
-            number = math.ceil(left / (room * SLACK))
-            room = left / number / SLACK if number > 1 else room
-        elif layer.kind.layer == 0:
+            fixed, room = 0, LATER * options.slices - CHUNK_OVERHEAD
+            number = math.ceil((costs[-1] - costs[done]) * scale / (room * SLACK))
+            room = room if number == 1 else (costs[-1] - costs[done]) * scale / number / SLACK
+        elif least:
             room = max(room, 2 * fixed)
-        elif left > room:
-            room /= 2
         tries: list[tuple[bool, int, _Slice, Past[Fitted]]] = []  # fits, anchors, slice, state for the next slice
         for _ in range(TRIES):
             expected = (costs[done + 1 :] - costs[done]) * scale + fixed
@@ -236,9 +239,20 @@ def _container(
     if metadata:
         parts.append((CHUNK_TYPE, FLAG_ANCILLARY, metadata))
     chunks = tuple((kind, len(payload)) for kind, _, payload in parts)
-    packed = pack_header(Header(chunks, mode, symbols.grid, symbols.info, bounds, digest))
+    packed = _header(symbols, bounds, mode, chunks, digest)
     scene_id = scene_id_of(packed)
     return b"".join([write_preamble(packed), *(write_chunk(kind, flags, scene_id, p) for kind, flags, p in parts)])
+
+
+def _header(
+    symbols: SceneSymbols,
+    bounds: dict[str, float],
+    mode: str,
+    chunks: tuple[tuple[int, int], ...],
+    digest: bytes = bytes(DIGEST_SIZE),
+) -> bytes:
+    """Returns the header's bytes. chunks: type and bytes of each."""
+    return pack_header(Header(chunks, mode, symbols.grid, symbols.info, bounds, digest))
 
 
 def _check_file(data: bytes, fingerprints: list[bytes]) -> None:

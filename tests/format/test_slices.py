@@ -115,13 +115,20 @@ def test_slices_take_what_was_asked_and_the_report_says_so():
     assert "anchors" not in info(data[: ends[1]])["layers"][0]
 
 
-def test_motion_shows_early_and_no_slice_is_a_small_rest():
-    """A later layer of several slices begins with half a slice; the slices behind the first of a layer are alike."""
+def test_later_slices_are_smaller_and_none_is_a_small_rest():
+    """Slices behind the first picture take two thirds at most; those behind the first of a layer are alike."""
     _, report = encode_with_report(make_scene(3, anchors=3000), effort=1, slices=4000)
     for layer in report.layers:
         first, *others = (row.bytes for row in layer.slices)
-        assert len(others) > 3 and max(others) <= 4000 and min(others) > 0.75 * max(others)
-        assert first <= (2000 if layer.layer else 4000)
+        assert len(others) > 3 and max(others) <= 2667 and min(others) > 0.75 * max(others)
+        assert first <= (2667 if layer.layer else 4000)
+
+
+def test_the_first_slice_with_the_header_takes_what_was_asked():
+    """The header has an entry for each of some fifty slices."""
+    data, report = encode_with_report(make_scene(3, anchors=6000), effort=1, slices=2500)
+    assert report.first_bytes == chunks_of(data)[2][0]
+    assert 0.95 * 2500 < report.first_bytes <= 2500
 
 
 def test_slices_that_cannot_be_are_refused(monkeypatch):
