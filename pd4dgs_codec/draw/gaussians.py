@@ -249,7 +249,7 @@ def _seen_from(anchors: Array, eye: Array, features: int) -> tuple[Array, Array]
 
 def seen(opacity: Array, mask: Array, faintest: float) -> Array:
     """Returns int64 [K]: the slots whose opacity [n, G] times mask [n] is at least `faintest`."""
-    keep = np.empty(opacity.size + 1, np.int64)
+    keep = np.empty(opacity.size, np.int64)
     found: Array = keep[: _seen(keep, opacity, mask, faintest)].copy()
     return found
 

@@ -453,7 +453,7 @@ def cost_matrix(
 
     values, counts: int64, concatenated over channels, which end at `ends` [channels].
     windows: int64 [priors, 3] of (kmin, n, index of the first entry in `costs`). costs: int64, of all tables' entries.
-    The cost of exceptions, symbols outside a window, is an estimate.
+    The cost of exceptions, symbols outside a window, is exact but for the gaps between them, which are an estimate.
     """
     matrix = np.empty((len(ends), len(windows)), np.int64)
     for column in range(len(windows)):
@@ -468,12 +468,12 @@ def cost_matrix(
                 if kmin <= value < end:
                     cost += count * costs[at + value - kmin]
                 else:
-                    distance = 2 * (kmin - value if value < kmin else value - end)
+                    distance = 2 * (kmin - 1 - value) + 1 if value < kmin else 2 * (value - end)
                     number += count
                     value_bytes += count * (1 + (distance >= 1 << 7) + (distance >= 1 << 14) + (distance >= 1 << 21))
             if number:
                 step_bytes = 1 + (total > 90 * number) + (total > 12000 * number)
-                cost += 8 * BIT * (1 + (number >= 128) + step_bytes * number + value_bytes)
+                cost += 8 * BIT * (1 + (number > 1 << 7) + (number > 1 << 14) + step_bytes * number + value_bytes)
             matrix[channel, column] = cost
             first = ends[channel]
     return matrix

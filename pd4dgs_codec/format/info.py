@@ -58,7 +58,7 @@ def info(data: bytes) -> dict[str, Any]:
                     name = Section(key).name.lower()
                     row["sections"][name] = row["sections"].get(name, 0) + section_bytes
             else:
-                for known in ("anchors", "steps", "planes", "sections", "networks"):
+                for known in ("anchors", "steps", "planes", "networks", "key_instant", "sections"):
                     row.pop(known, None)
         offset += size
     return {

@@ -167,7 +167,7 @@ class Fit:
 
     bytes: size that it adds to the file, for layer 0 with the header and HEADER_MARGIN. factors: on the steps, by field
     of Steps. steps: the resulting steps. moved: number of anchors that left the layer. to_layer: the layer that they
-    went to, None if they were dropped. harm: the largest omission error among them, None without any.
+    went to, None if they were dropped. omission_error: the largest among them, None without any.
     """
 
     layer: int
@@ -176,7 +176,7 @@ class Fit:
     factors: dict[str, float] = field(default_factory=dict)
     moved: int = 0
     to_layer: int | None = None
-    harm: float | None = None
+    omission_error: float | None = None
     steps: dict[str, float] = field(default_factory=dict)
 
 
@@ -296,6 +296,6 @@ class _Layer:
             factors=factors,
             moved=moved,
             to_layer=next(iter(self.scene.layers[self.index + 1 :]), None),
-            harm=float(self.errors[moved - 1]) if moved else None,
+            omission_error=float(self.errors[moved - 1]) if moved else None,
             steps={k: steps[k] for k in factors},
         )

@@ -226,8 +226,10 @@ class TrainState:
 
     @torch.no_grad()
     def return_to(self, before: tuple[Any, ...]) -> None:
-        """Undoes all steps since a `snapshot`."""
-        values, self.optimiser.moments, generator, noise, self.order = before
+        """Undoes all steps since a `snapshot`, which can be returned to again."""
+        values, moments, generator, noise, order = before
+        self.optimiser.moments = {p: {n: m.clone() for n, m in own.items()} for p, own in moments.items()}
+        self.order = list(order)
         for parameter, value in values.items():
             parameter.copy_(value)
         self.generator.set_state(generator)

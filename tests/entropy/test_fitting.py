@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pd4dgs_codec.entropy import fit_kernels, fitting
+from pd4dgs_codec.entropy import channels, fit_kernels, fitting
 from pd4dgs_codec.entropy.channels import encode_channels
 from pd4dgs_codec.entropy.fitting import fit_best, histogram, pool
 from pd4dgs_codec.entropy.tables import BIT, entropy_bits
@@ -92,6 +92,19 @@ def test_costs_under_a_prior_are_those_it_was_chosen_by():
     priors = [fit_best(h, 5) for h in histograms]
     matrix = fitting.costs_of(histograms, priors)
     np.testing.assert_array_equal(np.diag(matrix), [p.own for p in priors])
+
+
+@pytest.mark.parametrize("number", [100, 128, 129])
+@pytest.mark.parametrize("value", [-1, -64, -65, 2, 65, 66])
+def test_the_cost_of_exceptions_is_that_of_their_bytes(number, value):
+    """At the numbers and distances from the window 0..1 at which a varint takes one byte more; the gaps take one."""
+    inside = np.arange(2000) % 2
+    known, symbols = fit_best(histogram(inside), 5), inside.copy()
+    symbols[: 10 * number : 10] = value
+    out, (kept, exceptions) = bytearray(), channels._split(symbols, known.prior.window)
+    channels._write_channel(out, known.prior, exceptions, [known.prior])
+    cost = known.costs[kept].sum() + 8 * BIT * (len(out) - 1)  # without the token of the prior
+    assert fitting.costs_of([histogram(symbols)], [known]) == cost
 
 
 def test_channels_share_a_prior_only_if_that_saves_bits():

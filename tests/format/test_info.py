@@ -43,6 +43,15 @@ def test_info_needs_the_header_alone():
     assert whole["layers"][1]["planes"] == [[2, 3, 2, 4, 5]]
 
 
+def test_a_layer_without_its_last_slice_has_only_its_place():
+    data = encode(make_scene(3, anchors=300, key=5), effort=1, slices=1700)
+    slices = info(data)["layers"][1]["slices"]
+    assert len(slices) > 1 and "key_instant" in info(data)["layers"][1]
+    cut = info(data[: slices[-1]["offset"]])
+    assert "anchors" in cut["layers"][1]["slices"][-2] and "anchors" not in cut["layers"][1]["slices"][-1]
+    assert set(cut["layers"][1]) == {"layer", "offset", "bytes", "end", "slices"}
+
+
 def test_hashes_name_the_contents_not_the_coding():
     data = small_file(omit="nothing")
     lzma = encode(SCENE, layers=2, mode="lzma", effort=1, omit="nothing")

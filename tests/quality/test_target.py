@@ -152,7 +152,7 @@ def test_anchors_of_least_harm_move_to_the_next_layer_and_out_of_the_highest(sce
     fitted, left_out, (row,) = fit(scene, {0: round(0.8 * whole[0])}, lambda decoded: 0.0, harm, EncodeOptions(**FAST))
     moved, own = fitted.mask[0] == 0, np.arange(scene.rows[-1]) < scene.rows[0]
     assert row.moved == (moved & own).sum() > 0 and row.to_layer == 1 and not left_out
-    assert harm(scene, 0)[moved & own].max() == row.harm < harm(scene, 0)[~moved & own].min()
+    assert harm(scene, 0)[moved & own].max() == row.omission_error < harm(scene, 0)[~moved & own].min()
     assert (fitted.mask[1] > 0).all(), "they are shown from there on"
 
     alone = plan(scene, EncodeOptions(layers=0)).scene

@@ -307,6 +307,25 @@ def test_the_practice_of_a_level_below_one_that_stays_is_undone(dataset, monkeyp
 
 
 @pytest.mark.usefixtures("short_runs_have_phases")
+def test_a_level_that_changes_no_picture_and_stays_leaves_the_model_as_it_is(dataset, monkeypatch):
+    monkeypatch.setattr(levels, "MIN_PIXELS", math.inf)
+    learner, before, _ = judged(dataset, monkeypatch, -math.inf)
+    assert learner.model.level == 2 and all(map(torch.equal, learner.optimiser.parameters, before))
+
+
+def test_steps_since_a_snapshot_are_undone_as_often_as_needed(dataset):
+    learner, after = trainer_of(dataset, steps=2).learner, []
+    before = learner.snapshot()
+    for _ in range(3):
+        learner.step()
+        after.append([p.detach().clone() for p in learner.optimiser.parameters])
+        learner.return_to(before)
+        learner.iteration = 2
+    for again in after[1:]:
+        assert all(map(torch.equal, after[0], again))
+
+
+@pytest.mark.usefixtures("short_runs_have_phases")
 def test_levels_without_gain_go_from_the_top_and_leave_their_anchors(dataset, monkeypatch):
     learner, before, _ = judged(dataset, monkeypatch, math.inf)
     assert [row["level"] for row in learner.levels.left_out] == [2, 1] and learner.model.level == 0

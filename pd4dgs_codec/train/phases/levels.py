@@ -82,12 +82,12 @@ class SelectLevels(phases.Phase):
         needed = MIN_GAIN_1 - above
         if level == 2:
             needed = max(MIN_GAIN_2, SHARE_2 * workers.alike(lambda: gain_over(0)))
-        before, logits = state.snapshot(), state.model.mask_logits
-        with torch.no_grad():
-            logits[:, below] += softplus(logits[:, level])  # the anchors of the level, without its motion
         if sum(int(mask.sum()) for mask in acts) < MIN_PIXELS:
             return 0.0, needed
 
+        before, logits = state.snapshot(), state.model.mask_logits
+        with torch.no_grad():
+            logits[:, below] += softplus(logits[:, level])  # the anchors of the level, without its motion
         gain = math.inf
         try:
             self._practise(below, max(MIN_PRACTICE, state.steps_in(PRACTICE)))
