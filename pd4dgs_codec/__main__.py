@@ -8,20 +8,20 @@ from pd4dgs_codec.cli.common import USAGE, open_streams, say, tell
 from pd4dgs_codec.cli.options import version_line
 
 VERBS = {
-    "prepare": "find the camera's poses in a video or its frames",
+    "prepare": "estimate the camera poses of a video or its frames",
     "train": "train a layered scene from posed images",
-    "encode": "pack a trained scene into a .pd4 file",
-    "decode": "unpack a .pd4 file, or the first layers of one",
-    "info": "show the header and the layers of a .pd4 file",
-    "render": "render a file to pictures or a video",
-    "eval": "measure each level of a file against a dataset",
-    "import": "take over a model that another trainer made",
-    "export": "write a scene as Gaussians that other viewers read",
-    "bench": "measure what the codec, the renderer and the trainer promise",
-    "package": "lay out a file for DASH, HLS and plain HTTP",
-    "serve": "serve a folder over HTTP, at the rate of a slow link if wanted",
+    "encode": "encode a trained scene as a .pd4 file",
+    "decode": "decode a .pd4 file or its first layers",
+    "info": "show the header and layers of a .pd4 file",
+    "render": "render a scene to images or a video",
+    "eval": "measure quality, bytes and time of each level on a dataset",
+    "import": "import a Scaffold-GS model",
+    "export": "export a scene as Gaussians for other viewers",
+    "bench": "measure error against run time, stability and latency",
+    "package": "make a folder for web servers, with a page, DASH and HLS",
+    "serve": "serve a folder over HTTP, with an optional rate limit",
     "view": "show a scene in the browser",
-    "batch": "run a command on every scene of a library",
+    "batch": "run a command on many scenes",
 }
 
 MODULES = {"import": "import_model"}  #: modules of verbs that are Python keywords
@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     verb = arguments[0] if arguments else "--help"
     if verb in ("-h", "--help"):
-        lines = ["usage: python -m pd4dgs_codec VERB ...   (VERB --help explains each)", ""]
+        lines = ["usage: python -m pd4dgs_codec VERB ...   (VERB --help shows its options)", ""]
         lines += [f"  {name:<9}{summary}" for name, summary in VERBS.items()]
         if arguments:
             return tell("pd4dgs", "\n".join(lines))

@@ -132,7 +132,7 @@ def test_no_traceback_from_the_first_import_to_the_last_line(when, number):
     script = PROGRAM.replace("WHEN", repr(when)).replace("NUMBER", str(int(number)))
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)
     if when == "middle":
-        told = "pd4dgs-info: error: interrupted; what was not finished is removed\n"
+        told = "pd4dgs-info: error: interrupted; unfinished outputs were removed\n"
         assert done.returncode == 1 and done.stderr == told
     else:
         assert done.returncode == -number and done.stderr == ""

@@ -84,36 +84,35 @@ class Manifest:
                 try:
                     line = _line(number, raw, op, check)
                     if first.setdefault(line.output, number) != number:
-                        what = f"output {line.output!r} is that of line {first[line.output]}"
-                        raise DataError(f"{what}; expected one of its own")
+                        raise DataError(f"found output {line.output!r} of line {first[line.output]}, expected another")
                     self.lines.append(line)
                 except DataError as error:
                     self.faults.append((number, str(error)))
                 except Exception as error:  # an error that no check foresaw fails this line only
                     self.faults.append((number, one_line(f"{type(error).__name__}: {error}")))
         if not (self.lines or self.faults):
-            raise DataError(f"{place}: holds no lines, expected a JSON object for each scene")
+            raise DataError(f"{place}: is empty, expected one JSON object per scene")
 
 
 def _line(number: int, raw: bytes, op: Op, check: Callable[[dict[str, Any]], None]) -> Line:
     try:
         content = json.loads(raw.decode("utf-8-sig").rstrip())
     except json.JSONDecodeError as error:
-        raise DataError(f"not JSON: {error.msg}, at its character {error.pos + 1}") from None
+        raise DataError(f"invalid JSON: {error.msg} at character {error.pos + 1}") from None
     except (ValueError, RecursionError) as error:
-        raise DataError(f"not JSON: {error}") from None
+        raise DataError(f"invalid JSON: {error}") from None
     if not isinstance(content, dict) or not set(content) <= set(KEYS):
         found = ", ".join(map(str, content)) if isinstance(content, dict) else type(content).__name__
-        raise DataError(f"found {found}; expected an object of {', '.join(KEYS)}")
+        raise DataError(f"found {found}, expected an object with {', '.join(KEYS)}")
     source, options = content.get("source"), content.get("options", {})
     if not isinstance(source, str) or not source:
-        raise DataError(f"source is {source!r}, expected a path or a URI")
+        raise DataError(f"found source {source!r}, expected a path or a URI")
     if not isinstance(options, dict):
-        raise DataError(f"options are {options!r}, expected an object")
+        raise DataError(f"found options {options!r}, expected an object")
     output = content.get("output", default_output(source, op))
     plain = isinstance(output, str) and output.isprintable() and "\\" not in output
     if not plain or {"", ".", ".."} & set(output.split("/")) or output.endswith(store.RECORD):
-        raise DataError(f"output is {output!r}, expected a path below -o, which does not end in {store.RECORD}")
+        raise DataError(f"found output {output!r}, expected a path relative to -o without the suffix {store.RECORD}")
     check(options)
     inputs = {name: _absolute(options[name]) for name in op.inputs if name in options}
     return Line(number, _absolute(source), output, options | inputs)
@@ -136,16 +135,18 @@ def arguments(verb: str, source: str, output: str, options: dict[str, Any]) -> l
     options = dict(options)
     if verb == "eval":
         if not isinstance(options.get("data"), str):
-            raise DataError("eval needs the option data: the dataset to compare with")
+            raise DataError("eval needs the option data, its dataset")
         argv = [source, options.pop("data")]
     else:
         argv = [source, "--output", output]
     for name, value in options.items():
         if name in RESERVED or not name.replace("-", "").isalnum() or name.startswith("-"):
-            raise DataError(f"option {name!r} is not one that a line can set")
+            raise DataError(f"found option {name!r}, expected one that a manifest can set")
         for item in value if isinstance(value, list) else [value]:
             if not isinstance(item, (str, int, float)):
-                raise DataError(f"option {name} is {item!r}, expected a text, a number, true, or a list of them")
+                raise DataError(
+                    f"found {item!r} for option {name}, expected a string, a number, true or a list of these"
+                )
             if item is not False:
                 argv.append(f"--{name}" if item is True else f"--{name}={item}")
     return argv
@@ -167,10 +168,10 @@ def scan(folder: str, verb: str | None) -> Iterator[dict[str, str]]:
     found = {name: sources(op) for name, op in OPS.items()}
     kinds = [verb] if verb else [name for name in ("prepare", "train", "encode", "package") if found[name]]
     if len(kinds) > 1:
-        raise DataError(f"{folder}: holds sources for {' and '.join(kinds)}; expected --op with one of them")
+        raise DataError(f"{folder}: found sources for {' and '.join(kinds)}, expected --op with one of them")
     if not kinds or not found[kinds[0]]:
         wanted = OPS[verb].finds if verb else [suffix for op in OPS.values() for suffix in op.finds]
-        raise DataError(f"{folder}: holds no sources, expected {', '.join(dict.fromkeys(wanted)) or 'dataset folders'}")
+        raise DataError(f"{folder}: found no sources, expected {', '.join(dict.fromkeys(wanted)) or 'dataset folders'}")
     for name in found[kinds[0]]:
         output = posixpath.join(posixpath.dirname(name), default_output(name, OPS[kinds[0]]))
         yield {"source": posixpath.join(folder, name), "output": output}
@@ -229,7 +230,7 @@ def run_job(job: Job, command: Command) -> Outcome:
                 raise
             ignore_more()
             remove_temporaries()
-            outcome = Outcome(FAILED, "was interrupted")
+            outcome = Outcome(FAILED, "interrupted")
     peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return replace(outcome, message=one_line(outcome.message), cpu=time.process_time() - cpu, peak=peak)
 
@@ -250,7 +251,7 @@ def _outcome(job: Job, command: Command) -> Outcome:
 
 def _done_once(job: Job, command: Command) -> Outcome:
     if job.version != __version__:
-        raise DataError(f"the worker has pd4dgs-codec {__version__}, the batch began with {job.version}")
+        raise DataError(f"found pd4dgs-codec {__version__} on the worker, expected {job.version} as at the start")
     line, root = job.line, store.Root(job.root)
     record = root.record(line.output, job.overwrite)
     inputs = {"": line.source} | {name: line.options[name] for name in OPS[job.verb].inputs if name in line.options}
@@ -261,10 +262,10 @@ def _done_once(job: Job, command: Command) -> Outcome:
     if record and same and root.holds(line.output, record):
         return Outcome(ALREADY)
     if record and not same and not job.overwrite:
-        found = "holds what other input or options gave"
+        found = "was made with other inputs or options"
         if record.get("version") != __version__:
-            found = f"was made by pd4dgs-codec {record.get('version')}, this is {__version__}"
-        raise DataError(f"{found}; --overwrite makes it anew")
+            found = f"was made by pd4dgs-codec {record.get('version')}, expected {__version__}"
+        raise DataError(f"{found}; --overwrite replaces it")
     with _temporary_folder() as folder:
         files, report, work = _run(job, command, {name: _fetched(p, folder) for name, p in inputs.items()}, folder)
         whole = made_of | {"source": line.source, "report": report}
@@ -292,11 +293,13 @@ def _run(
     code, printed, log = command(job.verb, argv)
     work, log = time.process_time() - cpu, log[-LOG_BYTES:]
     if code != 0:
-        message = ([line for line in log.splitlines() if line.strip()] or [f"pd4dgs-{job.verb} ended with {code}"])[-1]
+        message = (
+            [line for line in log.splitlines() if line.strip()] or [f"pd4dgs-{job.verb} exited with code {code}"]
+        )[-1]
         raise CommandFailed(message, final=code == 2, log=log, work=work)
     report = json.loads(printed)
     if report.get("interrupted"):
-        raise CommandFailed("was interrupted before its end", log=log, work=work)
+        raise CommandFailed("interrupted before it finished", log=log, work=work)
     if op.stdout:
         output.write_text(json.dumps(report, indent=1) + "\n")
     if output.is_dir():

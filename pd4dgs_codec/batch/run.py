@@ -119,13 +119,13 @@ def _outcomes(engine: Engine, waiting: deque[Job]) -> Iterator[tuple[Job, Outcom
             patience = max(0.0, min(begun for _, begun in running.values()) + limit - time.monotonic())
         for future in wait(running, patience, FIRST_COMPLETED).done:
             error = future.exception()
-            why = f"its worker was lost: {type(error).__name__}: {error}"
+            why = f"the worker process was lost: {type(error).__name__}: {error}"
             yield running.pop(future)[0], future.result() if error is None else Outcome(FAILED, why)
         for future, (job, begun) in list(running.items()):
             if limit and time.monotonic() - begun >= limit:
                 engine.kill(future)
                 del running[future]
-                yield job, Outcome(FAILED, f"was ended after {limit:g} s, the most that --timeout allows")
+                yield job, Outcome(FAILED, f"stopped after {limit:g} s (--timeout)")
 
 
 # -- this machine ------------------------------------------------------------------------------------------------------
@@ -218,13 +218,15 @@ class Ray(Engine):
         try:
             ray.init(address=address, log_to_driver=False, logging_level="ERROR")
         except Exception as error:  # of many kinds
-            raise DataError(f"Ray cannot be reached at {address or 'an address of its own'}: {error}") from None
+            raise DataError(f"cannot connect to Ray ({address or 'a new local cluster'}): {error}") from None
         needed = {"CPU": settings.threads, "GPU": settings.gpus}
         nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
         if not any(all(node.get(kind, 0) >= count for kind, count in needed.items()) for node in nodes):
             ray.shutdown()
             wanted = " and ".join(f"{count:g} {kind}" for kind, count in needed.items() if count)
-            raise DataError(f"no node of the Ray cluster has the {wanted} that a scene takes")  # Ray would wait for one
+            raise DataError(
+                f"found no node of the Ray cluster with the {wanted} that a scene needs"
+            )  # Ray would wait for one
         self.room = settings.workers or int(ray.cluster_resources().get("CPU", 1) // settings.threads) or 1
         # `run` retries lost jobs itself, with one limit for all retries
         self.task = ray.remote(num_cpus=settings.threads, num_gpus=settings.gpus, max_retries=0)(_call)
@@ -259,7 +261,7 @@ def _check_listens(address: str | None) -> None:
     try:
         socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
     except (OSError, OverflowError) as error:
-        raise DataError(f"no Ray cluster answers at {address}: {error}") from None
+        raise DataError(f"cannot connect to Ray at {address}: {error}") from None
 
 
 # -- Slurm -------------------------------------------------------------------------------------------------------------
@@ -284,7 +286,7 @@ class Slurm(Engine):
             self.executor = submitit.AutoExecutor(folder=settings.folder, cluster=cluster)
             self.executor.update_parameters(**parameters)
         except (RuntimeError, ValueError, TypeError, NameError) as error:
-            raise DataError(f"submitit takes no such jobs: {error}") from None
+            raise DataError(f"submitit refused the settings: {error}") from None
         self.work, self.room = work, MAX_ARRAY if cluster == "slurm" else settings.workers or 1
         self.tasks: dict[Future[Outcome], Any] = {}
         threading.Thread(target=self._watch, daemon=True).start()
@@ -296,7 +298,7 @@ class Slurm(Engine):
             with self.executor.batch():
                 tasks = [self.executor.submit(self.work, job) for job in jobs]
         except RuntimeError as error:
-            raise DataError(f"Slurm takes no jobs: {error}") from None
+            raise DataError(f"Slurm refused the jobs: {error}") from None
         started = {Future[Outcome](): task for task in tasks}
         self.tasks |= started
         return list(started)

@@ -43,7 +43,7 @@ def absolute(place: str) -> str:
     if scheme in ("file", "local"):
         return _system(place)[1]
     if scheme not in available_protocols():
-        raise DataError(f"{place}: Protocol not known: {scheme}")
+        raise DataError(f"{place}: found the scheme {scheme}, expected one that fsspec supports")
     return place
 
 
@@ -142,7 +142,7 @@ class Root:
         try:
             self._put(PROBE, b"")
         except OSError as error:
-            raise DataError(f"{self.place}: takes no output: {error.strerror}") from None
+            raise DataError(f"{self.place}: cannot write: {error.strerror}") from None
         with suppress(Exception):  # a store that forbids deletion keeps an empty object
             self.system.rm_file(self._at(PROBE))
 
@@ -160,7 +160,7 @@ class Root:
             return dict(content)
         if overwrite:
             return None
-        raise DataError(f"{self.place}/{output}{RECORD}: is not a record of a batch; --overwrite replaces it")
+        raise DataError(f"{self.place}/{output}{RECORD}: is not a batch record; --overwrite replaces it")
 
     def holds(self, output: str, record: dict[str, Any]) -> bool:
         """Whether all files of a record exist with their recorded sizes."""
@@ -180,7 +180,7 @@ class Root:
             content = path.read_bytes()
             # a killed run may have left this very file, without its record
             if not replace and self._ask("cat_file", place) not in (None, content):
-                raise DataError(f"{self.place}/{place}: exists already, with no record of it; --overwrite replaces it")
+                raise DataError(f"{self.place}/{place}: exists already without a record; --overwrite replaces it")
             self._put(place, content)
             digest = hashlib.sha256(content).hexdigest()
             entries[name] = {"bytes": len(content), "sha256": digest, "type": media_type(place)}

@@ -28,16 +28,16 @@ ENGINES = ("local", "ray", "slurm")
 DETAILS = """\
 MANIFEST has one JSON object per line:
   {"source": "s3://films/kitchen.pt", "output": "kitchen.pd4", "options": {"effort": 3}}
-source is the input of the command, a path or a URI (s3, gs, https, ...). output is a path below -o (default: the name
-of the source). options are those of the command without dashes: true for a switch, a list for several values.
-For eval the dataset is the option data. `pd4dgs-batch scan FOLDER` writes a manifest of the sources in a folder.
+source is the input, a path or a URI (s3, gs, https, ...). output is a path relative to -o (default: named after the
+source). options are the command's options without dashes: true for a flag, a list for several values. For eval, the
+option data names the dataset. `pd4dgs-batch scan FOLDER` writes a manifest of the sources in a folder.
 
-OUTPUT.done.json beside each output records its input, options, version and digests. A scene whose record matches is not
-processed again, so that a killed batch resumes. Outputs appear whole or not at all. Lines that fail are retried, then
-reported with their logs, and the other lines continue. The exit code is 1 if any line failed.
+OUTPUT.done.json beside each output records its inputs, options, version and checksums. Scenes with a matching record
+are skipped, so the same command resumes an interrupted batch. A scene that still fails after its retries is reported
+with its log, and the batch continues. The exit code is 1 if any scene failed.
 
---on local is a pool of processes that share -j threads. --on ray uses the cluster at --address (or RAY_ADDRESS), --on
-slurm submits array jobs; both need the extra [cluster]. See docs/batch.md.
+--on local runs processes that share -j threads, --on ray uses the cluster at --address (or RAY_ADDRESS), and --on slurm
+submits array jobs. Ray and Slurm need the extra [cluster]. See docs/batch.md.
 
 examples:
   pd4dgs-batch scan models -o scenes.jsonl
@@ -45,8 +45,8 @@ examples:
   pd4dgs-batch scenes.jsonl --op encode --on ray --address 10.0.0.1:6379 -o s3://films/pd4"""
 
 SCAN_DETAILS = """\
-Writes a line for each source below FOLDER: checkpoints for encode, .pd4 files for package, datasets for train, videos
-for prepare. The outputs keep the paths of the sources.
+Writes one line per source below FOLDER: videos for prepare, datasets for train, checkpoints for encode, .pd4 files for
+package and eval. Outputs keep the relative paths of their sources.
 
 examples:
   pd4dgs-batch scan models -o scenes.jsonl
@@ -54,25 +54,30 @@ examples:
 
 
 def parser() -> options.Parser:
-    p = options.Parser("batch", "MANIFEST --op OP -o URI", "Run a command on every scene of a library.", DETAILS)
+    p = options.Parser("batch", "MANIFEST --op OP -o URI", "Run a command on many scenes.", DETAILS)
     add = p.add_argument
     add("input", metavar="MANIFEST", help="file of JSON lines, see below")
-    add("-o", "--output", required=True, type=options.named, metavar="URI", help="folder or URI to write below")
-    add("--op", required=True, choices=VERBS, help="the command: pd4dgs-OP")
-    add("--on", choices=ENGINES, default="local", help="engine that runs it (default: local)")
-    what = "scenes at a time (default: one per core; ray: as the cluster allows; 0: one by one in this process)"
+    add("-o", "--output", required=True, type=options.named, metavar="URI", help="output folder or URI")
+    add("--op", required=True, choices=VERBS, help="command to run on each scene (pd4dgs-OP)")
+    add("--on", choices=ENGINES, default="local", help="where to run the command (default: local)")
+    what = "scenes at a time (default: one per core; ray: as many as fit; 0: one after another in this process)"
     add("--workers", type=options.count, metavar="N", help=what)
-    what = "threads per scene (default: with local an equal share of -j, else 1)"
+    what = "threads per scene (default: 1; local: an equal share of -j)"
     add("--cpus", type=options.positive_int, metavar="N", help=what)
     add("--gpus", type=options.non_negative_float, metavar="N", help="GPUs per scene (default: 0)")
-    what = "retry a failed scene up to N times (default: %(default)s)"
+    what = "retries of a failed scene (default: %(default)s)"
     add("--retries", type=options.count, default=2, metavar="N", help=what)
-    what = "stop a scene after this time and retry it, such as 90s (default: never)"
+    what = "time limit of each try, such as 90s (default: none)"
     add("--timeout", type=options.duration, metavar="T", help=what)
-    add("--logs", default="batch-logs", metavar="DIR", help="folder for logs of failed scenes (default: %(default)s)")
-    what = "address of the Ray cluster (default: RAY_ADDRESS, else one on this machine)"
+    add(
+        "--logs",
+        default="batch-logs",
+        metavar="DIR",
+        help="folder for the logs of failed scenes (default: %(default)s)",
+    )
+    what = "address of the Ray cluster (default: RAY_ADDRESS, else a new local cluster)"
     add("--address", metavar="A", help=what)
-    what = "submitit parameter, such as slurm_partition=gpu; cluster=local runs on this machine"
+    what = "parameter of submitit, such as slurm_partition=gpu; cluster=local runs on this machine"
     add("--slurm", type=_parameter, action="append", metavar="KEY=VALUE", help=what)
     p.add_common()
     return p
@@ -80,9 +85,9 @@ def parser() -> options.Parser:
 
 def scan_parser() -> options.Parser:
     p = options.Parser("batch scan", "FOLDER", "Write a manifest of the sources in a folder.", SCAN_DETAILS)
-    p.add_argument("input", metavar="FOLDER", help="folder or URI")
-    p.add_argument("--op", choices=VERBS, help="the command of the manifest (default: by the kind of sources found)")
-    p.add_argument("-o", "--output", default=STDIO, metavar="FILE", help="file to write (default: stdout)")
+    p.add_argument("input", metavar="FOLDER", help="folder or URI of the sources")
+    p.add_argument("--op", choices=VERBS, help="command of the manifest (default: chosen by the sources found)")
+    p.add_argument("-o", "--output", default=STDIO, metavar="FILE", help="manifest to write (default: stdout)")
     p.add_common()
     return p
 
@@ -111,7 +116,7 @@ def command(verb: str, argv: list[str]) -> tuple[int, str, str]:
 
 def _scan(args: argparse.Namespace, console: Console) -> int:
     if args.json and args.output == STDIO:
-        raise UsageError("the manifest and --json both write to stdout; name a file with -o")
+        raise UsageError("the manifest and --json both write to stdout, expected -o FILE")
     check_output(args.output, args.overwrite)
     from pd4dgs_codec.batch.job import scan
 
@@ -193,5 +198,5 @@ class _Failures:
 
 
 def _text(result: dict[str, Any]) -> str:
-    parts = [f"{result['done']} done", f"{result['already']} done before", f"{result['failed']} failed"]
+    parts = [f"{result['done']} done", f"{result['already']} already done", f"{result['failed']} failed"]
     return f"{result['output']}: {', '.join(parts)}; {result['bytes']:,} bytes in {result['seconds']:.0f} s"

@@ -47,7 +47,7 @@ CHECKPOINT = "needs a checkpoint, not a .pd4 file"
 def _add_views(p: options.Parser, views: int) -> None:
     """Adds the options that choose the images to render. views: their default number."""
     add = p.add_argument
-    what = "dataset whose held-out views give the cameras (default: the file's own camera over time)"
+    what = "use the held-out cameras of this dataset (default: the file's own camera over time)"
     add("--data", metavar="SOURCE", help=what)
     options.add_reading(p, unset=options.READING)
     add("--views", type=options.positive_int, metavar="N", help=f"number of images (default: {views})")
@@ -74,9 +74,9 @@ def _frames(args: argparse.Namespace, info: SceneInfo) -> list[Frame]:
 # -- codec -------------------------------------------------------------------------------------------------------------
 
 CODEC = """\
-Encodes a checkpoint at each combination of step scale, mode and effort. The error of each file is that of rendered
-images against those of the checkpoint. For a .pd4 file without its checkpoint only bytes and times are reported. Times
-are medians and quartiles of repetitions in one process, none begun after 5 s.
+Encodes a checkpoint with each combination of step scale, mode and effort. The error of a file is the difference between
+its renderings and those of the checkpoint. For a .pd4 file, only bytes and times are reported. Times are medians and
+quartiles of repetitions in one process; no repetition starts after 5 s.
 
 examples:
   pd4dgs-bench codec model.pt --data recordings/kitchen --downscale 2 --plot codec.png > codec.md
@@ -93,11 +93,11 @@ def _codec_options(p: options.Parser) -> None:
     effort = options.checked(int, lambda value: 1 <= value <= 9, "an integer from 1 to 9")
     scales, modes, efforts = map(options.listed, (options.positive_float, mode, effort))
     add = p.add_argument
-    add("input", metavar="FILE", help="checkpoint of pd4dgs-train, or a .pd4 file (- for stdin)")
+    add("input", metavar="FILE", help="checkpoint of pd4dgs-train or .pd4 file; - reads stdin")
     add("--step-scales", type=scales, metavar="X,...", help="factors on all quantisation steps (default: 0.5,1,2,4)")
     add("--modes", type=modes, metavar="M,...", help="entropy coders (default: ans,lzma)")
-    add("--efforts", type=efforts, metavar="N,...", help="1 is fast, 9 makes the smallest files (default: 1,5,9)")
-    add("--repeats", type=options.positive_int, metavar="N", help="runs per time (default: 5)")
+    add("--efforts", type=efforts, metavar="N,...", help="compression efforts, 1 to 9 (default: 1,5,9)")
+    add("--repeats", type=options.positive_int, metavar="N", help="repetitions of each measurement (default: 5)")
     add("--quick", action="store_true", help="only --step-scales 1,2 --efforts 1 --repeats 1")
     _add_views(p, 6)
 
@@ -126,9 +126,8 @@ def _codec(args: argparse.Namespace, console: Console) -> Outcome:
 # -- render ------------------------------------------------------------------------------------------------------------
 
 RENDER = """\
-Renders the Gaussians of the highest level with each rasteriser and compares the images with those of a float64
-reference written from the formulas: the CPU kernels, and gsplat if there is a CUDA device. Times are of rasterising
-alone.
+Renders the Gaussians of the highest level with each rasteriser (the CPU kernels, and gsplat if there is a CUDA device)
+and compares the images with those of a float64 reference. Times cover rasterisation only.
 
 examples:
   pd4dgs-bench render scene.pd4 --plot render.png > render.md
@@ -138,7 +137,7 @@ examples:
 def _render_options(p: options.Parser) -> None:
     add = p.add_argument
     add("input", metavar="FILE", help=".pd4 file or .pt checkpoint; - reads a .pd4 from stdin")
-    what = "only these rasterisers: oracle float64, kernels, gsplat (default: all)"
+    what = "rasterisers to measure: oracle float64, kernels, gsplat (default: all)"
     add("--only", type=options.listed(str), metavar="NAME,...", help=what)
     what = "repetitions per image (default: 15)"
     add("--repeats", type=options.positive_int, default=15, metavar="N", help=what)
@@ -172,8 +171,8 @@ def _render(args: argparse.Namespace, console: Console) -> Outcome:
 # -- train -------------------------------------------------------------------------------------------------------------
 
 TRAIN = f"""\
-Trains each preset for the same time. Held-out quality is measured about twelve times on the way, on six views, as
-pd4dgs-train does. --from reports existing runs, from their checkpoints, instead.
+Trains each preset for the same time and measures six held-out views about twelve times during training. --from reports
+finished runs from their checkpoints instead.
 
 {options.SOURCES}
 
@@ -188,16 +187,26 @@ def _train_options(p: options.Parser) -> None:
     presets, add = ("tiny", "small", "paper"), p.add_argument
     add("source", nargs="?", metavar="SOURCE", help="dataset to train on, see below")
     add("--presets", nargs="+", choices=presets, metavar="PRESET", help="model sizes (default: tiny small)")
-    add("--seconds", type=options.positive_float, metavar="S", help="time limit per preset (default: 120)")
-    add("--iterations", type=options.positive_int, metavar="N", help="number of steps instead of a time limit")
+    add(
+        "--seconds",
+        type=options.positive_float,
+        metavar="S",
+        help="training time of each preset in seconds (default: 120)",
+    )
+    add(
+        "--iterations",
+        type=options.positive_int,
+        metavar="N",
+        help="training steps of each preset, instead of --seconds",
+    )
     options.add_reading(p, unset=options.READING)
-    add("--seed", type=options.seed, metavar="N", help="seed of each run (default: 0)")
-    add("--from", dest="runs", nargs="+", metavar="FILE", help="checkpoints of existing runs")
+    add("--seed", type=options.seed, metavar="N", help="random seed (default: 0)")
+    add("--from", dest="runs", nargs="+", metavar="FILE", help="report the runs of these checkpoints")
 
 
 def _train(args: argparse.Namespace, console: Console) -> Outcome:
     if args.runs and (args.source or _given(args, "presets", "seconds", *TRAIN_FIELDS)):
-        raise UsageError("--from reports existing runs; expected no SOURCE and no option of a training beside it")
+        raise UsageError("--from reports finished runs, expected no SOURCE and no training options")
     if not args.runs and not args.source:
         raise UsageError("found no SOURCE, expected a dataset to train on or --from FILE")
     if args.seconds and args.iterations:
@@ -228,7 +237,7 @@ def _trained(args: argparse.Namespace, console: Console) -> list[Point]:
         if trainer.interrupted:
             raise TrainError(f"interrupted while training {preset}; nothing was written")
         if not trainer.curve:
-            raise TrainError(f"{preset}: the run ended before its first evaluation; expected a larger limit")
+            raise TrainError(f"{preset}: the run ended before its first evaluation; expected a higher limit")
         runs.append(runtime.run_of(preset, trainer.curve, len(trainer.model.anchor_q)))
     return runs
 
@@ -236,9 +245,9 @@ def _trained(args: argparse.Namespace, console: Console) -> list[Point]:
 # -- latency -----------------------------------------------------------------------------------------------------------
 
 LATENCY = """\
-Reports for each rate and level the bytes S of the prefix, 8S/B, the median time to their last byte over the paced link
-of pd4dgs-serve, and the time to the rendered image on the CPU in a warm and in a cold process, with the file's camera.
-A file takes about (8S/B + 2 s) x 3 x runs at each rate. Use a machine without other load.
+Reports for each rate and level the bytes S of the prefix, the ideal time 8S/rate, the median time to its last byte over
+the simulated link of pd4dgs-serve, and the time to the rendered image on the CPU in a warm and in a cold process, with
+the file's camera. Each file takes about (8S/rate + 2 s) x 3 x runs per rate. Use an otherwise idle machine.
 
 examples:
   pd4dgs-bench latency scene.pd4 > latency.md
@@ -248,7 +257,7 @@ examples:
 def _latency_options(p: options.Parser) -> None:
     add = p.add_argument
     add("inputs", nargs="+", metavar="FILE", help=".pd4 files with a camera")
-    what = "rates of the link (default: 2M,10M,50M)"
+    what = "link rates in bits per second (default: 2M,10M,50M)"
     add("--rates", type=options.rates, default="2M,10M,50M", metavar="R", help=what)
     add("--runs", type=options.positive_int, default=9, metavar="N", help="runs per median (default: 9)")
 
@@ -277,7 +286,7 @@ def _with_camera(name: str) -> bytes:
     data = read_bytes(name)
     try:
         if decode(data).info.camera is None:
-            raise DataError("holds no camera, expected one to render with")
+            raise DataError("has no camera, expected one to render with")
     except (DecodeError, DataError) as error:
         raise DataError(f"{name}: {error}") from None
     return data
@@ -286,9 +295,9 @@ def _with_camera(name: str) -> bytes:
 # -- stability ---------------------------------------------------------------------------------------------------------
 
 STABILITY = """\
-Feeds stiff and extreme cases to each numerical part. A row passes if its error is within its bound; it is refused if
-input without an answer raised the promised error in one line. References are computed by mpmath or in float64. The exit
-code is 1 if any row fails.
+Runs stiff and extreme cases through each numerical component. A case passes if its error is within its bound, and is
+refused if invalid input raised the documented error. References come from mpmath or float64. The exit code is 1 if any
+case fails.
 
 groups: rate, fitting, quantiser, masks, hexplane, deformation, rasteriser, training
 
@@ -300,7 +309,7 @@ examples:
 
 
 def _stability_options(p: options.Parser) -> None:
-    p.add_argument("--only", metavar="NAME", help="the group NAME, or the cases with NAME in their name")
+    p.add_argument("--only", metavar="NAME", help="run the group NAME, or the cases with NAME in their name")
 
 
 def _stability(args: argparse.Namespace, console: Console) -> Outcome:
@@ -338,11 +347,15 @@ class Report(NamedTuple):
 
 
 REPORTS = {
-    "codec": Report("FILE", "Measure the codec's error against bytes and seconds.", CODEC, _codec_options, _codec),
+    "codec": Report("FILE", "Measure the codec's error against bytes and time.", CODEC, _codec_options, _codec),
     "render": Report("FILE", "Measure the rasterisers' error against time.", RENDER, _render_options, _render),
     "train": Report("[SOURCE]", "Measure held-out error against training time.", TRAIN, _train_options, _train),
-    "latency": Report("FILE...", "Measure seconds to each level's image.", LATENCY, _latency_options, _latency, False),
-    "stability": Report("", "Test stiff and extreme cases.", STABILITY, _stability_options, _stability, False),
+    "latency": Report(
+        "FILE...", "Measure the time to the image of each level.", LATENCY, _latency_options, _latency, False
+    ),
+    "stability": Report(
+        "", "Test numerical stability in stiff and extreme cases.", STABILITY, _stability_options, _stability, False
+    ),
 }
 
 
@@ -353,7 +366,7 @@ def parser(name: str | None = None) -> options.Parser:
         p = options.Parser(f"bench {name}", report.usage, report.summary, report.details)
         report.add_options(p)
         if report.plot:
-            what = "write a log-log plot of error against cost, with the Pareto front"
+            what = "plot error against cost on log axes, with the Pareto front"
             p.add_argument("-o", "--plot", metavar="FILE.png", help=what)
         p.add_common(json_file=True)
         return p

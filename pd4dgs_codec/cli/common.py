@@ -137,7 +137,7 @@ def read_bytes(path: str) -> bytes:
 
         return read_source(path)
     if sys.stdin is None or sys.stdin.isatty():
-        raise UsageError("nothing is piped to stdin; name a file")
+        raise UsageError("stdin is a terminal, expected a file name or piped input")
     return sys.stdin.buffer.read()
 
 
@@ -232,7 +232,7 @@ def run(parser: argparse.ArgumentParser, action: Action, argv: Sequence[str] | N
             ignore_more()
             if writing := sys.modules.get("pd4dgs_codec.io"):
                 writing.remove_temporaries()
-            return _fail(parser.prog, error, "interrupted; what was not finished is removed", "--json" in arguments)
+            return _fail(parser.prog, error, "interrupted; unfinished outputs were removed", "--json" in arguments)
 
 
 @contextlib.contextmanager
@@ -276,7 +276,7 @@ def _run(parser: argparse.ArgumentParser, action: Action, arguments: list[str]) 
                 import traceback
 
                 say(traceback.format_exc().rstrip())
-            message = f"internal error, please report it: {type(error).__name__}: {error} (-v shows where)"
+            message = f"internal error, please report it: {type(error).__name__}: {error} (-v prints the traceback)"
         return _fail(parser.prog, error, message, as_json)
 
 
@@ -301,7 +301,7 @@ def _explain(error: BaseException, name: str) -> str | None:
         return f"{where}: {error.strerror or error}".lstrip(": ")
     if isinstance(error, ModuleNotFoundError) and error.name and not error.name.startswith("pd4dgs_codec"):
         extra = EXTRAS.get(error.name.partition(".")[0], "train")
-        return f"needs the module {error.name}, which is not installed: pip install 'pd4dgs-codec[{extra}]'"
+        return f"the module {error.name} is not installed: pip install 'pd4dgs-codec[{extra}]'"
     if isinstance(error, MemoryError):
         return "out of memory"
     return None

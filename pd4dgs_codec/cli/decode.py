@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import io
 import time
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,10 +18,10 @@ if TYPE_CHECKING:
     from pd4dgs_codec.scene import Scene
 
 DETAILS = """\
-Without -o the file is decoded and checked, and a summary is printed.
-An .npz file holds the float32 arrays anchor, feature, scaling_log, offset, mask_L, mlp.*, planes.* and meta_*.
-A .pt file is a checkpoint that encode, render and eval accept.
-From a URL (http, https) only the layers asked for are fetched; interrupted transfers resume.
+Without -o, pd4dgs-decode only checks the file and prints a summary.
+A .npz output holds the float32 arrays anchor, feature, scaling_log, offset, mask_L, mlp.*, planes.* and meta_*.
+A .pt output is a checkpoint for encode, render and eval.
+From a URL (http, https), only the requested layers are fetched; interrupted transfers resume.
 
 examples:
   pd4dgs-decode scene.pd4
@@ -29,18 +30,23 @@ examples:
   pd4dgs-decode scene.pd4 --max-bytes 100k -o early.npz
   head -c 300000 scene.pd4 | pd4dgs-decode - --allow-partial -o prefix.pt
 
-exit code 3: cut input, decoded as far as possible (--allow-partial)"""
+exit code 3: truncated input, decoded as far as possible (--allow-partial)"""
 
 
 def parser() -> options.Parser:
-    p = options.Parser("decode", "[scene.pd4] [-o FILE]", "Unpack a .pd4 file, or its first layers.", DETAILS)
+    p = options.Parser("decode", "[scene.pd4] [-o FILE]", "Decode a .pd4 file or its first layers.", DETAILS)
     add = p.add_argument
-    add("input", nargs="?", default=STDIO, metavar="scene.pd4", help="file or URL; - or nothing reads stdin")
-    add("-o", "--output", metavar="FILE", help="FILE.npz or FILE.pt; - writes npz to stdout (default: only check)")
-    options.add_max_layer(p, "stop after this layer")
-    add("--max-bytes", type=options.size, metavar="SIZE", help="stop at the last slice within SIZE bytes, such as 50k")
-    add("--symbols", action="store_true", help="with .npz: add the integers (NAME_q) and their steps (NAME_step)")
-    add("--allow-partial", action="store_true", help="decode the whole layers of a cut file, and exit with 3")
+    add("input", nargs="?", default=STDIO, metavar="scene.pd4", help=".pd4 file or URL; - reads stdin (default: -)")
+    add("-o", "--output", metavar="FILE", help="FILE.npz or FILE.pt; - writes .npz to stdout (default: check only)")
+    options.add_max_layer(p, "highest layer to decode")
+    add(
+        "--max-bytes",
+        type=options.size,
+        metavar="SIZE",
+        help="decode only the slices within the first SIZE bytes, such as 50k",
+    )
+    add("--symbols", action="store_true", help="add quantised integers (NAME_q) and steps (NAME_step) to the .npz")
+    add("--allow-partial", action="store_true", help="decode the complete layers of a truncated file, with exit code 3")
     p.add_common()
     return p
 
@@ -63,7 +69,7 @@ def _decode(args: argparse.Namespace, console: Console) -> int:
     elif kind == ".npz":
         common.write_bytes(args.output, _npz(scene, args.symbols), args.overwrite)
     if not complete:
-        console.message(f"pd4dgs-decode: the input is cut; decoded the layers {list(scene.layers)}")
+        console.message(f"pd4dgs-decode: warning: the input is truncated; decoded layers {_listed(scene.layers)}")
     result = _summary(scene, data, complete, seconds, args)
     console.result(result, _text(result), on_stdout=not args.output)
     return OK if complete else PARTIAL
@@ -88,7 +94,7 @@ def _input(args: argparse.Namespace, console: Console) -> bytes:
                 raise
             console.message(f"pd4dgs-decode: {error}")
             data = bytes(transfer.data)
-    console.detail(f"{len(transfer.data):,} bytes in {transfer.requests} requests, {transfer.cuts} cuts")
+    console.detail(f"{len(transfer.data):,} bytes in {transfer.requests} requests, {transfer.cuts} interruptions")
     return data
 
 
@@ -96,7 +102,7 @@ def _output_kind(args: argparse.Namespace) -> str | None:
     """Returns ".npz", ".pt", or None without an output. Raises UsageError for options that do not fit."""
     kind = None if args.output is None else ".npz" if args.output == STDIO else Path(args.output).suffix
     if args.output == STDIO and args.json:
-        raise UsageError("-o - and --json both write to stdout; name an output file")
+        raise UsageError("-o - and --json both write to stdout, expected -o FILE")
     if kind not in (None, ".npz", ".pt"):
         raise UsageError(f"found -o {args.output}, expected a name that ends in .npz or .pt")
     if args.symbols and kind != ".npz":
@@ -141,21 +147,25 @@ def _summary(scene: Scene, data: bytes, complete: bool, seconds: float, args: ar
     }
 
 
+def _listed(layers: Iterable[int]) -> str:
+    return ", ".join(map(str, layers))
+
+
 def _text(result: dict[str, Any]) -> str:
     layers = result["layers"]
     if not result["complete"]:
-        state = "cut; valid so far"
+        state = "truncated, valid so far"
     elif result["max_bytes"] is not None:
-        state = f"valid in the first {layers[-1]['end']:,}"
+        state = f"first {layers[-1]['end']:,} bytes valid"
     elif result["max_layer"] is not None:  # nothing is known about the bytes behind the prefix
-        state = f"layers {', '.join(str(row['layer']) for row in layers)} whole and valid"
+        state = f"layers {_listed(row['layer'] for row in layers)} valid"
     else:
-        state = "whole and valid"
+        state = "complete and valid"
     cells = [(row["layer"], *(number(row[k], 0) for k in ("bytes", "end", "anchors", "active"))) for row in layers]
     lines = [
         f"{shown_name(result['input'])}: {result['bytes']:,} bytes, {state}, decoded in {result['seconds']:.3f} s",
         table(("layer", "bytes", "prefix", "new anchors", "active"), cells),
-        *(f"absent: layer {layer}; its level equals the one below" for layer in result["absent"]),
+        *(f"no layer {layer}: level {layer} equals level {layer - 1}" for layer in result["absent"]),
     ]
     if result["output"]:
         lines.append(f"wrote {shown_name(result['output'], 'stdout')}")

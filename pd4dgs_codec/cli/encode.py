@@ -20,10 +20,10 @@ if TYPE_CHECKING:
 
 DETAILS = f"""\
 A .pd4 file holds layer 0 (static scene), layer 1 (global motion) and layer 2 (local motion) in this order; every prefix
-that ends with a layer can be shown. Parts without visible effect are left out, and the report lists them with reasons.
+that ends with a layer can be shown. Parts without visible effect are omitted and listed with reasons in the report.
 
---target-size makes layers fit a link with the least loss of quality: 425k for layer 0 takes 1.7 s at 2 Mbps. It takes a
-minute or more. Without --data only views of the file's own camera count. --slices adds some per cent to these sizes.
+--target-size fits layers to a link with the least loss of quality: 425k for layer 0 takes 1.7 s at 2 Mbps. Fitting
+takes a minute or more, on renderings from --data or else the file's own camera. --slices adds a few per cent.
 
 --slices 50k lets the first frame appear after 50 kB and improve with each further slice. The anchors that matter most
 in renderings come first; without target sizes others pass to a higher layer, so that motion need not wait for them. It
@@ -42,41 +42,41 @@ examples:
 FIRST_FRAME_RATE = 2e6
 #: Help of the options that are fields of EncodeOptions with a few choices.
 HELP = {
-    "mode": "entropy coder; the player reads ans alone",
-    "priors": "distributions to choose from per channel",
-    "layers": "auto leaves out layers without visible effect; a number keeps the layers up to it",
-    "effort": "1 is fast, 9 makes the smallest files",
-    "omit": "leave out plane cells that no anchor reads, or nothing",
+    "mode": "entropy coder; the player supports ans only",
+    "priors": "candidate distributions of each channel",
+    "layers": "highest layer to keep; auto omits layers without visible effect",
+    "effort": "compression effort, from 1 (fastest) to 9 (smallest file)",
+    "omit": "omit plane cells that no anchor reads, or nothing",
 }
 
 
 def parser() -> options.Parser:
     p = options.Parser("encode", "model.pt -o FILE.pd4", "Encode a trained scene as a layered .pd4 file.", DETAILS)
     add = p.add_argument
-    add("input", metavar="model.pt", help="checkpoint of pd4dgs-train, or a .pd4 file to encode again; - reads stdin")
+    add("input", metavar="model.pt", help="checkpoint of pd4dgs-train, or a .pd4 file to re-encode; - reads stdin")
     add("-o", "--output", required=True, metavar="FILE.pd4", help="file to write; - writes stdout")
     for name, what in HELP.items():
         default, allowed = vars(DEFAULTS)[name], CHOICES[name]
         kind = int if all(isinstance(value, int) for value in allowed) else str
         choices = [kind(value) for value in allowed]
         add(f"--{name}", type=kind, choices=choices, default=default, help=f"{what} (default: {default})")
-    what = "multiply all quantisation steps; above 1 files are smaller and coarser (default: %(default)g)"
+    what = "factor on all quantisation steps; above 1, smaller and coarser files (default: %(default)g)"
     add("--step-scale", type=options.positive_float, default=DEFAULTS.step_scale, metavar="X", help=what)
-    add("--no-verify", action="store_true", help="do not decode the result to compare every symbol")
+    add("--no-verify", action="store_true", help="do not decode the result to verify it")
     what = "cut layers into slices: the first of SIZE bytes, later ones of two thirds at most (default: no slices)"
     add("--slices", type=options.size, default=DEFAULTS.slices, metavar="SIZE", help=what)
-    what = "upper limits of the layers' bytes (layer 0 with the header), met by coarser steps and fewer anchors"
+    what = "byte limits of layers (layer 0 with the header), met by coarser steps and fewer anchors"
     add("--target-size", type=options.layer_sizes, default={}, metavar="L0=425k,...", help=what)
-    about = p.add_argument_group("metadata", "shown by pd4dgs-info; encoding a .pd4 file again keeps them")
-    for name, what in (("title", "title of the scene"), ("source", "its origin"), ("licence", "terms of use")):
+    about = p.add_argument_group("metadata", "shown by pd4dgs-info and kept when a .pd4 file is re-encoded")
+    for name, what in (("title", "title of the scene"), ("source", "origin of the scene"), ("licence", "terms of use")):
         about.add_argument(f"--{name}", type=options.line, metavar="TEXT", help=what)
-    views = p.add_argument_group("quality in renderings")
-    what = "dataset, see below: its training views fit the sizes, its held-out views decide which layers are kept"
+    views = p.add_argument_group("rendered quality")
+    what = "dataset, see below: training views fit the sizes, held-out views decide which layers are kept"
     views.add_argument("--data", metavar="SOURCE", help=what)
     options.add_reading(views, unset=options.READING)
     what = "use about N views of each split, evenly spread (default: 16)"
     views.add_argument("--views", type=options.positive_int, metavar="N", help=what)
-    what = "with --data, leave out layers that gain less than DB dB mPSNR per megabyte"
+    what = "with --data, omit layers that gain less than DB dB mPSNR per megabyte"
     what = f"{what} (default: {ENCODE_MIN_DB_PER_MEGABYTE:g}; 0: keep all)"
     views.add_argument("--min-gain", type=options.non_negative_float, metavar="DB", help=what)
     p.add_common()
@@ -85,7 +85,7 @@ def parser() -> options.Parser:
 
 def _encode(args: argparse.Namespace, console: Console) -> int:
     if args.output == STDIO and args.json:
-        raise UsageError("-o - and --json both write to stdout; name an output file")
+        raise UsageError("-o - and --json both write to stdout, expected -o FILE")
     options.conditional(
         args, args.data, "needs --data SOURCE", holdout=8, views=16, min_gain=ENCODE_MIN_DB_PER_MEGABYTE
     )
@@ -131,7 +131,7 @@ def _load(args: argparse.Namespace) -> tuple[Scene, Metadata | None]:
 
         return decode(data), _metadata(args, metadata_of(data))
     if common.same_file(args.input, args.output):
-        raise UsageError(f"-o names the checkpoint {args.input}, which would be lost; expected another name")
+        raise UsageError(f"-o names the input checkpoint {args.input}, expected another file")
     return common.checkpoint_scene(args.input, data), _metadata(args, None)
 
 
@@ -154,7 +154,7 @@ def _views(args: argparse.Namespace, info: SceneInfo, console: Console) -> Views
     views = Views.of(dataset, args.data, args.views)
     console.detail(f"{args.data}: {len(views.fitting)} training views, {len(views.held_out)} held out")
     if not dataset.test:
-        console.message("no views are held out: gains are measured on training views")
+        console.message("no held-out views: gains are measured on training views")
     return views
 
 
@@ -208,5 +208,5 @@ def _target_lines(target: dict[str, Any]) -> list[str]:
     for row in target["levels"]:
         error = "none" if row["error_psnr"] == math.inf else f"{row['error_psnr']:.2f} dB PSNR"
         truth = f", {row['lost_db']:+.3f} dB loss on held-out views" if "lost_db" in row else ""
-        lines.append(f"level {row['level']}: error of quantisation {error}{truth}")
+        lines.append(f"level {row['level']}: quantisation error {error}{truth}")
     return lines + [f"fitted on {target['pictures']} renderings: {target['cameras']}"]

@@ -8,13 +8,13 @@ from pd4dgs_codec.cli.common import OK, Console, command, named_input, number, r
 from pd4dgs_codec.cli.progress import progress_bar
 
 DETAILS = f"""\
-Each level of a .pd4 file is decoded from its own prefix and compared with the held-out views.
+Decodes each level of a .pd4 file from its own prefix and compares its renderings with the held-out views.
 mPSNR in dB and mSSIM follow the DyCheck protocol: 8-bit images, masked if the dataset has covisibility masks.
---protocol 3dgs shows what papers on Gaussian splatting report, without masks: PSNR, SSIM as the code of 3D Gaussian
-Splatting computes it, and LPIPS-VGG where the package lpips and its weights are installed.
-Where test cameras stand still, the moving region is measured too: pixels whose true colour changes by more than 16 of
-255 over time. --perceptual adds LPIPS, ST-LPIPS and FLIP, as far as they are installed, masked too, and their temporal
-variants (t-LPIPS, ...): the mean distance between successive frames of a fixed camera. docs/evaluation.md has more.
+--protocol 3dgs reports the metrics of papers on Gaussian splatting, without masks: PSNR, SSIM as in the code of 3D
+Gaussian Splatting, and LPIPS-VGG if the package lpips and its weights are installed.
+For fixed test cameras, the moving region is measured too: pixels whose true colour changes by more than 16 of 255 over
+time. --perceptual adds LPIPS, ST-LPIPS and FLIP, masked, as far as they are installed, and their temporal variants
+(t-LPIPS, ...): the mean distance between successive frames of a fixed camera. See docs/evaluation.md.
 
 {options.SOURCES}
 
@@ -29,13 +29,18 @@ def parser() -> options.Parser:
     p = options.Parser("eval", "FILE SOURCE", "Measure quality, bytes and time of each level on a dataset.", DETAILS)
     p.add_argument("input", metavar="FILE", help=".pd4 file or .pt checkpoint; - reads a .pd4 from stdin")
     p.add_argument("source", metavar="SOURCE", help="dataset to compare with, see below")
-    options.add_max_layer(p, "leave out the layers above this one")
+    options.add_max_layer(p, "highest layer to measure")
     options.add_reading(p)
-    what = "dycheck: masked metrics; 3dgs: those of 3D Gaussian Splatting, see below (default: dycheck)"
+    what = "metrics of DyCheck or of 3D Gaussian Splatting, see below (default: dycheck)"
     p.add_argument("--protocol", choices=("dycheck", "3dgs"), default="dycheck", help=what)
-    p.add_argument("--max-bytes", type=options.size, metavar="SIZE", help="measure the first SIZE bytes, such as 50k")
+    p.add_argument(
+        "--max-bytes",
+        type=options.size,
+        metavar="SIZE",
+        help="measure only the slices within the first SIZE bytes, such as 50k",
+    )
     options.add_background(p, "the file's")
-    p.add_argument("--perceptual", action="store_true", help="add perceptual distances, which take longer")
+    p.add_argument("--perceptual", action="store_true", help="also measure perceptual distances (slow)")
     p.add_common()
     return p
 
@@ -50,7 +55,7 @@ def _evaluate(args: argparse.Namespace, console: Console) -> int:
     dataset = read_dataset(args.source, args, levels[-1].model.info)
     console.detail(f"{args.source}: {len(dataset.train)} training views, {len(dataset.test)} held out")
     if not dataset.test:
-        console.message("no views are held out: measuring on the training views")
+        console.message("no held-out views: measuring on the training views")
     distances = (*(PERCEPTUAL if args.perceptual else ()), *([VGG] if args.protocol == "3dgs" else []))
     perceptual = load_perceptual(distances) if distances else None
     for name, why in (perceptual.absent if perceptual else {}).items():
@@ -84,9 +89,9 @@ def _text(result: dict[str, Any]) -> str:
     lines = [
         f"{result['source']}: {result['views']} {what} views, {result['width']}x{result['height']}, {masked}",
         table(head, rows),
-        *([f"moving: the {100 * share:.1f} % of pixels that change where cameras stand still"] if share else []),
+        *([f"moving: pixels that change in views of fixed cameras ({100 * share:.1f} %)"] if share else []),
         *_distance_lines(result.get("perceptual")),
-        f"baseline, the mean training image: {number(result['baseline_mean_image_psnr'])} dB",
+        f"baseline (mean training image): {number(result['baseline_mean_image_psnr'])} dB",
     ]
     return "\n".join(lines)
 

@@ -24,18 +24,18 @@ if TYPE_CHECKING:
     from pd4dgs_codec.scene import SceneInfo
 
 DETAILS = f"""\
-View-dependent colours become spherical harmonics, view-dependent opacities and sizes become means over many viewpoints;
-both are then refined against renderings of the scene. Where only colours are view-dependent (pd4dgs-info --json),
-everything but the harmonics is exact, and refinement is off by default. The viewpoints are the training cameras of
+View-dependent colours become spherical harmonics, and view-dependent opacities and sizes become means over many
+viewpoints; both are then refined against renderings of the scene. If only colours are view-dependent (pd4dgs-info
+--json), only the harmonics are approximate, and refinement is off by default. Viewpoints are the training cameras of
 --data, or else lie around the point that the file's camera looks at. --compare measures the loss of quality.
 
-  ply       one PLY file in the layout of 3D Gaussian splatting
+  ply       one PLY file in the layout of 3D Gaussian Splatting
   ply-seq   a folder of such files, one per frame
   spz       one SPZ file (needs gaussforge)
   glb       one glTF file with KHR_gaussian_splatting
-  4dgs      one .4dgs file for the whole time range (needs fourdgs)
+  4dgs      one .4dgs file of the whole time range (needs fourdgs)
 
-PLY and 4dgs keep the file's axes. For glTF and SPZ the scene is rotated so that +y is up.
+PLY and 4dgs keep the axes of the file. For glTF and SPZ, the scene is rotated so that +y is up.
 
 {options.SOURCES}
 
@@ -51,25 +51,25 @@ FPS, STEPS, MAX_FRAMES = 30.0, 300, 100_000
 
 
 def parser() -> options.Parser:
-    p = options.Parser("export", "FILE -o OUT --to KIND", "Write a scene as Gaussians for other viewers.", DETAILS)
-    p.add_argument("input", metavar="FILE", help=".pd4 file; - reads it from stdin")
+    p = options.Parser("export", "FILE -o OUT --to KIND", "Export a scene as Gaussians for other viewers.", DETAILS)
+    p.add_argument("input", metavar="FILE", help=".pd4 file; - reads stdin")
     p.add_argument(
-        "-o", "--output", required=True, type=options.named, metavar="OUT", help="file to write; with ply-seq a folder"
+        "-o", "--output", required=True, type=options.named, metavar="OUT", help="output file; a folder for ply-seq"
     )
     p.add_argument("--to", required=True, choices=KINDS, help="file format, see below")
-    what = "time of ply, spz and glb, 0..1 of the file's time range (default: 0)"
+    what = "time of ply, spz and glb, as 0..1 of the file's time range (default: 0)"
     p.add_argument("--time", type=options.share, metavar="T", help=what)
     what = f"frame rate of ply-seq and 4dgs (default: {FPS:g})"
     p.add_argument("--fps", type=options.positive_float, metavar="F", help=what)
-    p.add_argument("--level", type=int, choices=(0, 1, 2), help="level to write (default: the file's highest)")
+    p.add_argument("--level", type=int, choices=(0, 1, 2), help="level to export (default: the highest)")
     what = "degree of the spherical harmonics (default: 3)"
     p.add_argument("--sh", type=int, choices=(0, 1, 2, 3), default=3, help=what)
-    what = f"optimisation steps of the refinement, a quarter for later frames (default: {STEPS} or 0, see below)"
+    what = f"refinement steps; later frames take a quarter (default: {STEPS} or 0, see below)"
     p.add_argument("--refine", type=options.count, metavar="N", help=what)
-    what = "multiply all lengths, so that small scenes suit SPZ's fixed-point numbers (default: 1)"
+    what = "factor on all lengths; enlarge small scenes for the fixed-point positions of SPZ (default: 1)"
     p.add_argument("--scale", type=options.positive_float, default=1.0, metavar="X", help=what)
-    p.add_argument("--data", metavar="SOURCE", help="use the training cameras of a dataset as viewpoints")
-    what = "measure PSNR before and after exporting on the held-out views of a dataset"
+    p.add_argument("--data", metavar="SOURCE", help="use the training cameras of this dataset as viewpoints")
+    what = "measure PSNR before and after export on the held-out views of this dataset"
     p.add_argument("--compare", metavar="SOURCE", help=what)
     options.add_reading(p, unset=options.READING)
     p.add_common()
@@ -116,9 +116,9 @@ def _check_folder(path: str, overwrite: bool) -> None:
     check_path(path)
     folder = Path(path)
     if folder.exists() and not folder.is_dir():
-        raise DataError(f"{path}: is a file, expected the name of a folder")
+        raise DataError(f"{path}: is a file, expected a folder")
     if not overwrite and any(folder.glob("*.ply")):
-        raise DataError(f"{path}: holds PLY files already; --overwrite removes them")
+        raise DataError(f"{path}: contains PLY files already; --overwrite removes them")
 
 
 def _player(args: argparse.Namespace) -> Player:
@@ -151,10 +151,8 @@ def _write_still(args: argparse.Namespace, export: Export, console: Console) -> 
         splats, _ = export.splats(args.time, turn, step=step)
     splats = _scaled(splats, args)
     if args.to == "spz" and (size := float(np.median(splats.scales.max(axis=1)))) < 4 * SPZ_STEP:
-        what = f"half of the Gaussians are smaller than {size:.2g} units"
-        console.message(
-            f"pd4dgs-export: {what}, and SPZ rounds positions to {SPZ_STEP:.2g}; --scale enlarges the scene"
-        )
+        what = f"half of the Gaussians are smaller than {size:.2g} units, and SPZ rounds positions to {SPZ_STEP:.2g}"
+        console.message(f"pd4dgs-export: warning: {what}; --scale enlarges the scene")
     data = {"ply": ply_bytes, "spz": spz_bytes, "glb": glb_bytes}[args.to](splats)
     common.write_bytes(args.output, data, args.overwrite)
     return {"frames": 1, "gaussians": len(splats.means), "bytes": len(data), "time": args.time}
@@ -162,7 +160,7 @@ def _write_still(args: argparse.Namespace, export: Export, console: Console) -> 
 
 def _scaled(splats: Splats, args: argparse.Namespace) -> Splats:
     if not len(splats.means):
-        raise DataError(f"{args.input}: has no visible Gaussian at this level and time, expected at least one")
+        raise DataError(f"{args.input}: has no visible Gaussians at this level and time, expected some")
     return splats.scaled(args.scale)
 
 
@@ -172,7 +170,7 @@ def frame_times(info: SceneInfo, fps: float) -> list[float]:
     count = math.floor((stop - start) * fps * (1 + 1e-6)) + 1
     if count > MAX_FRAMES:
         raise DataError(
-            f"{stop - start:g} seconds at {fps:g} frames per second are {count} frames, expected {MAX_FRAMES} at most"
+            f"{stop - start:g} seconds at {fps:g} frames per second are {count} frames, expected at most {MAX_FRAMES}"
         )
     return [i / fps for i in range(count)]
 

@@ -7,12 +7,12 @@ from pd4dgs_codec.cli import options
 from pd4dgs_codec.cli.common import OK, Console, check_output, command, write_checkpoint
 
 DETAILS = """\
-FOLDER is a Scaffold-GS checkpoint: the folder of the run, or its point_cloud/iteration_N with point_cloud.ply and
-either opacity_mlp.pt, cov_mlp.pt and color_mlp.pt or checkpoints.pth.
-It becomes layer 0, a static scene, without loss; encoding quantises it as usual.
-Models with features that layer 0 lacks (distances as inputs, a feature bank) are refused with the feature's name.
-Runs of 4DGaussians and Deformable-3DGS cannot be imported; pd4dgs-train teacher:FOLDER learns from their pictures.
-No code in the files is run.
+FOLDER is a Scaffold-GS checkpoint: a run or its point_cloud/iteration_N, with point_cloud.ply and either
+opacity_mlp.pt, cov_mlp.pt and color_mlp.pt or checkpoints.pth.
+The model becomes layer 0, a static scene, without loss; encoding quantises it as usual.
+Models with features that layer 0 does not support (distance inputs, a feature bank) are refused.
+Runs of 4DGaussians and Deformable-3DGS cannot be imported; pd4dgs-train teacher:FOLDER trains on their renderings.
+Code in the files is never executed.
 
 examples:
   pd4dgs-import output/garden -o garden.pt
@@ -22,11 +22,11 @@ examples:
 
 def parser() -> options.Parser:
     p = options.Parser("import", "FOLDER -o model.pt", "Import a Scaffold-GS model.", DETAILS)
-    p.add_argument("input", metavar="FOLDER", help="the checkpoint")
+    p.add_argument("input", metavar="FOLDER", help="Scaffold-GS checkpoint")
     p.add_argument("-o", "--output", required=True, type=options.named, metavar="model.pt", help="checkpoint to write")
-    what = "use the appearance embedding of image I, if colours depend on one"
+    what = "appearance embedding to use, if colours depend on one"
     p.add_argument("--appearance", type=options.count, metavar="I", help=what)
-    what = "voxel size of the anchors' grid in scene units (default: from cfg_args, else from the anchors)"
+    what = "voxel size of the anchor grid in scene units (default: from cfg_args or the anchors)"
     p.add_argument("--voxel-size", type=options.positive_float, metavar="V", help=what)
     p.add_argument("--iteration", type=options.count, metavar="N", help="iteration to read (default: the last)")
     p.add_common()

@@ -9,9 +9,9 @@ from pd4dgs_codec.cli.common import OK, Console, command, number, read_bytes, sh
 from pd4dgs_codec.errors import DataError
 
 DETAILS = """\
-Times to the first frame are 8 * (bytes to the end of the first slice) / rate: transfer alone, without latency.
-From a URL (http, https) only the header is fetched, unless --check, --bytes or --hashes need the whole file.
-Error bounds are declared by the encoder: the largest difference of a decoded value from the value it was given.
+The time to the first frame is 8 * (bytes to the end of the first slice) / rate, without latency.
+From a URL (http, https), only the header is fetched, unless --check, --bytes or --hashes needs the whole file.
+Error bounds are the largest differences between decoded and original values, as declared by the encoder.
 
 examples:
   pd4dgs-info scene.pd4
@@ -25,11 +25,13 @@ DETAIL_KEYS = ("steps", "planes", "networks")
 
 def parser() -> options.Parser:
     p = options.Parser("info", "FILE", "Show the header and layers of a .pd4 file.", DETAILS)
-    p.add_argument("input", metavar="FILE", help=".pd4 file or its URL; - reads stdin")
-    p.add_argument("--check", action="store_true", help="decode the whole file: check every checksum and rule")
-    p.add_argument("--bytes", action="store_true", help="show the bytes of each section by layer")
-    p.add_argument("--hashes", action="store_true", help="SHA-256 of each layer's integers and float32 tensors")
-    what = "link rates in bits per second for times to the first frame (default: 2M,10M,50M)"
+    p.add_argument("input", metavar="FILE", help=".pd4 file or URL; - reads stdin")
+    p.add_argument("--check", action="store_true", help="decode the whole file and check every checksum and rule")
+    p.add_argument("--bytes", action="store_true", help="show the bytes of each section and layer")
+    p.add_argument(
+        "--hashes", action="store_true", help="show SHA-256 of the integers and float32 tensors of each layer"
+    )
+    what = "link rates in bits per second for the time to the first frame (default: 2M,10M,50M)"
     p.add_argument("--at", type=options.rates, default="2M,10M,50M", metavar="RATES", help=what)
     p.add_common()
     return p
@@ -81,7 +83,7 @@ def _parts(result: dict[str, Any]) -> list[dict[str, Any]]:
     layers = result["layers"]
     missing = [row["layer"] for row in layers if "sections" not in row]
     if missing:
-        raise DataError(f"{result['input']}: layer {missing[0]} is incomplete; expected a whole file for --bytes")
+        raise DataError(f"{result['input']}: layer {missing[0]} is truncated, expected a complete file for --bytes")
     names = dict.fromkeys(name for row in layers for name in row["sections"])
     parts = [{"part": name, "layers": [row["sections"].get(name, 0) for row in layers]} for name in names]
     frames = [row["bytes"] - sum(row["sections"].values()) for row in layers]
@@ -148,7 +150,7 @@ def _slice_lines(result: dict[str, Any]) -> list[str]:
 
 
 def _text(result: dict[str, Any]) -> str:
-    cut = "" if result["available"] >= result["bytes"] else f", of which {result['available']:,} are present"
+    cut = "" if result["available"] >= result["bytes"] else f", truncated to {result['available']:,}"
     low, high = result["time_range"]
     left_out = result["left_out"]
     lines = [

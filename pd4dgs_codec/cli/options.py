@@ -13,7 +13,7 @@ from pd4dgs_codec.cli.common import UsageError, tell
 
 T = TypeVar("T")
 
-EXIT_CODES = "exit codes: 0 done, 1 bad data or I/O, 2 wrong usage"
+EXIT_CODES = "exit codes: 0 success, 1 invalid data or I/O error, 2 usage error"
 #: Defaults of the options of `add_reading`.
 READING = {"downscale": 1, "holdout": 8}
 #: Stands for the list of sources in the details of a command; `Parser.format_help` fills it in.
@@ -21,20 +21,19 @@ SOURCES = "<the list of sources>"
 SCENES = """\
   synthetic:static   nothing moves
   synthetic:global   large objects move slowly
-  synthetic:local    the same, and small parts move on their own
-  synthetic:fast     quick motion
-  synthetic:flyby, synthetic:dart, synthetic:rods, synthetic:tunnel, synthetic:bend, synthetic:blink
-                     on white in D-NeRF's manner, from a camera that jumps and without points: a ball flies past a
-                     cube, a small ball flies fast, thin rods move, a ball goes through a tunnel, a column bends,
-                     things appear and vanish
-  (synthetic:NAME?seed=n is another scene of that kind; &size=WxH and &frames=N set the size and number of its
-  images, by default 160x120 and 60, on white 100x100 and 150; &path=pass|sweeps|jump moves the camera once over its
-  arc, to and fro, or to a random place at each instant)
-  teacher:PATH       images rendered from explicit Gaussians: a folder of .ply or .spz files, one per frame, one such
-                     file, a .4dgs file, a gsplat checkpoint, a run of 4DGaussians or Deformable-3DGS, or
-                     module:function (time -> Gaussians)
-  (teacher:PATH?cameras=SOURCE takes the cameras, times and held-out images of another source;
-  otherwise ?views=N&size=WxH&fps=F&background=white&up=X,Y,Z)"""
+  synthetic:local    large objects move slowly, and small parts of them on their own
+  synthetic:fast     fast motion
+  synthetic:flyby (a ball flies past a cube), synthetic:dart (a small ball flies fast), synthetic:rods (thin rods move),
+  synthetic:tunnel (a ball flies through a tunnel), synthetic:bend (a column bends), synthetic:blink (objects appear
+  and vanish): as in D-NeRF, on white, with a camera that jumps between frames and without initial points
+  synthetic:NAME?seed=S&size=WxH&frames=N&path=P varies a scene by random seed, image size and number of frames
+  (default: 160x120 and 60; on white 100x100 and 150) and by camera path: pass (once along an arc), sweeps (back and
+  forth) or jump (a random pose in each frame)
+  teacher:PATH       renderings of explicit Gaussians: a .ply or .spz file, a folder with one per frame, a .4dgs file, a
+                     gsplat checkpoint, a run of 4DGaussians or Deformable-3DGS, or module:function (a Python function
+                     from time to Gaussians)
+  teacher:PATH?cameras=SOURCE takes cameras, times and held-out views from another source; otherwise
+  ?views=N&size=WxH&fps=F&background=white&up=X,Y,Z sets them"""
 
 
 class Parser(argparse.ArgumentParser):
@@ -74,21 +73,21 @@ class Parser(argparse.ArgumentParser):
         add("-h", "--help", action="help", help="show this help and exit")
         add("--version", action=_Version, nargs=0, help="show the version and exit")
         if json_file:
-            what = "write one JSON object to FILE; without FILE, to stdout and nothing else there"
+            what = "write the result to FILE as one JSON object (default: to stdout, in place of the text)"
             add("--json", nargs="?", const="-", metavar="FILE", help=what)
         else:
-            add("--json", action="store_true", help="print one JSON object on stdout and nothing else there")
-        add("-v", "--verbose", action="store_true", help="print more on stderr")
+            add("--json", action="store_true", help="print the result as one JSON object on stdout")
+        add("-v", "--verbose", action="store_true", help="print more messages")
         add("-j", "--threads", type=positive_int, metavar="N", help="CPU threads (default: all cores)")
-        add("-f", "--overwrite", action="store_true", help="replace existing outputs")
+        add("-f", "--overwrite", action="store_true", help="overwrite existing outputs")
 
 
 def add_reading(options: argparse._ActionsContainer, *, unset: Iterable[str] = ()) -> None:
     """Adds --downscale and --holdout for reading a dataset. unset: names that are None unless given."""
     add, default = options.add_argument, READING | dict.fromkeys(unset)
-    what = f"use images at 1/K size (default: {READING['downscale']})"
+    what = f"downscale images by K (default: {READING['downscale']})"
     add("--downscale", type=positive_int, default=default["downscale"], metavar="K", help=what)
-    what = f"hold out frames with i %% K == K/2 if there are no split files (default: {READING['holdout']}; 0: none)"
+    what = f"without split files, hold out frames with i %% K == K/2 (default: {READING['holdout']}; 0: none)"
     add("--holdout", type=count, default=default["holdout"], metavar="K", help=what)
 
 
@@ -105,7 +104,7 @@ def conditional(args: argparse.Namespace, condition: object, otherwise: str, **d
 
 def add_background(options: argparse._ActionsContainer, default: str) -> None:
     """Adds --background. default: the default in words."""
-    what = f"black, white or R,G,B in 0..1 behind the scene and behind pictures with alpha (default: {default})"
+    what = f"colour behind the scene and images with alpha: black, white or R,G,B in 0..1 (default: {default})"
     options.add_argument("--background", type=background, metavar="COLOR", help=what)
 
 

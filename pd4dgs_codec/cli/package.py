@@ -20,18 +20,17 @@ if TYPE_CHECKING:
     from pd4dgs_codec.web.manifests import Video
 
 DETAILS = """\
-DIR then holds scene.pd4 and index.html, a page that plays the scene from any web server that DIR is copied to.
-For other players it holds index.json (byte ranges and SHA-256 of the layers), scene.mp4 and scene.mpd (DASH: each layer
-is a fragment and an AdaptationSet of its own, with dependencyId) and scene.m3u8 (HLS: the session data name
-index.json).
+DIR then holds scene.pd4 and index.html, a page that plays the scene from any static web server. For other players there
+are index.json (byte ranges and SHA-256 of the layers), scene.mp4 with scene.mpd (DASH: each layer is a fragment in an
+AdaptationSet of its own, with dependencyId) and scene.m3u8 (HLS, with index.json as session data).
 
-DASH clients that support dependencyId deliver the layers; showing them takes a .pd4 decoder. Other DASH and HLS players
-play a 2D video, fallback.mp4, rendered with the scene's own camera over its time range. The video needs torch, numba
-and ffmpeg (the extra [train]) and a file with a camera; otherwise the folder is made without it.
+DASH clients with support for dependencyId can fetch the layers, but need a .pd4 decoder to show them. Other DASH and
+HLS players show a 2D video, fallback.mp4, of the scene from its own camera. The video needs torch, numba and ffmpeg
+(the extra [train]) and a file with a camera; otherwise it is left out.
 
---immutable puts a digest into the names of referenced files, so that a CDN may cache them for ever: a new version has
-new names. index.json lists the Cache-Control header of each file. If the input is a folder of packages, library.json
-and index.html are written beside them: a list with posters, sizes and times to the first picture.
+--immutable puts a checksum into the names of the files that others refer to, so that a CDN may cache them forever.
+index.json lists the Cache-Control header of each file. For a folder of packages, pd4dgs-package writes library.json and
+index.html beside them, with the poster, size and time to the first frame of each.
 
 examples:
   pd4dgs-package scene.pd4 -o out/scene
@@ -45,14 +44,14 @@ FRAGMENT_SECONDS = 2
 
 
 def parser() -> options.Parser:
-    summary = "Make a folder for web servers: a page that plays the scene, DASH, HLS."
+    summary = "Make a folder for web servers, with a player page, DASH and HLS."
     p = options.Parser("package", "scene.pd4 -o DIR", summary, DETAILS)
-    p.add_argument("input", metavar="scene.pd4", help="file to package (- reads stdin), or a folder of packages")
+    p.add_argument("input", metavar="scene.pd4", help=".pd4 file (- reads stdin), or a folder of packages")
     p.add_argument(
-        "-o", "--output", required=True, type=options.named, metavar="DIR", help="folder to write, made if missing"
+        "-o", "--output", required=True, type=options.named, metavar="DIR", help="output folder, created if missing"
     )
-    p.add_argument("--immutable", action="store_true", help="put digests into file names, for long-lived caches")
-    p.add_argument("--no-video", action="store_true", help="leave out the 2D video")
+    p.add_argument("--immutable", action="store_true", help="put checksums into file names, for long-lived caches")
+    p.add_argument("--no-video", action="store_true", help="make no 2D video")
     what = "frame rate of the 2D video (default: 20)"
     p.add_argument("--fps", type=options.fps, metavar="F", help=what)
     p.add_common()
@@ -90,7 +89,7 @@ def _library(args: argparse.Namespace, console: Console) -> int:
 
     options.conditional(args, False, "needs a .pd4 file, not a folder", immutable=False, no_video=False, fps=None)
     if not same_file(args.input, args.output):
-        raise DeliveryError(f"-o {args.output}: expected {args.input}: the index is written beside the packages")
+        raise DeliveryError(f"found -o {args.output}, expected {args.input}, the folder of the packages")
     result = {"input": args.input, "output": args.output, "files": _write(args, library(Path(args.input)))}
     console.result(result, _text(result))
     return OK
@@ -111,7 +110,7 @@ def _reason(error: RenderError | ModuleNotFoundError) -> str:
         return str(error)
     if (error.name or "").startswith("pd4dgs_codec"):
         raise error
-    return f"needs the module {error.name}, which is not installed"
+    return f"the module {error.name} is not installed"
 
 
 def _render(scene: Scene, fps: float) -> Video:
@@ -122,11 +121,11 @@ def _render(scene: Scene, fps: float) -> Video:
 
     check_mp4()
     if scene.info.camera is None:
-        raise RenderError("the file holds no camera of its own")
+        raise RenderError("the file has no camera")
     low, high = scene.info.time_range
     count = max(2, round((high - low) * fps)) if high > low else STILL_FRAMES
     if count > MAX_FRAMES:
-        raise RenderError(f"it would have {count:,} frames, expected at most {MAX_FRAMES:,}; choose a lower --fps")
+        raise RenderError(f"found {count:,} frames, expected at most {MAX_FRAMES:,}; lower --fps")
     frames = own_frames(scene.info, count)
     camera = frames[0].camera
     with temporary_folder() as folder, progress_bar(len(frames), "frames", "video") as step:

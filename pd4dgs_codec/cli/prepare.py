@@ -12,12 +12,12 @@ from pd4dgs_codec.errors import DataError
 CAMERAS = ("SIMPLE_RADIAL", "SIMPLE_PINHOLE", "PINHOLE", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 DETAILS = """\
 INPUT is a video, or a folder of frames whose names end with their numbers.
-Frames are chosen evenly over time, without blurred frames and repetitions. pycolmap estimates the camera poses (pip
-install 'pd4dgs-codec[prepare]'). Features that move are found by comparing them with their predicted positions in a
-static scene, and the poses are adjusted without them. Training images are not masked.
+Frames are chosen evenly over time, without blurred and repeated ones. pycolmap estimates the camera poses (pip install
+'pd4dgs-codec[prepare]'). Features off their predicted positions in a static scene count as moving, and the
+poses are refined without them. Training images are not masked.
 
-FOLDER then holds images/, times.txt, sparse/0 (a COLMAP model), report.json and report.png. Intermediate results are
-kept in FOLDER.partial; after Ctrl-C the same command resumes from there.
+FOLDER then holds images/, times.txt, sparse/0 (a COLMAP model), report.json and report.png. FOLDER.partial holds
+intermediate results; after Ctrl-C, the same command resumes from them.
 
 examples:
   pd4dgs-prepare kitchen.mp4 -o kitchen
@@ -26,14 +26,14 @@ examples:
 
 
 def parser() -> options.Parser:
-    p = options.Parser("prepare", "INPUT -o FOLDER", "Estimate the camera poses of a recording.", DETAILS)
+    p = options.Parser("prepare", "INPUT -o FOLDER", "Estimate the camera poses of a video.", DETAILS)
     add = p.add_argument
-    add("input", type=options.named, metavar="INPUT", help="a video, or a folder of frames")
-    add("-o", "--output", required=True, type=options.named, metavar="FOLDER", help="folder to make")
+    add("input", type=options.named, metavar="INPUT", help="video or folder of frames")
+    add("-o", "--output", required=True, type=options.named, metavar="FOLDER", help="output folder")
     add("--frames", type=options.count, default=120, metavar="N", help="use at most N frames (default: 120; 0: all)")
     what = "frame rate of a folder of frames (default: 30)"
     add("--fps", type=options.positive_float, metavar="F", help=what)
-    add("--downscale", type=options.positive_int, default=1, metavar="K", help="write images at 1/K size (default: 1)")
+    add("--downscale", type=options.positive_int, default=1, metavar="K", help="downscale images by K (default: 1)")
     add("--camera", choices=CAMERAS, default=CAMERAS[0], help=f"COLMAP camera model (default: {CAMERAS[0]})")
     p.add_common()
     return p
@@ -58,11 +58,11 @@ main = command(parser, _prepare)
 def _text(output: str, report: dict[str, Any]) -> str:
     frames = report["frames"]
     found = f"{frames['registered']} of {frames['chosen']} frames have poses"
-    left = f"{frames['blurred']} blurred and {frames['repeated']} repeated of {frames['seen']} left out"
+    left = f"of {frames['seen']}, {frames['blurred']} blurred and {frames['repeated']} repeated left out"
     lines = [
         f"{output}: {found} ({left})",
         f"reprojection error {report['reprojection_error']:.2f} pixels, {report['points']:,} points, "
         f"{100 * report['moving_share']:.0f} % of the features move",
     ]
-    lines += [f"record better: {line}" for line in report["advice"]]
-    return "\n".join([*lines, f"{output}/report.png shows more"])
+    lines += [f"advice: {line}" for line in report["advice"]]
+    return "\n".join([*lines, f"see {output}/report.png"])

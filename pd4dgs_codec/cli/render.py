@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from pd4dgs_codec.quality.levels import Level
 
 DETAILS = f"""\
-Without --data the file's own camera is used over its time range; with --data the views of a dataset at their times.
+Renders the file's own camera over its time range, or with --data the views of a dataset at their times.
 
 {options.SOURCES}
 
@@ -39,22 +39,22 @@ VIDEOS = (".gif", ".mp4")
 def parser() -> options.Parser:
     p = options.Parser("render", "FILE -o OUT", "Render a .pd4 file or a checkpoint to images or a video.", DETAILS)
     p.add_argument("input", metavar="FILE", help=".pd4 file or .pt checkpoint; - reads a .pd4 from stdin")
-    what = "images such as out/%%04d.png, or a .gif or .mp4"
+    what = "images such as out/%%04d.png, or a .gif or .mp4 video"
     p.add_argument("-o", "--output", required=True, metavar="OUT", help=what)
-    options.add_max_layer(p, "render the layers up to this one")
-    what = "render the slices within the first SIZE bytes, such as 50k"
+    options.add_max_layer(p, "highest layer to render")
+    what = "render only the slices within the first SIZE bytes, such as 50k"
     p.add_argument("--max-bytes", type=options.size, metavar="SIZE", help=what)
     options.add_background(p, "the file's")
-    p.add_argument("--data", metavar="SOURCE", help="take cameras, times and ground-truth images from a dataset")
+    p.add_argument("--data", metavar="SOURCE", help="take cameras, times and ground truth from this dataset")
     p.add_argument("--split", choices=("test", "train"), help="views of the dataset (default: test)")
     options.add_reading(p, unset=("holdout",))
-    what = "number of frames, evenly over the time range (default: 60); with --data the first N views"
+    what = "number of evenly spaced frames (default: 60); with --data, render the first N views"
     p.add_argument("--frames", type=options.positive_int, metavar="N", help=what)
-    what = "swing the file's camera by DEG degrees around the point it looks at (default: 0)"
+    what = "swing the file's camera by DEG degrees about its look-at point (default: 0)"
     p.add_argument("--orbit", type=options.finite_float, default=0.0, metavar="DEG", help=what)
     what = "frame rate of a video (default: 20)"
     p.add_argument("--fps", type=options.fps, metavar="F", help=what)
-    what = "show all levels side by side, and the ground truth with --data"
+    what = "show all levels side by side, with --data beside the ground truth"
     p.add_argument("--side-by-side", action="store_true", help=what)
     p.add_common()
     return p
@@ -81,7 +81,7 @@ def _render(args: argparse.Namespace, console: Console) -> int:
     console.detail(f"{args.input}: levels " + ", ".join(f"{row.level} ({row.anchors} anchors)" for row in levels))
     frames = _frames(args, levels[-1])
     if kind in VIDEOS and len({(frame.camera.width, frame.camera.height) for frame in frames}) > 1:
-        raise DataError(f"{args.data}: has views of several sizes, a video takes one; expected -o such as out/%04d.png")
+        raise DataError(f"{args.data}: found views of several sizes, expected one size, or -o such as out/%04d.png")
     milliseconds: list[float] = []
     with progress_bar(len(frames), "frames", "rendering") as step:
         outputs = _write(args, kind, _pictures(frames, levels, args.side_by_side, milliseconds, step), len(frames))
@@ -108,7 +108,7 @@ def _check_usage(args: argparse.Namespace) -> str:
     if args.output == STDIO or kind not in (*PICTURES, *VIDEOS):
         raise UsageError(f"found -o {args.output}, expected images such as out/%04d.png, or a .gif or .mp4")
     if args.data and args.orbit:
-        raise UsageError("--orbit moves the file's own camera; found --data too, expected one of them")
+        raise UsageError("found --orbit and --data, expected one of them")
     options.conditional(args, args.data, "needs --data SOURCE", split="test", holdout=8)
     options.conditional(args, kind in VIDEOS, "needs a .gif or .mp4 as -o", fps=20.0)
     if kind not in VIDEOS and "%" in args.output:
@@ -157,7 +157,7 @@ def _write(args: argparse.Namespace, kind: str, pictures: Iterator[np.ndarray], 
     numbered = "%" in args.output
     if count > 1 and not numbered:
         raise UsageError(
-            f"found -o {args.output} for {count} images, expected a frame number in it, such as %04d, or --frames 1"
+            f"found -o {args.output} for {count} images, expected a frame number such as %04d in it, or --frames 1"
         )
     names = [args.output % i if numbered else args.output for i in range(count)]
     with whole_files(names, args.overwrite, args.output) as temporaries:
@@ -168,5 +168,5 @@ def _write(args: argparse.Namespace, kind: str, pictures: Iterator[np.ndarray], 
 def _text(result: dict[str, Any]) -> str:
     levels = ", ".join(map(str, result["levels"]))
     size = f"{result['width']}x{result['height']}"
-    speed = f"{result['render_ms']:.1f} ms per picture"
+    speed = f"{result['render_ms']:.1f} ms per frame"
     return f"{result['output']}: {result['frames']} frames of {size}, level {levels}, {speed}"

@@ -9,12 +9,12 @@ from pd4dgs_codec.cli.common import OK, Console, command
 
 DETAILS = """\
 Answers GET and HEAD with ranges, If-Range, ETag and CORS. Files outside DIR and names that begin with a dot are not
-served. The first line on stdout is the URL, printed when the server listens. Ctrl-C or SIGTERM ends it.
+served. The first line on stdout is the URL, printed when the server is ready. Ctrl-C or SIGTERM stops it.
 
---rate is the rate of one link that all clients share; headers are not counted. --latency is its round-trip time: a new
-connection takes one round trip, each request another.
+--rate is the rate of one link shared by all clients, headers not counted. --latency is its round-trip time: one
+per new connection and one per request.
 
-In production use any server of static files; docs/player-and-delivery.md has configurations for nginx and Caddy.
+For production, use any web server for static files; docs/player-and-delivery.md configures nginx and Caddy.
 
 examples:
   pd4dgs-serve out/scene
@@ -22,11 +22,17 @@ examples:
 
 
 def parser() -> options.Parser:
-    p = options.Parser("serve", "DIR", "Serve a folder over HTTP, at the rate of a slow link if asked for.", DETAILS)
+    p = options.Parser("serve", "DIR", "Serve a folder over HTTP, with an optional rate limit.", DETAILS)
     p.add_argument("input", metavar="DIR", help="folder to serve")
     what = "address to listen on (default: 127.0.0.1)"
     p.add_argument("--host", type=options.host, default="127.0.0.1", metavar="H", help=what)
-    p.add_argument("--port", type=options.port, default=8000, metavar="N", help="port; 0: any free one (default: 8000)")
+    p.add_argument(
+        "--port",
+        type=options.port,
+        default=8000,
+        metavar="N",
+        help="port to listen on (default: 8000; 0: any free port)",
+    )
     add_link(p)
     p.add_common()
     return p
@@ -34,9 +40,9 @@ def parser() -> options.Parser:
 
 def add_link(p: options.Parser) -> None:
     """Adds --rate and --latency of the simulated link."""
-    what = "rate of the link in bits per second, such as 2M (default: unlimited)"
+    what = "link rate in bits per second, such as 2M (default: unlimited)"
     p.add_argument("--rate", type=options.rate, metavar="BPS", help=what)
-    what = "round-trip time of the link, such as 50ms (default: 0)"
+    what = "round-trip time, such as 50ms (default: 0)"
     p.add_argument("--latency", type=options.duration, metavar="T", help=what)
 
 

@@ -20,23 +20,23 @@ if TYPE_CHECKING:
     from pd4dgs_codec.train.loop import Trainer
 
 DETAILS = f"""\
-Training ends after --iterations steps. --max-seconds alone spreads the whole schedule over that time; with --iterations
-it stops the run early. Ctrl-C or SIGTERM ends the run after the current step with a complete checkpoint, from which
---resume continues. A second Ctrl-C ends it at once and loses all steps since the last save (one a minute).
+Training ends after --iterations steps. --max-seconds alone spreads the whole schedule over this time; with --iterations
+it stops the run early. Ctrl-C or SIGTERM stops the run after the current step with a complete checkpoint, from which
+--resume continues. A second Ctrl-C stops it at once and loses the steps since the last save (one a minute).
 
---quality sets the weights of the bit rates, pruning and quantisation steps together; --rate-scale, --prune and
---grading replace single ones.
+--quality sets the weights of the bitrate, pruning and quantisation steps together; --rate-scale, --prune and --grading
+override single ones.
 
---rollout: key makes level 0 the scene at --key-instant, from which layer 1 moves it, and trains mostly the highest
-level. The others are the paper's, whose level 0 is the mean over time: adaptive samples levels, higher ones more often
-the more the layers differ; uniform samples all levels alike; fixed samples them with probabilities .15, .30, .55; top
-trains only the highest level; all trains every level in every step, at about three times the cost. The first tenth of a
-run trains level 0 in any case.
---without: rate, the bit-rate terms; planes, the bit-rate term of the planes; binary and smooth, the two mask terms;
-tmc, both of them; noise, the simulated quantisation; whitening, the transform of the feature channels.
+With --rollout key, level 0 is the scene at --key-instant, layer 1 moves it from there, and most steps train the highest
+level. The other values are the paper's, with the mean over time as level 0: adaptive samples higher levels more often
+the more the layers differ; uniform samples all levels equally; fixed samples them with probabilities 0.15, 0.30 and
+0.55; top trains only the highest level; all trains every level in every step, at about three times the cost. The first
+tenth of every run trains level 0.
+--without turns off: rate, the bitrate terms; planes, the bitrate term of the planes; binary and smooth, the two mask
+terms; tmc, both mask terms; noise, the simulated quantisation; whitening, the transform of the feature channels.
 
-torchrun starts several workers that train one scene: they share the V views of a step and average their gradients, and
-the first worker writes the files. Their number must divide V. A run may be resumed with another number of workers.
+torchrun starts several workers for one scene: they share the V views of a step and average their gradients, and the
+first worker writes the files. Their number must divide V and may change when a run is resumed.
 
 {options.SOURCES}
 
@@ -56,21 +56,21 @@ def parser() -> options.Parser:
     add("source", metavar="SOURCE", help="dataset to train on, see below")
     add("-o", "--output", required=True, type=options.named, metavar="FILE.pt", help="checkpoint to write")
     options.add_reading(p, unset=options.READING)
-    options.add_background(p, "that of the data, white behind pictures with alpha")
+    options.add_background(p, "the dataset's; white for images with alpha")
     what = "0 (small files) to 100 (high quality), see below (default: 50)"
     add("--quality", type=options.checked(float, lambda q: 0 <= q <= 100, "0 to 100"), metavar="Q", help=what)
     _add_fields(p)
-    add("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to train (default: auto)")
+    add("--device", choices=("auto", "cpu", "cuda"), default="auto", help="device to train on (default: auto)")
     add(
         "--resume",
         type=options.named,
         metavar="FILE.pt",
-        help="continue from this checkpoint with the settings stored in it",
+        help="continue from this checkpoint with its stored settings",
     )
-    add("--log", type=options.named, metavar="FILE.jsonl", help="write one JSON object per step")
-    what = f"show the scene in the browser while it trains, at this port (default: {VIEW_PORT}; needs viser)"
+    add("--log", type=options.named, metavar="FILE.jsonl", help="log to write, one JSON object per step")
+    what = f"show the training in the browser at this port (default: {VIEW_PORT}; needs viser)"
     add("--view", type=options.port, nargs="?", const=VIEW_PORT, metavar="PORT", help=what)
-    what = f"turn off a part of the method, see below; may be repeated: {', '.join(ABLATIONS)}"
+    what = f"turn off a part of the method, see below (repeatable): {', '.join(ABLATIONS)}"
     add("--without", action="append", choices=tuple(ABLATIONS), metavar="PART", default=[], help=what)
     p.add_common()
     return p
@@ -129,8 +129,8 @@ def _train(args: argparse.Namespace, console: Console) -> int:
     workers.stop()
     if trainer.iteration and trainer.learner.skipped == trainer.iteration:
         raise TrainError(
-            f"{args.output}: nothing was learnt: in all {trainer.iteration} steps the loss or its gradient was not "
-            "finite; expected views and a scene of ordinary size"
+            f"{args.output}: training failed: the loss or its gradient was not finite in all {trainer.iteration} "
+            "steps; expected images and a scene of ordinary size"
         )
     if first:
         result = _summary(args, trainer)
@@ -173,8 +173,8 @@ def _stored_config(args: argparse.Namespace) -> TrainConfig:
 
     _, training = checkpoint.load(args.resume)
     if "config" not in training:
-        what = "no training state (it was decoded from a .pd4, or stripped)"
-        raise TrainError(f"{args.resume}: holds {what}; expected a checkpoint of pd4dgs-train")
+        what = "no training state (decoded from a .pd4, or stripped)"
+        raise TrainError(f"{args.resume}: found {what}, expected a checkpoint of pd4dgs-train")
     config = TrainConfig.from_json(training["config"], args.resume)
     for name in FIXED:
         asked = getattr(args, name)
@@ -183,10 +183,10 @@ def _stored_config(args: argparse.Namespace) -> TrainConfig:
     if args.quality is not None:
         for name, value in at_quality(args.quality).items():
             if getattr(args, name, None) is None and name not in _ablated(args):
-                _expect_same(args.resume, f"{name}, which --quality sets,", getattr(config, name), value)
+                _expect_same(args.resume, f"--quality with {name}", getattr(config, name), value)
     for part in args.without:
         if any(getattr(config, name) != value for name, value in ABLATIONS[part].items()):
-            raise TrainError(f"{args.resume}: was not trained --without {part}; expected the same to resume")
+            raise TrainError(f"{args.resume}: found --without {part}, expected the settings of the checkpoint")
     if _same_source(args.source) != _same_source(config.source):
         _expect_same(args.resume, "SOURCE", config.source, args.source)
     return replace(config, max_seconds=args.max_seconds or config.max_seconds)
@@ -194,7 +194,7 @@ def _stored_config(args: argparse.Namespace) -> TrainConfig:
 
 def _expect_same(path: str, what: str, stored: Any, asked: Any) -> None:
     if stored != asked:
-        raise TrainError(f"{path}: was trained with {what} {stored}, found {asked}; expected the same to resume")
+        raise TrainError(f"{path}: found {what} {asked}, expected {stored} as in the checkpoint")
 
 
 def _same_source(source: str) -> str:
@@ -207,8 +207,8 @@ def _check_time_left(trainer: Trainer, path: str) -> None:
     """Raises TrainError if the run has used up its time limit without having finished."""
     limit = trainer.config.max_seconds
     if limit and not trainer.finished and trainer.seconds >= limit:
-        used = f"has trained {trainer.seconds:.0f} s of its limit of {limit:g} s"
-        raise TrainError(f"{path}: {used}; expected a larger --max-seconds to continue")
+        used = f"has used {trainer.seconds:.0f} s of its limit of {limit:g} s"
+        raise TrainError(f"{path}: {used}, expected a higher --max-seconds")
 
 
 # -- log and messages --------------------------------------------------------------------------------------------------
@@ -248,7 +248,7 @@ def _progress(args: argparse.Namespace, trainer: Trainer, console: Console) -> T
     from pd4dgs_codec.cli.watch import WatchedProgress
 
     progress = WatchedProgress(trainer, args.view)
-    console.message(f"the scene is at {progress.url}")
+    console.message(f"watch the training at {progress.url}")
     return progress
 
 
@@ -277,7 +277,7 @@ def _device(name: str, console: Console) -> str:
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
         return "cpu"
     if not torch.cuda.is_available():
-        raise TrainError("--device cuda: this PyTorch finds no CUDA device; expected one, or --device cpu")
+        raise TrainError("--device cuda: PyTorch found no CUDA device, expected one or --device cpu")
     from pd4dgs_codec.model.picture import check_gsplat
 
     try:
@@ -285,7 +285,7 @@ def _device(name: str, console: Console) -> str:
     except RenderError as error:
         if name == "cuda":
             raise TrainError(f"--device cuda: {error}") from None
-        console.message(f"the GPU is not used: {error}")
+        console.message(f"training on the CPU: {error}")
         return "cpu"
     return "cuda"
 
@@ -322,7 +322,7 @@ def _text(result: dict[str, Any]) -> str:
     if not result["finished"]:
         lines.append(f"not finished: --resume {result['output']} continues from here")
     if result["skipped"]:
-        lines.append(f"{result['skipped']} steps skipped: their gradient was not finite")
+        lines.append(f"{result['skipped']} steps skipped for non-finite gradients")
     for row in result["left_out"]:
         gain = f"{row['gain']:+.2f} dB over level {row['level'] - 1} on {row['views']} held-back views"
         lines.append(f"level {row['level']} left out: {gain}")

@@ -10,11 +10,11 @@ from pd4dgs_codec.cli.serve import add_link, set_by_signals
 from pd4dgs_codec.io import check_output, temporary_folder, write_bytes
 
 DETAILS = """\
-SCENE is a .pd4 file, a checkpoint, which is encoded first, or the URL of a .pd4 file.
-The first line on stdout is the address of the page, printed when it can be opened. The default browser opens it.
-Ctrl-C or SIGTERM ends the command. A server of another site must allow cross-origin requests, as pd4dgs-serve does.
+SCENE is a .pd4 file, the URL of one, or a checkpoint, which is encoded first.
+The first line on stdout is the address of the page, printed when it is ready; the default browser opens it. Ctrl-C or
+SIGTERM stops the server. The server of a URL must allow cross-origin requests, as pd4dgs-serve does.
 
-With -o the page is written instead: player and scene in one HTML file, which browsers open without a server.
+-o writes one HTML file with the player and the scene instead, which browsers open without a server.
 
 examples:
   pd4dgs-view scene.pd4
@@ -28,17 +28,17 @@ PACKING_EFFORT = 1
 
 def parser() -> options.Parser:
     p = options.Parser("view", "SCENE", "Show a scene in the browser.", DETAILS)
-    p.add_argument("input", metavar="SCENE", help=".pd4 file, .pt checkpoint or URL of a .pd4; - reads stdin")
+    p.add_argument("input", metavar="SCENE", help=".pd4 file, its URL, or .pt checkpoint; - reads stdin")
     p.add_argument(
         "-o",
         "--output",
         type=options.named,
         metavar="FILE",
-        help="write one HTML file that shows the scene, and do not serve",
+        help="write one HTML file instead of starting a server",
     )
-    what = "port to listen on; 0: any free one (default: 0)"
+    what = "port to listen on (default: any free port)"
     p.add_argument("--port", type=options.port, metavar="N", help=what)
-    p.add_argument("--no-browser", action="store_true", help="print the address without opening a browser")
+    p.add_argument("--no-browser", action="store_true", help="do not open the browser")
     add_link(p)
     p.add_common()
     return p

@@ -53,7 +53,7 @@ COLMAP = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 READERS = (
     Reader(
         "iPhone/DyCheck, Nerfies, HyperNeRF", "iphone:read_iphone", (("camera",),), "camera/, rgb/ and splits/",
-        "the split files decide what is held out",
+        "split files name the held-out views",
     ),
     Reader("Blender, D-NeRF, nerfstudio", "transforms:read_transforms", (("transforms*.json",),), "transforms*.json"),
     Reader(
@@ -69,7 +69,7 @@ READERS = (
     Reader(
         "COLMAP", "colmap:read_colmap",
         tuple((f"{place}/cameras{kind}", f"{place}/images{kind}") for place in COLMAP for kind in (".bin", ".txt")),
-        "sparse/0 and images/ or videos/", "times.txt may give times; the first video is held out",
+        "sparse/0 and images/ or videos/", "optional times.txt; the first video is held out",
     ),
 )  # fmt: skip
 #: A line of help for each layout.

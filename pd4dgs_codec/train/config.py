@@ -136,12 +136,10 @@ class TrainConfig:
     preset: str = option("small", help="model size", choices=tuple(DEFAULT_ITERATIONS))
     source: str = ""  #: the source given to `data.load`, stored so that a resumed run reads the same data
     feature_width: int = option(
-        32, help=f"numbers of an anchor's feature, 1 to {MAX_FEATURE}", metavar="N", least=1, most=MAX_FEATURE
+        32, help=f"feature channels per anchor, 1 to {MAX_FEATURE}", metavar="N", least=1, most=MAX_FEATURE
     )
-    slots: int = option(10, help=f"Gaussians of an anchor, 1 to {MAX_SLOTS}", metavar="N", least=1, most=MAX_SLOTS)
-    view_dependent: str = option(
-        "color", help="the networks of anchors that take the view direction", choices=VIEW_DEPENDENT
-    )
+    slots: int = option(10, help=f"Gaussians per anchor, 1 to {MAX_SLOTS}", metavar="N", least=1, most=MAX_SLOTS)
+    view_dependent: str = option("color", help="networks that take the view direction", choices=VIEW_DEPENDENT)
     downscale: int = option(1)
     holdout: int = option(8)
     #: RGB behind pictures with alpha; None: white
@@ -152,13 +150,13 @@ class TrainConfig:
     )
     #: without `iterations`, the schedule is spread over this time; with `iterations`, the limit stops the run early
     max_seconds: float | None = option(
-        None, help="time to train; a resumed run counts the time before it too", metavar="S", above=0, fixed=False
+        None, help="training time in seconds, including the time before --resume", metavar="S", above=0, fixed=False
     )
-    seed: int = option(0, help="seed of all randomness in training", metavar="N", least=0, most=2**63 - 2)
+    seed: int = option(0, help="random seed", metavar="N", least=0, most=2**63 - 2)
     #: rate weight per level; the paper's weight of level 2 is 0.00025, for anchors that only layer 2 has
     lambdas: tuple[float, float, float] = (0.04, 0.01, 0.01)
     #: multiplies every lambda; 1 is the paper's operating point
-    rate_scale: float = option(0.08, help="weight of the anchors' bit rate; 1 is the paper's", least=0, dial=4.0)
+    rate_scale: float = option(0.08, help="weight of the anchors' bitrate; the paper's is 1", least=0, dial=4.0)
     rate_share: float = 0.05  #: share of the anchors from which a step estimates the rate
     plane_rate: float = option(4e-9, least=0, dial=4.0, fixed=False)  #: weight per bit of the planes, ramped up
     tmc: float = 0.01
@@ -170,37 +168,35 @@ class TrainConfig:
     tmc_tau: float = 4.0  #: voxels
     #: the gradients of a step's views are averaged; workers share the views
     views_per_step: int = option(
-        1, help="views of each level per step; torchrun's workers share them", metavar="V", least=1
+        1, help="views per step and level, shared by the workers of torchrun", metavar="V", least=1
     )
     #: steps on smaller pictures cost less, and coarse structure is learnt before detail
     small_pictures: float = option(
         0.4,
-        help="share of the run, at its start, that sees pictures of 400 pixels a side or more at a quarter, then at "
-        "half their size; 0: always whole",
+        help="fraction of the run, from its start, that uses images of 400 pixels a side or more at a quarter, then "
+        "half size; 0: off",
         least=0,
         most=1,
     )
-    rollout: str = option("key", help="which level each step trains, see below", choices=ROLLOUTS)
+    rollout: str = option("key", help="choice of the level to train in each step, see below", choices=ROLLOUTS)
     key_instant: float = option(
-        0.5, help="normalised time of the scene that level 0 shows, with --rollout key", metavar="T", least=0, most=1
+        0.5, help="normalised time that level 0 shows with --rollout key", metavar="T", least=0, most=1
     )
     #: 0 is a static scaffold, 1 a scaffold with its global deformation
-    max_layer: int = option(2, help="train without the layers above this one", choices=(0, 1, 2))
+    max_layer: int = option(2, help="highest layer to train", choices=(0, 1, 2))
     keep_layers: bool = option(
-        False, help="keep all layers, those too that gain little on training views held back for it"
+        False, help="keep layers even if they gain little on training views held back for this decision"
     )
     prune: float = option(
         0.14,
-        help="prune anchors half way through the run, as long as together they add at most this share to the squared "
-        "error; 0 prunes none",
+        help="prune anchors halfway through the run, adding at most this fraction to the squared error; 0: none",
         least=0,
         most=1,
         dial=3.0,
     )
     grading: float = option(
         0.05,
-        help="coarser steps for anchors that pictures depend on little, adding at most this share to the squared "
-        "error; 0 grades none",
+        help="coarser steps for less visible anchors, adding at most this fraction to the squared error; 0: none",
         least=0,
         most=1,
         dial=3.0,

@@ -103,7 +103,7 @@ class Transfer:
                 self.cuts += 1
                 failures += 1
                 if failures >= self.attempts or isinstance(error, ssl.SSLCertVerificationError):
-                    message = f"{self.url}: {_reason(error)} ({len(self.data):,} bytes are here)"
+                    message = f"{self.url}: {_reason(error)} ({len(self.data):,} bytes received)"
                     raise DeliveryError(message) from None
                 if failures > 1:
                     time.sleep(BACKOFF_SECONDS * 2 ** (failures - 2))
@@ -159,7 +159,7 @@ class Transfer:
             self._response = None
         elif not block:
             if skipped or self._response_end is not None:
-                raise _Cut(f"the connection ended early, at byte {self._at:,}")
+                raise _Cut(f"the connection closed early, at byte {self._at:,}")
             self._response, self.total = None, self._at  # of unknown length: it ends with the connection
         return b"" if skipped else block
 
@@ -183,9 +183,9 @@ class Transfer:
             here, target = self._place.geturl(), response.headers.get("Location")
             self.close()
             if target is None:
-                raise DeliveryError("a redirect without a Location")
+                raise DeliveryError("found a redirect without a Location")
             self._place = _parsed(target, here)
-        raise DeliveryError(f"more than {MAX_REDIRECTS} redirects")
+        raise DeliveryError(f"found more than {MAX_REDIRECTS} redirects")
 
     def _send(self, headers: dict[str, str]) -> http.client.HTTPResponse:
         """Sends a request. The time limit covers name resolution, connection, TLS and all headers of the response."""
@@ -223,7 +223,7 @@ class Transfer:
             self.total = 0
             return
         if status not in (HTTPStatus.OK, HTTPStatus.PARTIAL_CONTENT):
-            said = f"the server answers {status} {one_line(response.reason, SHOWN)}".rstrip()
+            said = f"the server answered {status} {one_line(response.reason, SHOWN)}".rstrip()
             raise (_Cut if status in TEMPORARY else DeliveryError)(said)
         coding = response.headers.get("Content-Encoding", "identity")
         if coding.lower() != "identity":
@@ -255,7 +255,7 @@ class Transfer:
             self.close()
             self.total = None
         if self.changes > MAX_CHANGES:
-            raise DeliveryError(f"changed {self.changes} times during the transfer")
+            raise DeliveryError(f"the file changed {self.changes} times during the transfer")
         raise Changed
 
 
@@ -293,12 +293,12 @@ def _target(place: SplitResult) -> str:
 
 def _reason(error: BaseException) -> str:
     if isinstance(error, TimeoutError):
-        return "no byte arrived for too long"
+        return "timed out waiting for data"
     if isinstance(error, OSError):
         return error.strerror or one_line(str(error), SHOWN)
     if isinstance(error, _Cut):
         return str(error)
-    return f"not an HTTP answer: {one_line(str(error), SHOWN)}".rstrip(": ")
+    return f"invalid HTTP response: {one_line(str(error), SHOWN)}".rstrip(": ")
 
 
 # -- prefixes of a .pd4 file -------------------------------------------------------------------------------------------
@@ -321,7 +321,7 @@ def prefix_end(slices: list[tuple[int, int]], max_layer: int | None = None, max_
 def check_end(end: int) -> None:
     """Raises LimitExceeded if a file, or the requested prefix of it, ends beyond MOST_BYTES."""
     if end > MOST_BYTES:
-        raise LimitExceeded(f"ends at byte {end:,}, limit {MOST_BYTES:,} without a budget of bytes")
+        raise LimitExceeded(f"ends at byte {end:,}, limit {MOST_BYTES:,} without a byte budget")
 
 
 def fetch(transfer: Transfer, max_layer: int | None = None, max_bytes: int | None = None) -> bytes:

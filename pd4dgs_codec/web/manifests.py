@@ -147,7 +147,7 @@ def box(kind: bytes, *parts: bytes) -> bytes:
     """Returns one box. Raises DeliveryError if its size exceeds 32 bits."""
     size = 8 + sum(map(len, parts))
     if size > MAX_BOX:
-        raise DeliveryError(f"a layer of {size:,} bytes, an MP4 box holds at most {MAX_BOX:,}")
+        raise DeliveryError(f"found a layer of {size:,} bytes, expected at most {MAX_BOX:,} in an MP4 box")
     return struct.pack(">I4s", size, kind) + b"".join(parts)
 
 
@@ -224,7 +224,7 @@ def boxes(data: bytes, start: int = 0, end: int | None = None) -> Iterator[Box]:
         if size == 1 and end - start >= 16:
             (size,), content = struct.unpack_from(">Q", data, content), content + 8
         if size < content - start or start + size > end:
-            raise DeliveryError(f"an MP4 box of {size} bytes at byte {start}, {end - start} are there")
+            raise DeliveryError(f"found an MP4 box of {size} bytes at byte {start}, expected at most {end - start}")
         yield Box(kind, start, content, start + size)
         start += size
 
@@ -257,5 +257,5 @@ def fragments(data: bytes) -> tuple[int, list[Fragment]]:
             samples = sum(struct.unpack_from(">I", data, run.content + 4)[0] for run in runs)
             result.append(Fragment(moof.start, mdat.end, samples))
     if not result:
-        raise DeliveryError("an MP4 file without fragments, expected some")
+        raise DeliveryError("found an MP4 file without fragments, expected some")
     return result[0].start, result

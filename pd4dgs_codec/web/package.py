@@ -43,7 +43,7 @@ def package(
     low, high = about["time_range"]
     seconds = high - low if high > low else STILL_SECONDS
     if seconds > MAX_SECONDS:
-        raise DeliveryError(f"the scene lasts {seconds:g} s, DASH takes at most {MAX_SECONDS:,}")
+        raise DeliveryError(f"found a scene of {seconds:g} s, expected at most {MAX_SECONDS:,} s for DASH")
     segments, slices = _segments(data, about, seconds)
     video = render(scene) if render is not None else None
     media = {SCENE: data, SEGMENTS: segments}
@@ -127,7 +127,7 @@ def library(folder: Path) -> dict[str, bytes]:
     """
     scenes = list(_scenes(folder))
     if not scenes:
-        raise DeliveryError(f"{folder}: holds no packages, expected NAME/{INDEX} as pd4dgs-package writes it")
+        raise DeliveryError(f"{folder}: found no packages, expected NAME/{INDEX} by pd4dgs-package")
     content = {"scenes": scenes, "bytes": sum(scene["bytes"] for scene in scenes)}
     return {LIBRARY: _json(content), PAGE: _library_page(scenes).encode()}
 
@@ -139,7 +139,7 @@ def _scenes(folder: Path) -> Iterator[dict[str, Any]]:
         try:
             yield _listed(path.parent.relative_to(folder).as_posix(), json.loads(path.read_bytes()))
         except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-            raise DeliveryError(f"{path}: invalid index of a package ({type(error).__name__}: {error})") from None
+            raise DeliveryError(f"{path}: invalid package index ({type(error).__name__}: {error})") from None
 
 
 def _listed(name: str, about: Any) -> dict[str, Any]:

@@ -82,7 +82,7 @@ def player_folder() -> Path:
     for folder in (package / "player", package.parent / "player"):
         if (folder / PAGE).is_file():
             return folder
-    raise DataError(f"{package}: holds no player; expected the package as pip installs it, or a checkout")
+    raise DataError(f"{package}: found no player, expected an installed package or a checkout")
 
 
 def page(source: bytes | str | None = None) -> str:

@@ -118,7 +118,7 @@ class Server(ThreadingTCPServer):
     ):
         self.root = Path(folder).resolve()
         if not self.root.is_dir():
-            raise DeliveryError(f"{folder}: is no folder, expected one to serve")
+            raise DeliveryError(f"{folder}: is not a folder, expected one to serve")
         self.link, self.latency, self.log, self.private = link or Link(), latency, log, private
         #: Connections that owe a request, with the time.monotonic() of its deadline.
         self.waiting: dict[socket.socket, float] = {}
@@ -127,7 +127,7 @@ class Server(ThreadingTCPServer):
             super().__init__((host, port), _Handler)
         except (OSError, OverflowError) as error:
             raise DeliveryError(
-                f"{_authority(host, port)}: cannot listen here: {getattr(error, 'strerror', error)}"
+                f"cannot listen on {_authority(host, port)}: {getattr(error, 'strerror', error)}"
             ) from None
 
     @property

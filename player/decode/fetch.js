@@ -129,7 +129,7 @@ export class SceneSource {
           if (++failures >= this._attempts) {
             // browsers do not tell the two apart
             const why = error instanceof Cut ? error.message : "no connection, or a server that other sites may not read";
-            throw new FetchError(`${this.url}: ${why} (${this.received} bytes are here)`);
+            throw new FetchError(`${this.url}: ${why} (${this.received} bytes received)`);
           }
           if (failures > 1) await sleep(1000 * Math.min(this._pause * 2 ** (failures - 2), until - now()));
           continue;
@@ -251,7 +251,7 @@ export class SceneSource {
     const left = this._lapse - performance.now();
     const later = Math.min(Math.ceil(left) + 1, 2 ** 31 - 1); // more would fire at once
     this._timer = left > 0 && left < Infinity ? setTimeout(() => this._look(), later) : undefined;
-    if (left <= 0) this._controller?.abort(new Cut("no byte arrived for too long"));
+    if (left <= 0) this._controller?.abort(new Cut("timed out waiting for data"));
   }
 
   /** Requests the missing bytes. @param {number} until */
@@ -279,7 +279,7 @@ export class SceneSource {
   _accept({ status, statusText, headers }, resumes) {
     if (status === 416 && resumes) return this._restart(); // the file has become shorter
     if (status !== 200 && status !== 206) {
-      const said = `the server answers ${status} ${statusText}`.trimEnd();
+      const said = `the server answered ${status} ${statusText}`.trimEnd();
       if (TEMPORARY.includes(status)) throw new Cut(said);
       throw new FetchError(`${this.url}: ${said}`);
     }

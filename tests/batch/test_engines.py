@@ -193,7 +193,7 @@ def test_ray_makes_what_one_process_makes_though_a_worker_dies(filled, ray_clust
     assert summary["done"] == 9 and filled.outcomes["z.pd4"][1] == 2 and filled.outcomes["bad.pd4"][1] == 2
     assert {name: text for name, text in _outputs(filled).items() if name in WANTED} == WANTED
     assert filled.run("ray", workers=2, retries=0, address="local")["already"] == 9
-    with pytest.raises(DataError, match="no node .* has the 999 CPU"):
+    with pytest.raises(DataError, match="no node .* with the 999 CPU"):
         filled.run("ray", address="local", threads=999)
     assert capsys.readouterr().out == ""  # Ray says of its workers' deaths on stdout
 

@@ -125,7 +125,7 @@ CASES = [
         )
     ),
     (1, "encode cut.pt -o s.pd4", "cut.pt"),
-    (2, "encode cut.pt -o ./cut.pt -f", "-o names the checkpoint cut.pt"),
+    (2, "encode cut.pt -o ./cut.pt -f", "-o names the input checkpoint cut.pt"),
     (1, "encode nan.pt -o s.pd4", "feature"),
     (1, "encode inf.pt -o s.pd4", "feature"),
     (1, "encode huge.pt -o s.pd4", "feature"),
@@ -285,7 +285,7 @@ def test_an_engine_that_is_not_installed_names_its_extra(cli, tmp_path, monkeypa
     monkeypatch.setitem(sys.modules, module, None)
     (tmp_path / "m.jsonl").write_text('{"source": "synthetic:local"}\n')
     result = cli("batch", tmp_path / "m.jsonl", "-o", tmp_path / "out", "--op", "train", "--on", engine)
-    line = f"needs the module {module}, which is not installed: pip install 'pd4dgs-codec[cluster]'"
+    line = f"the module {module} is not installed: pip install 'pd4dgs-codec[cluster]'"
     _check(result, "batch", 1, line)
 
 

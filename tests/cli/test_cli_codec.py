@@ -60,7 +60,7 @@ def test_tables_without_json(cli, model_pt, scene_pd4, tmp_path):
     result = cli("encode", model_pt, "-o", tmp_path / "s.pd4", "--effort", 1)
     assert result.code == 0 and result.out == b"" and "first frame after" in result.err and "payload/ΣR" in result.err
     result = cli("decode", scene_pd4)
-    assert result.code == 0 and result.err == "" and b"whole and valid" in result.out
+    assert result.code == 0 and result.err == "" and b"complete and valid" in result.out
 
 
 def test_decode_npz_holds_the_decoded_arrays(cli, scene_pd4, tmp_path):
@@ -123,7 +123,7 @@ def test_info_tells_where_the_bytes_are(cli, scene_pd4):
     assert f"{rows['attributes']['bytes']:,}" in text and "share" in text
     assert "parts" not in cli("info", scene_pd4, "--json").json
     cut = cli("info", "-", "--bytes", stdin=scene_pd4.read_bytes()[: report["layers"][1]["end"] - 1])
-    assert cut.code == 1 and "layer 1 is incomplete" in cut.err
+    assert cut.code == 1 and "layer 1 is truncated" in cut.err
 
 
 def test_metadata_is_written_shown_and_kept(cli, scene_pd4, tmp_path):
@@ -140,7 +140,7 @@ def test_info_names_what_is_left_out(cli, model_pt, tmp_path):
     assert cli("encode", model_pt, "-o", output, "--layers", 1, "--effort", 1).code == 0
     assert [row["what"] for row in cli("info", output, "--json").json["left_out"]] == ["layer 2"]
     decoded = cli("decode", output, "--max-layer", 2)
-    assert decoded.code == 0 and b"absent: layer 2" in decoded.out
+    assert decoded.code == 0 and b"no layer 2: level 2 equals level 1" in decoded.out
     assert cli("decode", output, "--max-layer", 1, "--json").json["absent"] == []
 
 

@@ -53,7 +53,7 @@ def test_the_whole_time_as_a_folder_of_plys(cli, scene_pd4, tmp_path):
     assert [path.name for path in frames] == [f"{i:05d}.ply" for i in range(5)] and result.json["frames"] == 5
     assert all(_count(path) > 20 for path in frames) and len({path.read_bytes() for path in frames}) == 5
     again = cli(*command, "--fps", 1)
-    assert again.code == 1 and "holds PLY files already" in again.err
+    assert again.code == 1 and "contains PLY files already" in again.err
     assert cli(*command, "--fps", 1, "-f").code == 0
     assert sorted(path.name for path in out.iterdir()) == ["00000.ply", "00001.ply", "00002.ply"]
 

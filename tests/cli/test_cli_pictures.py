@@ -73,7 +73,7 @@ def test_eval_measures_what_moves_where_cameras_stand_still(cli, scene_pd4):
     assert report["levels"][1]["moving_mpsnr"] == pytest.approx(np.mean(scores))
     assert 0 < report["moving_share"] == pytest.approx(np.mean(shares))
     shown = cli("eval", scene_pd4, source, "--max-layer", 0).out.decode()
-    assert "moving dB" in shown and f"moving: the {100 * np.mean(shares):.1f} % of pixels" in shown
+    assert "moving dB" in shown and f"views of fixed cameras ({100 * np.mean(shares):.1f} %)" in shown
 
 
 @pytest.mark.parametrize("given", [None, "0,0.6,1"])

@@ -20,7 +20,7 @@ CASES = {
     "stderr is closed": ("info FILE", "2>&-", 0, ""),
     "stderr is closed, an error": ("info none", "2>&-", 1, ""),
     "all are closed": ("info none", "<&- >&- 2>&-", 1, ""),
-    "stdin is closed": ("info -", "<&-", 2, "nothing is piped to stdin"),
+    "stdin is closed": ("info -", "<&-", 2, "stdin is a terminal"),
     "no stream at all, and the file is whole": ("decode FILE -o OUT.npz", "<&- >&- 2>&-", 0, ""),
     "array data to a full stdout": ("decode FILE -o -", ">/dev/full", 1, "stdout: No space left on device"),
     "array data to a reader that goes": ("decode FILE -o -", "| true", 1, ""),

@@ -164,4 +164,4 @@ def test_the_command_says_where_to_look(tmp_path, capsys, shared_dataset):
     options = ["--preset", "tiny", "--iterations", "2", "--view", "0"]
     assert main([str(shared_dataset), "-o", str(tmp_path / "m.pt"), *options]) == 0
     told = capsys.readouterr()
-    assert "the scene is at http://127.0.0.1:" in told.err and told.out == ""
+    assert "watch the training at http://127.0.0.1:" in told.err and told.out == ""

@@ -59,4 +59,4 @@ def test_options_that_cannot_work_are_one_line(folder, capsys, options, code):
 
 def test_a_folder_that_is_none(folder, capsys):
     assert import_module("pd4dgs_codec.cli.serve").main([str(folder / "bytes.bin"), "--port", "0"]) == 1
-    assert "is no folder" in capsys.readouterr().err
+    assert "is not a folder" in capsys.readouterr().err

@@ -27,7 +27,7 @@ def test_info_reads_the_header_alone(cli, folder, scene_bytes):
 def test_info_tells_of_a_file_that_is_cut_on_the_server(cli, scene_bytes):
     with FaultyServer(scene_bytes[:1000]) as server:
         done = cli("info", server.url)
-    assert done.code == 0 and b"of which 1,000 are present" in done.out
+    assert done.code == 0 and b"truncated to 1,000" in done.out
 
 
 def test_info_checks_and_hashes_the_whole_remote_file(cli, folder, scene_bytes):
@@ -44,7 +44,7 @@ def test_decode_fetches_the_prefix_and_nothing_more(cli, folder, tmp_path, scene
     with FaultyServer(scene_bytes, [Fault(100), Fault(), Fault(1234)]) as server:
         done = cli("decode", server.url, "--max-layer", layer, "-o", tmp_path / "there.npz", "-v")
         assert server.sent == end
-    assert done.code == 0 and f"{end:,} bytes in 4 requests, 2 cuts" in done.err
+    assert done.code == 0 and f"{end:,} bytes in 4 requests, 2 interruptions" in done.err
     assert cli("decode", folder / "scene.pd4", "--max-layer", layer, "-o", tmp_path / "here.npz").code == 0
     assert (tmp_path / "there.npz").read_bytes() == (tmp_path / "here.npz").read_bytes()
 
@@ -76,14 +76,14 @@ def test_partial_files_and_failing_links(cli, scene_bytes, monkeypatch):
     for options, expected in (([], 1), (["--allow-partial"], 3)):
         with FaultyServer(scene_bytes, [Fault(cut), *[Fault(status=503)] * 9]) as server:
             done = cli("decode", server.url, *options)
-        assert done.code == expected and f"answers 503 Service Unavailable ({cut:,} bytes are here)" in done.err
+        assert done.code == expected and f"answered 503 Service Unavailable ({cut:,} bytes received)" in done.err
 
 
 @pytest.mark.parametrize("verb", ["info", "decode"])
 def test_bad_urls_and_missing_files_are_one_line(cli, scene_bytes, verb):
     with FaultyServer(scene_bytes, [Fault(status=404)]) as server:
         done = cli(verb, server.url)
-    says = f"pd4dgs-{verb}: error: {server.url}: the server answers 404 Not Found\n"
+    says = f"pd4dgs-{verb}: error: {server.url}: the server answered 404 Not Found\n"
     assert (done.code, done.out, done.err) == (1, b"", says)
     done = cli(verb, "http://")
     assert (done.code, done.out) == (1, b"") and len(done.err.splitlines()) == 1

@@ -179,7 +179,7 @@ CASES = {
     },
     **{f"{n} once": Case(lambda f, n=n: [Fault(status=n)], requests=2) for n in (408, 429, 500, 502, 503, 504)},
     **{
-        f"{n}": Case(lambda f, n=n: [Fault(status=n)], NONE, error=DeliveryError, says=f"answers {n}", requests=1)
+        f"{n}": Case(lambda f, n=n: [Fault(status=n)], NONE, error=DeliveryError, says=f"answered {n}", requests=1)
         for n in (400, 401, 403, 404, 410, 501)
     },
 }

@@ -79,7 +79,7 @@ def test_a_server_tells_caches_what_never_changes(shelf):
 
 
 def test_a_folder_without_packages_and_a_broken_index_are_named(tmp_path):
-    with pytest.raises(DeliveryError, match="holds no packages"):
+    with pytest.raises(DeliveryError, match="found no packages"):
         library(tmp_path)
     (tmp_path / "x").mkdir()
     (tmp_path / "x" / "index.json").write_text("{}")
@@ -140,7 +140,7 @@ def test_an_index_that_says_something_else_is_named(shelf, key, value):
     if key == "layers" and value == {}:
         assert library(shelf)
         return
-    with pytest.raises(DeliveryError, match="c/index.json: invalid index of a package") as caught:
+    with pytest.raises(DeliveryError, match="c/index.json: invalid package index") as caught:
         library(shelf)
     assert str(caught.value).isprintable()
 
@@ -148,5 +148,5 @@ def test_an_index_that_says_something_else_is_named(shelf, key, value):
 @pytest.mark.parametrize("text", ["[]", "5", "[" * 100_000, '{"bytes": 1' + "0" * 5000 + "}", "\x00"])
 def test_an_index_that_is_none_is_named(shelf, text):
     (shelf / "c" / "index.json").write_text(text)
-    with pytest.raises(DeliveryError, match="c/index.json: invalid index of a package"):
+    with pytest.raises(DeliveryError, match="c/index.json: invalid package index"):
         library(shelf)

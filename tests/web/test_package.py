@@ -159,7 +159,7 @@ def test_only_whole_files_of_a_time_that_dash_can_tell(scene_bytes):
     for time_range, seconds in (((2.0, 2.0), "PT1S"), ((0.0, 0.5), "PT0.5S")):
         files = package(encode(replace(scene, info=replace(scene.info, time_range=time_range)), effort=1))
         assert f'mediaPresentationDuration="{seconds}"'.encode() in files[MPD]
-    with pytest.raises(DeliveryError, match="lasts 1e"):
+    with pytest.raises(DeliveryError, match="a scene of 1e"):
         package(encode(replace(scene, info=replace(scene.info, time_range=(0.0, 1e10))), effort=1))
 
 
@@ -208,7 +208,7 @@ def test_without_a_renderer_there_is_a_clear_word(cli, folder, tmp_path, monkeyp
 
     monkeypatch.setattr("pd4dgs_codec.cli.package._render", gone)
     done = cli("package", folder / "scene.pd4", "-o", tmp_path / "out")
-    assert done.code == 0 and "no 2D video: needs the module torch" in done.err
+    assert done.code == 0 and "no 2D video: the module torch" in done.err
     done = cli("package", folder / "scene.pd4", "-o", tmp_path / "other", "-j", 100_000)
     assert done.code == 1 and "threads is 100000" in done.err and not (tmp_path / "other").exists()
 

@@ -45,7 +45,7 @@ def test_a_notebook_shows_no_damaged_scene(cut):
 
 def test_a_player_that_is_nowhere_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(page, "__file__", str(tmp_path / "a" / "b" / "page.py"))
-    with pytest.raises(DataError, match="holds no player"):
+    with pytest.raises(DataError, match="found no player"):
         page.page()
 
 
