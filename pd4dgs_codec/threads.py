@@ -151,9 +151,9 @@ def load_numba() -> None:
 #: delays a thread, or its tasks take longer, the others do the rest.
 PARTS_PER_THREAD = 4
 #: Seconds of all tasks for each further part per thread: after each part a thread waits for the interpreter's lock.
-WORTH_PART = 2e-3
+PART_SECONDS = 2e-3
 #: Least seconds of all tasks for which helpers are woken, which takes about a tenth of this.
-WORTH_HELP = 2e-4
+HELPER_SECONDS = 2e-4
 
 Work = Callable[[tuple[int, int]], None]
 
@@ -170,10 +170,10 @@ class Sharer:
     def share(self, tasks: int, work: Work) -> None:
         """Calls work((first, end)) for ranges that together cover 0 .. tasks - 1. `work` must release the GIL."""
         threads, begin = min(kernel_threads(), tasks), perf_counter()
-        if self._seconds * tasks < WORTH_HELP:
+        if self._seconds * tasks < HELPER_SECONDS:
             threads = min(threads, 1)
         if threads > 1:
-            _share(tasks, threads, min(PARTS_PER_THREAD, 1 + int(self._seconds * tasks / WORTH_PART)), work)
+            _share(tasks, threads, min(PARTS_PER_THREAD, 1 + int(self._seconds * tasks / PART_SECONDS)), work)
         else:
             work((0, tasks))
         self._seconds = (perf_counter() - begin) * threads / max(tasks, 1)

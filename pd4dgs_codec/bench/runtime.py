@@ -170,7 +170,7 @@ def _without_gsplat() -> str | None:
     from pd4dgs_codec.model.picture import check_gsplat
 
     if not torch.cuda.is_available():
-        return "there is no CUDA device"
+        return "found no CUDA device"
     try:
         check_gsplat()
     except RenderError as error:
@@ -181,7 +181,7 @@ def _without_gsplat() -> str | None:
 def render_table(points: Sequence[Point]) -> str:
     """Formats a row per rasteriser."""
     rows = [(p["name"], p["missing"] or spread(p["milliseconds"]), optional(p["rmse"], ".2g")) for p in points]
-    return markdown(("rendered by", "ms per image", "RMSE"), rows)
+    return markdown(("rasteriser", "ms per image", "RMSE"), rows)
 
 
 def render_panels(points: Sequence[Point]) -> list[Panel]:
@@ -210,7 +210,9 @@ def recorded_run(path: str) -> Point:
     preset = json.loads(training.get("config", "{}")).get("preset", "")
     curve = json.loads(training.get("curve", "[]"))
     if not curve:
-        raise DataError(f"{path}: found no held-out quality, expected a run that was evaluated at least once")
+        raise DataError(
+            f"{path}: found no curve of quality, expected the checkpoint of a run with at least one evaluation"
+        )
     return run_of(f"{Path(path).name} ({preset})" if preset else Path(path).name, curve, len(model.anchor_q))
 
 

@@ -46,7 +46,7 @@ def refusal(group: str, error: type[Pd4Error], act: Callable[..., object], *inpu
     return Promise(group, f"refused in one line ({error.__name__})", act, inputs, refuses=error)
 
 
-def judge(promise: Promise, given: tuple[Any, ...]) -> Row:
+def run_case(promise: Promise, given: tuple[Any, ...]) -> Row:
     """Tests one input and returns its row. Any exception fails the row, except the promised refusal; that of a missing
     module is raised."""
     case, fed, *arguments = given
@@ -86,7 +86,7 @@ def counts(rows: Sequence[Row]) -> dict[str, int]:
 
 def text(rows: Sequence[Row]) -> str:
     """Formats the rows as one Markdown table per group, and a line with the counts."""
-    head, parts = ("case", "fed", "promised", "came out", "error", "bound", "status"), []
+    head, parts = ("case", "fed", "promised", "got", "error", "bound", "status"), []
     for group in dict.fromkeys(row["group"] for row in rows):
         cells = [
             [*(r[key].replace("|", "\\|") for key in ("case", "fed", "promised", "got"))]

@@ -134,18 +134,18 @@ def _field(name: str, plane: np.ndarray) -> Deformation:
 
 
 def _residual_error(field: Deformation, times: Sequence[float]) -> Found:
-    places = INSIDE * np.float32(1.4)
+    points = INSIDE * np.float32(1.4)
     module, player, worst = DeformationField.from_arrays(field, BOX), Field(field, BOX, {"position": 3}), 0.0
     ((head, _),), ((trunk, _),) = (field.networks[name] for name in ("position", "trunk"))
     scale = max(float(np.abs(plane).max()) for plane in field.planes[0].values())
     for t in times:
-        hidden = np.maximum(_exact_samples(field.planes, BOX, places, t) @ trunk.T.astype(np.float64), 0)
+        hidden = np.maximum(_exact_samples(field.planes, BOX, points, t) @ trunk.T.astype(np.float64), 0)
         expected = hidden @ head.T.astype(np.float64) * float(deformation_unit(BOX))
-        points = torch.from_numpy(places)
-        still = points.new_zeros(len(points), 3)
-        moved = module.moved(still, lambda time: module.planes(points, time), {"position": 3}, t)  # noqa: B023
-        played = np.zeros_like(places)
-        player.move(played, places, t)
+        tensor = torch.from_numpy(points)
+        still = tensor.new_zeros(len(tensor), 3)
+        moved = module.moved(still, lambda time: module.planes(tensor, time), {"position": 3}, t)  # noqa: B023
+        played = np.zeros_like(points)
+        player.move(played, points, t)
         for found in (moved.detach().numpy(), played):
             worst = largest([worst, float(np.abs(found - expected).max()) / scale])
     return f"{len(times)} instants", worst
@@ -375,7 +375,7 @@ PROMISES = [
             *((f"{name} nan", f"NaN in {name}", {name: NAN}) for name in ("viewmat", "K")),
             *((f"width {width}", "a size outside 1..65535", {"width": width}) for width in (0, 65536))),
     Promise("training", TRAINED, lambda how: _run(_trainer(**how)), [
-        ("as it should be", "six views of a synthetic scene", {}),
+        ("an ordinary run", "six views of a synthetic scene", {}),
         ("learning rates times 1e4", "every learning rate times 10,000", {"factor": 1e4}),
         ("a single Gaussian", "one anchor, of whose Gaussians one is seen", {"anchors": 1, "prepare": _single}),
         ("10^6 between scales", "Gaussians and offsets of 1 and of 1e-6 scene units", {"prepare": _two_scales}),
@@ -386,5 +386,5 @@ PROMISES = [
         ("a flat box", "a box without depth", {"points": None, "box": BOX * np.array([1, 1, 0], np.float32)}),
     ], 1 / 255),
     Promise("training", f"both steps are skipped and counted; {TRAINED}", _passing_nan,
-            [("a weight that is not a number", "NaN in a network for two steps, then the weight it had")], 1 / 255),
+            [("a NaN weight", "NaN in a network's bias for two steps, then its former value")], 1 / 255),
 ]  # fmt: skip

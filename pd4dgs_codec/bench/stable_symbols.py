@@ -28,7 +28,7 @@ from pd4dgs_codec.scene import MASK_THRESHOLD
 IN_SIGMAS = (0.0, 1e-6, *(10 ** (i / 3) for i in range(-6, 19)))
 IN_STEPS = (0.49, 0.499999, 0.5, 0.500001, 0.51, 1.0, 40.0)
 FARTHEST = 1e6  #: sigmas
-PLACES = ((0.0, 0.125), (-1.5, 0.7))  #: (mu, Q)
+PRIORS = ((0.0, 0.125), (-1.5, 0.7))  #: (mu, Q)
 LN_CLIP = math.log(rate.MIN_PROBABILITY)
 #: Least ln P for which values and gradients are promised.
 LEAST = {torch.float64: -math.inf, torch.float32: math.log(1e-30)}
@@ -38,7 +38,7 @@ LEAST = {torch.float64: -math.inf, torch.float32: math.log(1e-30)}
 def _inputs(dtype: torch.dtype) -> list[Tensor]:
     """(a, mu, sigma, Q), each [n], leaves: sigma / Q of 1e-8..1e8."""
     rows = []
-    for ratio, (mu, step), sign in itertools.product((10.0**e for e in range(-8, 9)), PLACES, (1, -1)):
+    for ratio, (mu, step), sign in itertools.product((10.0**e for e in range(-8, 9)), PRIORS, (1, -1)):
         sigma = ratio * step
         distances = [z * sigma for z in IN_SIGMAS] + [d * step for d in IN_STEPS if d <= FARTHEST * ratio]
         rows += [(mu + sign * d, mu, sigma, step) for d in distances]
@@ -72,12 +72,12 @@ def _exact(*stored: float) -> tuple[float, float, float, float]:
 
 
 def _worst(inputs: list[Tensor], errors: Tensor, counts: Tensor) -> Found:
-    """Returns the place of the largest error among `counts`, and that error, NaN if there is one."""
+    """Returns the position of the largest error among `counts`, and that error, NaN if there is one."""
     found = torch.where(counts, errors, -1.0)
     index = int(found.argmax())
     a, mu, sigma, step = (float(x[index].detach()) for x in inputs)
-    place = f"sigma/Q {sigma / step:.0e}, |a - mu|/sigma {abs(a - mu) / sigma:.3g}"
-    return f"{int(counts.sum())} points, worst at {place}", float(found[index])
+    position = f"sigma/Q {sigma / step:.0e}, |a - mu|/sigma {abs(a - mu) / sigma:.3g}"
+    return f"{int(counts.sum())} points, worst at {position}", float(found[index])
 
 
 def _relative(found: Tensor, expected: Tensor) -> Tensor:

@@ -322,7 +322,7 @@ def _stability(args: argparse.Namespace, console: Console) -> Outcome:
     rows = []
     with progress_bar(len(cases), "cases", "stability") as step:
         for case in cases:
-            rows.append(stability.judge(*case))
+            rows.append(stability.run_case(*case))
             step()
     failures = [
         "fail: {group}: {case}: {got}, error {error}, bound {bound}".format(**row)

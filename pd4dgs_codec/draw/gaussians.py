@@ -78,7 +78,7 @@ def in_view(camera: Camera, viewmat: Any, position: Any, radius: Any, near: floa
     """Returns bool [N]: whether Gaussians within radius [N] of position [N, 3], world, may reach the image. viewmat
     [4, 4] is the camera's. All arrays are float32, either numpy arrays or torch tensors."""
     across, down, depth = viewmat[:3, :3] @ position.T + viewmat[:3, 3:]
-    fx, fy, cx, cy = (float(camera.K[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    fx, fy, cx, cy = (float(camera.K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))
     z = depth.clip(min=float(near))
     x, y = fx * across / z + cx, fy * down / z + cy
     width, height = camera.width, camera.height

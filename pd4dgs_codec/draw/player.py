@@ -125,11 +125,11 @@ class Player:
         self._grow(rows, anchors)
         count = self._count[rows]
         before = np.cumsum(count) - count
-        places = np.repeat(self._first[rows] - before, count) + np.arange(count.sum())
-        slots, gates = self._slots.take(places), np.repeat(self._mask[rows], count)
+        entries = np.repeat(self._first[rows] - before, count) + np.arange(count.sum())
+        slots, gates = self._slots.take(entries), np.repeat(self._mask[rows], count)
         keep, found = slots + np.repeat((np.arange(len(rows)) - rows) * self.slots, count), []
         for eye in eyes:
-            gaussians = self._grown.take(places, axis=0)
+            gaussians = self._grown.take(entries, axis=0)
             gaussians[:, COLOR:] += self._decoders.colors(anchors, eye, keep)
             found.append((*finished(gaussians, gates), slots))
         return _joined(found)

@@ -182,15 +182,15 @@ def depth_order(visible: Array, depths: Array) -> Array:
     order, other = order[:count], np.empty(count, np.int64)
     shift = 0
     while count and (high - low) >> shift:
-        places = np.zeros(4097, np.int64)
+        starts = np.zeros(4097, np.int64)
         for n in range(count):
-            places[(((bits[order[n]] - low) >> shift) & 4095) + 1] += 1
+            starts[(((bits[order[n]] - low) >> shift) & 4095) + 1] += 1
         for digit in range(4096):
-            places[digit + 1] += places[digit]
+            starts[digit + 1] += starts[digit]
         for n in range(count):
             digit = ((bits[order[n]] - low) >> shift) & 4095
-            other[places[digit]] = order[n]
-            places[digit] += 1
+            other[starts[digit]] = order[n]
+            starts[digit] += 1
         order, other = other, order
         shift += 12
     return order
@@ -242,10 +242,10 @@ def fill_tiles(
             for row in range(rects[i, 2], rects[i, 3]):
                 for column in range(rects[i, 0], rects[i, 1]):
                     tile = row * columns + column
-                    place = positions[chunk, tile]
-                    positions[chunk, tile] = place + 1
-                    items[place] = i
-                    slot_of[place] = pair
+                    position = positions[chunk, tile]
+                    positions[chunk, tile] = position + 1
+                    items[position] = i
+                    slot_of[position] = pair
                     pair += 1
 
 

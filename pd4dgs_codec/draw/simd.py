@@ -305,7 +305,7 @@ def _product(rows: int, vectors: int) -> Callable[..., Any]:
             kind = ir.VectorType(context.get_value_type(y.dtype), WIDE)
             align, index, whole = y.dtype.bitwidth // 8, ir.IntType(64), range(vectors)
 
-            def place(first: int, step: Any, row: int) -> Any:
+            def row_at(first: int, step: Any, row: int) -> Any:
                 """Returns a pointer to row `row` of the array at argument `first`, whose rows are `step` apart."""
                 at = builder.add(args[first + 1], builder.mul(step, index(row)))
                 return _address(context, builder, sig.args[first], args[first], at)
@@ -317,10 +317,10 @@ def _product(rows: int, vectors: int) -> Callable[..., Any]:
             sums = [[new(builder, kind) for _ in whole] for _ in range(rows)]
             for row, own in enumerate(sums):
                 for v in whole:
-                    builder.store(builder.load(vector(place(3, args[5], row), v), align=align), own[v])
-            scalars = [place(6, args[8], row) for row in range(rows)]
+                    builder.store(builder.load(vector(row_at(3, args[5], row), v), align=align), own[v])
+            scalars = [row_at(6, args[8], row) for row in range(rows)]
             with cgutils.for_range(builder, args[13], intp=index) as loop:
-                pointer = builder.gep(place(10, args[12], 0), [builder.mul(loop.index, args[12])])
+                pointer = builder.gep(row_at(10, args[12], 0), [builder.mul(loop.index, args[12])])
                 factors = [builder.load(vector(pointer, v), align=align) for v in whole]
                 at = builder.mul(loop.index, args[9])
                 for scalar, own in zip(scalars, sums, strict=True):
@@ -332,7 +332,9 @@ def _product(rows: int, vectors: int) -> Callable[..., Any]:
                 for v in whole:
                     value = builder.load(own[v])
                     negative = builder.and_(clamps, builder.fcmp_ordered("<", value, zero))
-                    builder.store(builder.select(negative, zero, value), vector(place(0, args[2], row), v), align=align)
+                    builder.store(
+                        builder.select(negative, zero, value), vector(row_at(0, args[2], row), v), align=align
+                    )
             return context.get_dummy_value()
 
         indices = dict.fromkeys((1, 2, 4, 5, 7, 8, 9, 11, 12, 13), types.intp)

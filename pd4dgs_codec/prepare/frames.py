@@ -92,8 +92,8 @@ class FrameFolder:
         numbered = dict(zip(last_numbers(files) or range(len(files)), files, strict=True))
         if len(numbered) < len(files):
             raise DataError(f"{path}: two pictures have the same number, expected one per frame")
-        self.places = sorted(numbered)
-        self.path, self.files, self.fps = path, [numbered[place] for place in self.places], fps
+        self.numbers = sorted(numbered)
+        self.path, self.files, self.fps = path, [numbered[number] for number in self.numbers], fps
         self.size = image_info(self.files[0])[:2]
 
     def looks(self) -> Iterator[np.ndarray]:
@@ -108,7 +108,7 @@ class FrameFolder:
 
     def time(self, index: int) -> float:
         """The time of a frame after the first one, seconds."""
-        return (self.places[index] - self.places[0]) / self.fps
+        return (self.numbers[index] - self.numbers[0]) / self.fps
 
 
 Recording = VideoFile | FrameFolder
@@ -136,7 +136,7 @@ def look(recording: Recording, advance: Advance) -> list[Look]:
         before = picture
         advance()
     if len(looks) < FEWEST_FRAMES:
-        raise DataError(f"{recording.path}: {len(looks)} frames, expected {FEWEST_FRAMES} at least")
+        raise DataError(f"{recording.path}: {len(looks)} frames, expected at least {FEWEST_FRAMES}")
     return looks
 
 
@@ -177,5 +177,7 @@ def write_frames(
         times[name] = recording.time(index)
         advance()
     if len(times) < len(indices):
-        raise DataError(f"{recording.path}: {len(times)} of {len(indices)} frames could be decoded a second time")
+        raise DataError(
+            f"{recording.path}: {len(times)} of {len(indices)} chosen frames could be read again, expected all"
+        )
     return times

@@ -124,7 +124,7 @@ def reconstruct(database: Path, images: Path, folder: Path, threads: int, advanc
     try:
         models = pycolmap.incremental_mapping(database, images, folder, options, next_image_callback=advance)
     except (RuntimeError, ValueError) as error:
-        raise DataError(f"{images}: COLMAP gives up: {one_line(str(error), 160)}") from None
+        raise DataError(f"{images}: COLMAP failed: {one_line(str(error), 160)}") from None
     return max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
 
 
@@ -138,7 +138,7 @@ def write(model: Any, folder: Path) -> None:
     except Exception:  # pycolmap raises its own types
         found = -1
     if found != model.num_points3D():
-        raise DataError(f"{folder}: the model could not be written whole; expected room on the disk")
+        raise DataError(f"{folder}: COLMAP wrote an incomplete model; is the disk full?")
 
 
 def upright(model: Any) -> None:
@@ -160,21 +160,21 @@ def upright(model: Any) -> None:
     model.transform(pycolmap.Sim3d(1.0, pycolmap.Rotation3d(rotation), -np.median(points, axis=0)))
 
 
-def moving_features(database: Path, model: Any) -> dict[str, Verdicts]:
+def moving_features(database: Path, model: Any) -> dict[str, Features]:
     """By name of each picture with a pose, the match counts of its features."""
     pycolmap = colmap()
-    verdicts, normalised, poses = {}, {}, {}
+    features, normalised, poses = {}, {}, {}
     camera = next(iter(model.cameras.values()))
     with pycolmap.Database.open(database) as stored:
         names = {image.image_id: image.name for image in stored.read_all_images()}
         for key in model.reg_image_ids():
-            places = stored.read_keypoints(key)[:, :2].astype(np.float64)
-            verdicts[key], normalised[key] = Verdicts(places), camera.cam_from_img(places)
+            keypoints = stored.read_keypoints(key)[:, :2].astype(np.float64)
+            features[key], normalised[key] = Features(keypoints), camera.cam_from_img(keypoints)
             poses[key] = model.image(key).cam_from_world().matrix()
         numbers, matches = stored.read_all_matches()
         listed = [(*pycolmap.pair_id_to_image_pair(n), index) for n, index in zip(numbers, matches, strict=True)]
-    count_off(verdicts, normalised, poses, camera.mean_focal_length(), camera.width, listed)
-    return {names[key]: verdict for key, verdict in verdicts.items()}
+    count_off(features, normalised, poses, camera.mean_focal_length(), camera.width, listed)
+    return {names[key]: own for key, own in features.items()}
 
 
 def leave_out(model: Any, moving: Mapping[str, np.ndarray]) -> None:
@@ -194,16 +194,16 @@ def leave_out(model: Any, moving: Mapping[str, np.ndarray]) -> None:
 
 
 def travel(database: Path) -> float:
-    """The median distance between the places of matched features in two pictures, pixels, of the pair where it is
+    """The median distance between the positions of matched features in two pictures, pixels, of the pair where it is
     largest; -1 without pairs."""
     pycolmap, largest = colmap(), -1.0
     with pycolmap.Database.open(database) as stored:
-        places = {image.image_id: stored.read_keypoints(image.image_id)[:, :2] for image in stored.read_all_images()}
+        keypoints = {image.image_id: stored.read_keypoints(image.image_id)[:, :2] for image in stored.read_all_images()}
         for number, geometry in zip(*stored.read_two_view_geometries(), strict=True):
             first, second = pycolmap.pair_id_to_image_pair(number)
             index = geometry.inlier_matches
             if len(index):
-                gaps = places[first][index[:, 0]] - places[second][index[:, 1]]
+                gaps = keypoints[first][index[:, 0]] - keypoints[second][index[:, 1]]
                 largest = max(largest, float(np.median(np.hypot(*gaps.T))))
     return largest
 
@@ -212,16 +212,16 @@ def travel(database: Path) -> float:
 
 
 @dataclass
-class Verdicts:
-    """The features of a picture. places: float64 [n, 2], pixels. matched, off: int64 [n], matches, and matches off."""
+class Features:
+    """A picture's features. keypoints: float64 [n, 2], pixels. matched, off: int64 [n], all matches and matches off."""
 
-    places: np.ndarray
+    keypoints: np.ndarray
     matched: np.ndarray = field(init=False)
     off: np.ndarray = field(init=False)
 
     def __post_init__(self) -> None:
-        self.matched = np.zeros(len(self.places), np.int64)
-        self.off = np.zeros(len(self.places), np.int64)
+        self.matched = np.zeros(len(self.keypoints), np.int64)
+        self.off = np.zeros(len(self.keypoints), np.int64)
 
     @property
     def known(self) -> np.ndarray:
@@ -231,11 +231,11 @@ class Verdicts:
     def moving(self, width: int) -> np.ndarray:
         """bool [n]: most of the known features within REACH move. width: of the picture, pixels."""
         known = self.known
-        votes, voters = np.where(self.off >= MOVING_SHARE * self.matched, 1, -1)[known], self.places[known]
-        result = np.zeros(len(self.places), bool)
-        for start in range(0, len(self.places), 512):
+        votes, voters = np.where(self.off >= MOVING_SHARE * self.matched, 1, -1)[known], self.keypoints[known]
+        result = np.zeros(len(self.keypoints), bool)
+        for start in range(0, len(self.keypoints), 512):
             part = slice(start, start + 512)
-            gaps = ((self.places[part, None] - voters) ** 2).sum(axis=2)
+            gaps = ((self.keypoints[part, None] - voters) ** 2).sum(axis=2)
             result[part] = ((gaps <= (REACH * width) ** 2) @ votes) > 0
         return result
 
@@ -256,7 +256,7 @@ def sampson(a: np.ndarray, b: np.ndarray, relative: np.ndarray) -> np.ndarray:
 
 
 def count_off(
-    verdicts: dict[int, Verdicts],
+    features: dict[int, Features],
     normalised: dict[int, np.ndarray],
     poses: dict[int, np.ndarray],
     focal: float,
@@ -276,5 +276,5 @@ def count_off(
         a, b = normalised[first][index[:, 0]], normalised[second][index[:, 1]]
         off = sampson(a, b, np.column_stack([rotation, shift])) * focal > OFF * width / 1000
         for picture, column in ((first, 0), (second, 1)):
-            np.add.at(verdicts[picture].matched, index[:, column], 1)
-            np.add.at(verdicts[picture].off, index[:, column], off)
+            np.add.at(features[picture].matched, index[:, column], 1)
+            np.add.at(features[picture].off, index[:, column], off)

@@ -32,7 +32,7 @@ from pd4dgs_codec.prepare.frames import (
     open_recording,
     write_frames,
 )
-from pd4dgs_codec.prepare.poses import Verdicts
+from pd4dgs_codec.prepare.poses import Features
 from pd4dgs_codec.signals import held
 from pd4dgs_codec.threads import available
 
@@ -86,7 +86,7 @@ def prepare(
         raise
     except (RuntimeError, ValueError) as error:  # of pycolmap and SQLite, on a full disk for example
         shutil.rmtree(work, ignore_errors=True)
-        raise DataError(f"{source}: COLMAP gives up: {one_line(str(error), 160)}") from None
+        raise DataError(f"{source}: COLMAP failed: {one_line(str(error), 160)}") from None
     check_folder(output, overwrite)  # it may have appeared meanwhile
     with held():
         if output.exists():
@@ -100,7 +100,7 @@ def check_folder(output: Path, overwrite: bool) -> None:
     """Raises DataError for an output that cannot be written, or exists and was not made by `prepare`."""
     check_path(output)
     if output.exists() and not (overwrite and (output / REPORT).is_file() and (output / "sparse").is_dir()):
-        how = "expected a folder that pd4dgs-prepare made" if overwrite else "--overwrite replaces what was made here"
+        how = "expected an output of pd4dgs-prepare" if overwrite else "--overwrite replaces an earlier output"
         raise DataError(f"{output}: exists already; {how}")
     if not output.resolve().parent.is_dir():
         raise DataError(f"{output}: there is no folder {output.parent} to write into")
@@ -116,7 +116,7 @@ def _begin(work: Path, source: Path, choices: Choices) -> None:
     state = work / STATE
     if work.exists():
         if not state.is_file():
-            raise DataError(f"{work}: exists already and is not of an earlier run, expected nothing there")
+            raise DataError(f"{work}: exists already, expected nothing here or the partial output of an earlier run")
         try:
             if json.loads(state.read_text()) == asked:
                 return
@@ -136,13 +136,12 @@ def _frames(
         stored = json.loads(done.read_text())
         looks = [Look(i, t, sharp, float("inf") if i == 0 else change) for i, t, sharp, change in stored["looks"]]
         return looks, Choice(*map(tuple, stored["choice"])), stored["times"]
-    with progress(None, "frames", "looking") as advance:
+    with progress(None, "frames", "measuring") as advance:
         looks = look(recording, advance)
     choice = choose(looks, choices.frames)
     if len(choice.chosen) < FEWEST_FRAMES:
         found = f"{len(choice.blurred)} blurred and {len(choice.repeated)} repeated of {len(looks)} frames"
-        left = f"leave {len(choice.chosen)}, expected {FEWEST_FRAMES} that differ at least"
-        raise DataError(f"{recording.path}: {found} {left}")
+        raise DataError(f"{recording.path}: {found} leave {len(choice.chosen)}, expected at least {FEWEST_FRAMES}")
     shutil.rmtree(work / "images", ignore_errors=True)
     (work / "images").mkdir()
     with progress(len(choice.chosen), "frames", "writing") as advance:
@@ -164,20 +163,20 @@ def _poses(work: Path, times: dict[str, float], choices: Choices, progress: Prog
     _check_moves(poses.travel(database), image_info(images / names[0])[0])
     with progress(None, "frames", "poses") as advance:
         model = _checked(poses.reconstruct(database, images, work / "models", choices.threads, advance), len(names))
-    verdicts = poses.moving_features(database, model)
-    named = [image for image in model.images.values() if image.name in verdicts]
-    moving = {image.name: verdicts[image.name].moving(image.camera.width) for image in named}
+    features = poses.moving_features(database, model)
+    named = [image for image in model.images.values() if image.name in features]
+    moving = {image.name: features[image.name].moving(image.camera.width) for image in named}
     poses.leave_out(model, moving)
     poses.upright(model)
     poses.write(model, work / "sparse" / "0")
-    return Findings(model, verdicts, moving)
+    return Findings(model, features, moving)
 
 
 def _check_moves(travel: float, width: int) -> None:
     """Raises DataError for a camera on a tripod; without any pair of frames, `_checked` reports more."""
     if 0 <= travel < poses.STILL * width / 1000:
-        found = f"static things are {travel:.1f} pixels apart in two frames at most"
-        raise DataError(f"the camera stands still: {found}; expected a camera that walks around them")
+        found = f"static points move by at most {travel:.1f} pixels between frames"
+        raise DataError(f"the camera stands still: {found}; expected a camera that moves around the scene")
 
 
 def _checked(model: Any | None, count: int) -> Any:
@@ -185,8 +184,8 @@ def _checked(model: Any | None, count: int) -> Any:
     found = 0 if model is None else model.num_reg_images()
     if model is None or found < max(FEWEST_FRAMES, poses.LEAST_SHARE * count):
         raise DataError(
-            f"no camera poses: found those of {found} of {count} frames, expected half at least; record things "
-            "that stand still and have texture, from a camera that moves slowly and sideways"
+            f"found camera poses for {found} of {count} frames, expected at least half; "
+            "record static, textured objects with a camera that moves slowly and sideways"
         )
     return model
 
@@ -215,11 +214,11 @@ def _finish(
 
 @dataclass(frozen=True)
 class Findings:
-    """model: a pycolmap.Reconstruction. verdicts, moving: by name of each picture with a pose, the match counts of its
+    """model: a pycolmap.Reconstruction. features, moving: by name of each picture with a pose, the match counts of its
     features, and bool [n]: whether a feature moves."""
 
     model: Any
-    verdicts: Mapping[str, Verdicts]
+    features: Mapping[str, Features]
     moving: Mapping[str, np.ndarray]
 
 
@@ -261,8 +260,8 @@ def _errors(model: Any) -> dict[int, float]:
             continue
         world = np.array([model.point3D(point.point3D_id).xyz for point in seen])
         camera, pose = model.camera(image.camera_id), image.cam_from_world().matrix()
-        places = camera.img_from_cam(world @ pose[:, :3].T + pose[:, 3])
-        gaps = places - np.array([point.xy for point in seen])
+        projected = camera.img_from_cam(world @ pose[:, :3].T + pose[:, 3])
+        gaps = projected - np.array([point.xy for point in seen])
         errors[image.image_id] = float(np.nanmean(np.hypot(gaps[:, 0], gaps[:, 1])))
     return errors
 
@@ -284,7 +283,7 @@ def advice(report: Mapping[str, Any]) -> list[str]:
     lines, frames, error = [], report["frames"], report["reprojection_error"]
     points, angle, moving = (report[key] for key in ("points_per_picture", "angle_degrees", "moving_share"))
     if frames["blurred"] > MANY_BLURRED * frames["seen"]:
-        lines.append(f"{frames['blurred']} of {frames['seen']} frames are blurred: move slower, or with more light")
+        lines.append(f"{frames['blurred']} of {frames['seen']} frames are blurred: move slower or use more light")
     lost = [row["seconds"] for row in report["pictures"] if not row["pose"]]
     if len(lost) > MANY_LOST * frames["chosen"]:
         found = f"{len(lost)} of {frames['chosen']} frames have no pose, between {lost[0]:.1f} and {lost[-1]:.1f} s"
@@ -292,9 +291,11 @@ def advice(report: Mapping[str, Any]) -> list[str]:
     if error * 1000 > LARGE_ERROR * report["camera"]["width"]:
         lines.append(f"reprojection error {error:.2f} pixels: lock zoom and focus, and switch stabilisation off")
     if points < FEW_POINTS:
-        lines.append(f"{points:.0f} points in a picture: have textured static things around the moving ones")
+        lines.append(f"{points:.0f} points per picture: record textured static objects around the moving ones")
     if angle < SMALL_ANGLE:
-        lines.append(f"points are seen under {angle:.1f} degrees: walk around the scene, turning shows no depth")
+        lines.append(
+            f"triangulation angle {angle:.1f} degrees: walk around the scene; turning on the spot shows no depth"
+        )
     if moving > MUCH_MOVES:
         lines.append(f"{100 * moving:.0f} % of the features move: stand back, so that more of the picture is static")
     return lines
@@ -336,10 +337,10 @@ def draw(
         axis = figure.add_subplot(3, 3, 4 + k)
         with Image.open(images / name) as picture:
             axis.imshow(picture)
-        if name in findings.verdicts:
-            verdicts, moves = findings.verdicts[name], findings.moving[name]
-            axis.plot(*verdicts.places[~moves & verdicts.known].T, ",", color="lime")
-            axis.plot(*verdicts.places[moves].T, ".", color="red", markersize=3)
+        if name in findings.features:
+            features, moves = findings.features[name], findings.moving[name]
+            axis.plot(*features.keypoints[~moves & features.known].T, ",", color="lime")
+            axis.plot(*features.keypoints[moves].T, ".", color="red", markersize=3)
         axis.set_title(f"{seconds[at]:.2f} s", fontsize=8)
         axis.axis("off")
     figure.tight_layout()

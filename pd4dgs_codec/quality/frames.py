@@ -32,13 +32,13 @@ def own_frames(info: SceneInfo, count: int, orbit: float = 0.0, downscale: int =
     """Returns `count` frames over the whole time from the file's camera, which orbits its look-at point by `orbit`
     degrees. Raises RenderError if the file has no camera, or its pictures exceed MAX_PIXELS."""
     if info.camera is None:
-        raise RenderError("the file holds no camera of its own; expected --data SOURCE to take cameras from")
+        raise RenderError("found no camera in the file, expected one, or --data SOURCE with cameras")
     camera = shrunk(info.camera, downscale)
     if camera.width * camera.height > MAX_PIXELS:
         size = f"{camera.width}x{camera.height}"
         raise RenderError(
-            f"the file's camera takes pictures of {size}, expected {MAX_PIXELS:,} pixels at most: "
-            "smaller with --downscale, or those of another camera with --data"
+            f"pictures of the file's camera are {size}, expected at most {MAX_PIXELS:,} pixels; "
+            "use --downscale, or other cameras with --data"
         )
     times = np.linspace(0.0, 1.0, count) if count > 1 else np.zeros(1)
     centre = look_at_point(info)

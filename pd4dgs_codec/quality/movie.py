@@ -107,7 +107,7 @@ def write_mp4(frames: Iterator[np.ndarray], path: Path, fps: float, *, fragment:
         return
     height, width = (size // 2 * 2 for size in first.shape[:2])
     if min(height, width) < 2:
-        raise RenderError(f"the camera has {first.shape[1]}x{first.shape[0]} pixels, a video takes 2x2 or more")
+        raise RenderError(f"the camera has {first.shape[1]}x{first.shape[0]} pixels, expected at least 2x2 for a video")
     rate = str(Fraction(fps).limit_denominator())
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", rate]
     coding = ["-an", "-c:v", "libx264", "-crf", str(CRF), "-pix_fmt", "yuv420p", "-y"]
@@ -120,7 +120,7 @@ def write_mp4(frames: Iterator[np.ndarray], path: Path, fps: float, *, fragment:
                 pipe.write(np.ascontiguousarray(frame[:height, :width]).data)
         code, said = run.end()
         if code or said:
-            raise DataError(f"{path.name}: ffmpeg cannot write it: {said or f'it ended with {code}'}")
+            raise DataError(f"{path.name}: ffmpeg cannot write it: {said or f'exit code {code}'}")
 
 
 def check_mp4() -> None:

@@ -113,7 +113,7 @@ def _lpips_network(net: str, url: str, *, spatial: bool) -> tuple[str, Any]:
     # lpips would make torchvision download weights that are not in this folder
     weights = Path(torch.hub.get_dir()) / "checkpoints" / Path(url).name
     if not weights.is_file():
-        raise _Absent(f"its weights of ImageNet are not in {weights}")
+        raise _Absent(f"its ImageNet weights are not in {weights}")
     import lpips
 
     with warnings.catch_warnings():

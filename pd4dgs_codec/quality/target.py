@@ -119,28 +119,28 @@ def _walk(
 ) -> dict[str, float]:
     """Returns the first setting found along the path with final_size <= target. Raises Unreachable."""
 
-    def at(place: float) -> dict[str, float]:
-        whole = min(math.floor(place), len(path) - 1)
+    def at(position: float) -> dict[str, float]:
+        whole = min(math.floor(position), len(path) - 1)
         setting = {**start, **{segment.name: segment.end for segment in path[:whole]}}
         segment = path[whole]
-        setting[segment.name] = segment.start + (place - whole) * (segment.end - segment.start)
+        setting[segment.name] = segment.start + (position - whole) * (segment.end - segment.start)
         return setting
 
     ratio = final_size(start) / size(start)
     low, high = 0.0, float(len(path))
     met = None
     for _ in range(FINAL_TRIES if path else 0):
-        place = _first(lambda s: ratio * size(at(s)) <= AIM * target, low, high)  # noqa: B023
-        got = final_size(at(place))
+        position = _first(lambda s: ratio * size(at(s)) <= AIM * target, low, high)  # noqa: B023
+        got = final_size(at(position))
         if got <= target:
-            met = high = place
+            met = high = position
             if got >= (1 - SLACK) * target:
                 break
-        elif place == high:
+        elif position == high:
             break
         else:
-            low = place
-        ratio = got / size(at(place))
+            low = position
+        ratio = got / size(at(position))
     if met is not None:
         return at(met)
     smallest = at(float(len(path))) if path else dict(start)
@@ -150,7 +150,7 @@ def _walk(
 
 
 def _first(holds: Callable[[float], bool], low: float, high: float) -> float:
-    """Returns about the least place in low..high where a monotone condition holds, or high if it holds nowhere."""
+    """Returns about the least position in low..high where a monotone condition holds, or high if it holds nowhere."""
     while high - low > 1 / 32:
         middle = (low + high) / 2
         if high - low > 1:  # try ends of segments first: they were measured, and are few
@@ -205,7 +205,7 @@ def fit(
         except Unreachable as error:
             raise EncodeError(
                 f"target size: layer {layer} takes at least {error.smallest:,} bytes "
-                f"(steps up to x{2 ** OCTAVES[-1]:g}, {SHARES[-1]:.0%} of its anchors out of it), "
+                f"(steps up to x{2 ** OCTAVES[-1]:g}, {SHARES[-1]:.0%} of its anchors moved out), "
                 f"expected at most {target:,}"
             ) from None
         fits.append(fitted.describe(found, target))
@@ -214,7 +214,7 @@ def fit(
     if not dropped:
         return scene, [], fits
     scene, _ = in_file_order(scene, scene.layers)  # removes dropped anchors, else a plan would report them too
-    why = "the least error in the pictures, left out for the target size"
+    why = "least error in the pictures, left out to reach the target size"
     return scene, [LeftOut(f"{dropped} anchors", why, anchors=dropped)], fits
 
 

@@ -266,5 +266,5 @@ def _rebuilt(plain: Any, like: Any) -> Any:
         return tuple(_rebuilt(value, like[0] if isinstance(like, tuple) else 0.0) for value in plain)
     kind = (int, float) if isinstance(like, float) else type(like)
     if like is not None and not isinstance(plain, kind) or isinstance(plain, dict):
-        raise ValueError(f"{plain!r} where {like!r} is usual")
+        raise ValueError(f"found {plain!r}, expected a value like {like!r}")
     return plain

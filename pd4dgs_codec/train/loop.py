@@ -214,12 +214,12 @@ class Trainer:
         """
         model, training = checkpoint.load(path)
         if "optimiser" not in training:
-            raise TrainError(f"{path}: holds no training state (it was decoded or stripped); cannot resume from it")
+            raise TrainError(f"{path}: found no training state, expected a checkpoint that pd4dgs-train saved")
         try:
             self.learner.restore(model, training)
             self.seconds, self.curve = float(training["seconds"]), _curve(training["curve"])
             if not 0 <= self.seconds < math.inf:
-                raise ValueError(f"seconds are {self.seconds}")
+                raise ValueError(f"seconds is {self.seconds}, expected a finite number >= 0")
         except Exception as error:  # a broken state can raise any exception
             reason = one_line(f"{type(error).__name__}: {error}")  # torch's messages have several lines
             raise DataError(f"{path}: its training state cannot be read: {reason}") from None
@@ -234,7 +234,7 @@ def _curve(text: str) -> list[dict[str, Any]]:
     """Parses the curve of a checkpoint. Raises ValueError, KeyError or TypeError."""
     rows = list(json.loads(text))
     if not all(math.isfinite(v) for row in rows for v in (row["iteration"], row["seconds"], *row["psnr"])):
-        raise ValueError("a curve that is not finite")
+        raise ValueError("curve has a value that is not finite")
     return rows
 
 

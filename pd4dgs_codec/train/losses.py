@@ -138,10 +138,10 @@ class Neighbours:
     def __init__(self, anchor_q: Tensor, tau: float):
         self.anchor_q = anchor_q
         self.order = torch.from_numpy(morton_order(anchor_q.cpu().numpy()))
-        places = anchor_q.cpu()[self.order].double()
-        self.weights = torch.zeros(len(places), self.REACH)
-        for away in range(1, min(self.REACH + 1, len(places))):
-            distance = (places[away:] - places[:-away]).norm(dim=1)
+        positions = anchor_q.cpu()[self.order].double()
+        self.weights = torch.zeros(len(positions), self.REACH)
+        for away in range(1, min(self.REACH + 1, len(positions))):
+            distance = (positions[away:] - positions[:-away]).norm(dim=1)
             self.weights[:-away, away - 1] = torch.exp(distance / -tau)
 
     def draw(self, generator: torch.Generator) -> Tensor:

@@ -142,5 +142,5 @@ class Optimiser:
             moments = {name: stored[name].detach().clone() for name in (STEP, MEAN, SQUARE)}
             shapes = [tuple(value.shape) for value in moments.values()]
             if shapes != [(), tuple(p.shape), tuple(p.shape)]:
-                raise ValueError(f"steps and moments of shapes {shapes} of a parameter of shape {tuple(p.shape)}")
+                raise ValueError(f"step and moments have shapes {shapes}, the parameter {tuple(p.shape)}")
             self.moments[p] = {name: value.to(p.device, torch.float32) for name, value in moments.items()}

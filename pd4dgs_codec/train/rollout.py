@@ -93,18 +93,18 @@ def near_key(state: TrainState, among: list[int]) -> list[int]:
     return nearest[: max(NEAR_VIEWS, round(len(among) * NEAR_SHARE))]
 
 
-def taught_views(state: TrainState, views: Sequence[TrainingView]) -> dict[int, list[TrainingView]]:
-    """By trained level, the views with the pixel weights of `as_taught`."""
-    return {level: [as_taught(state, view, level) for view in views] for level in state.trained_levels()}
+def views_by_level(state: TrainState, views: Sequence[TrainingView]) -> dict[int, list[TrainingView]]:
+    """By trained level, the views with the pixel weights of `view_for_level`."""
+    return {level: [view_for_level(state, view, level) for view in views] for level in state.trained_levels()}
 
 
-def as_taught(state: TrainState, shown: TrainingView, level: int) -> TrainingView:
+def view_for_level(state: TrainState, shown: TrainingView, level: int) -> TrainingView:
     """The view with its pixel weights for training `level`. At level 0 of a scene with a key instant, pixels that
     motion changes have weight 0."""
     if level > 0 or state.key is None or state.practising or state.position < state.schedule.coarse_end:
         return shown
     with torch.no_grad():
-        place = shown.view.time, shown.view.camera, state.rounding(noisy=False)
-        still, moved = (render(state.model, drawn, *place).image for drawn in (0, state.model.level))
+        viewpoint = shown.view.time, shown.view.camera, state.rounding(noisy=False)
+        still, moved = (render(state.model, drawn, *viewpoint).image for drawn in (0, state.model.level))
     same = (still - moved).abs().amax(-1) < STILL_CONTRAST
     return replace(shown, weights=shown.weights * same)

@@ -269,16 +269,17 @@ class TrainState:
     def restore(self, model: Model, state: dict[str, Any]) -> None:
         """Continues with `model` from a `state`. Raises an exception of any type if the state is broken."""
         if model.widths != self.model.widths:
-            raise ValueError(f"a model of {model.widths}, where its configuration has {self.model.widths}")
+            raise ValueError(f"the model has {model.widths}, expected {self.model.widths} as in its configuration")
         fresh = fresh_statistics(len(model.anchor_q), self.config.slots)
         for name, value in fresh.items():
             if state["densifier"][name].shape != value.shape:
-                raise ValueError(f"{name} of shape {tuple(state['densifier'][name].shape)}, not {tuple(value.shape)}")
+                found, expected = tuple(state["densifier"][name].shape), tuple(value.shape)
+                raise ValueError(f"{name} has shape {found}, expected {expected}")
         for name, most in (("iteration", MOST_STEPS), ("skipped", MOST_STEPS), ("total", MOST_STEPS), ("share", 1)):
             if not 0 <= state[name] <= most:
-                raise ValueError(f"{name} is {state[name]!r}, not from 0 to {most}")
+                raise ValueError(f"{name} is {state[name]!r}, expected a number from 0 to {most}")
         if not math.isfinite(state["rho"]):
-            raise ValueError(f"rho is {state['rho']!r}")
+            raise ValueError(f"rho is {state['rho']!r}, expected a finite number")
         self.model = model.to(self.device)
         self.optimiser = Optimiser(self.model, self.config.rates, self.config.cooldown)
         self.optimiser.load_state(state["optimiser"])

@@ -118,7 +118,7 @@ def test_rasterisers_are_compared_with_the_reference():
     assert points[runtime.ORACLE]["rmse"] == 0
     assert 0 < points[runtime.KERNELS]["rmse"] < 1e-5 and points[runtime.KERNELS]["milliseconds"]["repeats"] == 3
     if not torch.cuda.is_available():
-        assert points[runtime.GSPLAT]["missing"] == "there is no CUDA device"
+        assert points[runtime.GSPLAT]["missing"] == "found no CUDA device"
     assert len(runtime.render_table(list(points.values())).splitlines()) == 2 + 3
 
 

@@ -132,7 +132,7 @@ def test_broken_recordings_are_one_line(recording, tmp_path):
     (tmp_path / "empty").mkdir()
     assert "found no picture" in line(tmp_path / "empty")
     write_folder(tmp_path / "short", recording[:3])
-    assert f"3 frames, expected {FEWEST_FRAMES} at least" in line(tmp_path / "short")
+    assert f"3 frames, expected at least {FEWEST_FRAMES}" in line(tmp_path / "short")
     Image.fromarray(recording[3][:100]).save(tmp_path / "short" / "shot4.png")
     assert "is 320x100, expected 320x240" in line(tmp_path / "short")
     Image.fromarray(recording[3]).save(tmp_path / "short" / "other1.png")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rooms import FOCAL, WIDTH, pose
 
-from pd4dgs_codec.prepare.poses import Verdicts, count_off, sampson
+from pd4dgs_codec.prepare.poses import Features, count_off, sampson
 
 
 @pytest.fixture(scope="module")
@@ -45,20 +45,20 @@ def _inverse(relative: np.ndarray) -> np.ndarray:
 def test_moving_features_are_found(scene):
     poses, places = scene
     rng = np.random.default_rng(2)
-    verdicts = {k: Verdicts(p * FOCAL + WIDTH / 2) for k, p in places.items()}
+    features = {k: Features(p * FOCAL + WIDTH / 2) for k, p in places.items()}
     index = np.stack([np.arange(200)] * 2, axis=1)
     wrong = index.copy()
     wrong[:20, 1] = rng.permutation(150)[:20]  # a tenth of the matches are wrong
     listed = [(i, j, wrong if (i + j) % 5 == 0 else index) for i in poses for j in poses if i < j]
-    count_off(verdicts, places, poses, FOCAL, WIDTH, listed)
-    for each in verdicts.values():
+    count_off(features, places, poses, FOCAL, WIDTH, listed)
+    for each in features.values():
         moving = each.moving(WIDTH)
         assert moving[150:].all() and moving[:150].sum() <= 3
 
 
 def test_pictures_without_pose_and_features_without_matches_do_not_count(scene):
     poses, places = scene
-    verdicts = {k: Verdicts(p * FOCAL) for k, p in places.items()}
+    features = {k: Features(p * FOCAL) for k, p in places.items()}
     index = np.stack([np.arange(200)] * 2, axis=1)
-    count_off(verdicts, places, {0: poses[0]}, FOCAL, WIDTH, [(0, 1, index), (0, 0, index[:0])])
-    assert not verdicts[0].matched.any() and not verdicts[0].moving(WIDTH).any()
+    count_off(features, places, {0: poses[0]}, FOCAL, WIDTH, [(0, 1, index), (0, 0, index[:0])])
+    assert not features[0].matched.any() and not features[0].moving(WIDTH).any()

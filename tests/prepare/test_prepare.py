@@ -139,7 +139,7 @@ def test_unregistrable_recording_is_refused_and_leaves_nothing(tmp_path, capsys)
     frames = write(tmp_path / "noise", [rng.integers(0, 255, (96, 128, 3), np.uint8) for _ in range(10)])
     assert main([str(frames), "-o", str(tmp_path / "out"), "-j", "2"]) == 1
     lines = capsys.readouterr().err.strip().splitlines()
-    assert "no camera poses: found those of 0 of 10 frames" in lines[-1]
+    assert "found camera poses for 0 of 10 frames" in lines[-1]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["noise"]
 
 
@@ -149,8 +149,8 @@ def test_foreign_folder_is_not_replaced(room, tmp_path, capsys):
     assert "exists already; --overwrite replaces" in capsys.readouterr().err
     (tmp_path / "out" / "letter.txt").write_text("dear")
     assert main([str(room[0]), "-o", str(tmp_path / "out"), "--overwrite"]) == 1
-    assert "expected a folder that pd4dgs-prepare made" in capsys.readouterr().err
+    assert "expected an output of pd4dgs-prepare" in capsys.readouterr().err
     assert (tmp_path / "out" / "letter.txt").is_file()
     (tmp_path / "new.partial").mkdir()
     assert main([str(room[0]), "-o", str(tmp_path / "new")]) == 1
-    assert "is not of an earlier run" in capsys.readouterr().err
+    assert "expected nothing here or the partial output of an earlier run" in capsys.readouterr().err

@@ -92,7 +92,7 @@ def test_captions_state_the_size():
 
 
 def test_a_film_of_one_pixel_is_refused_in_one_line(tmp_path):
-    with pytest.raises(RenderError, match="1x2 pixels, a video takes 2x2 or more"):
+    with pytest.raises(RenderError, match="1x2 pixels, expected at least 2x2 for a video"):
         movie.write_mp4(iter([np.zeros((2, 1, 3), np.uint8)]), tmp_path / "a.mp4", 10.0)
 
 

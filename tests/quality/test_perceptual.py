@@ -183,7 +183,7 @@ def test_vgg_is_called_as_3d_gaussian_splatting_calls_it(monkeypatch, tmp_path):
         monkeypatch.setitem(sys.modules, module.__name__, module)
     monkeypatch.setattr("importlib.metadata.version", lambda name: "0.1.4")
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    assert load_perceptual([VGG]).absent == {VGG: f"its weights of ImageNet are not in {weights}"}
+    assert load_perceptual([VGG]).absent == {VGG: f"its ImageNet weights are not in {weights}"}
     weights.parent.mkdir(parents=True)
     weights.touch()
     a, b, _ = pair()

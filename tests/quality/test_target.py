@@ -108,13 +108,13 @@ def _few_values(monkeypatch):
     monkeypatch.setattr(target, "SHARES", (0.0, 0.5))
 
 
-def harm(scene, level):
+def error(scene, level):
     """Anchors count the more, the farther up in the order of their voxels they are."""
     return np.lexsort(scene.anchor_q.T).argsort().astype(np.float64)
 
 
 def coarseness(given_scene):
-    """A loss without pictures: logarithms of the steps, and the harm of what is gone from layer 0 or from all."""
+    """A loss without pictures: logarithms of the steps, and the error of anchors gone from layer 0 or from all."""
 
     def loss(decoded):
         steps = sum(np.log2(getattr(decoded.steps, k) / v) for k, v in vars(given_scene.steps).items())
@@ -133,7 +133,7 @@ def test_layers_meet_their_targets_and_the_loss_grows_as_they_shrink(scene):
     loss, whole, losses = coarseness(scene), added(encode(scene, **FAST)), []
     for share in (1.01, 0.95, 0.8):
         targets = {layer: round(share * whole[layer]) for layer in (0, 2)}
-        fitted, left_out, fits = fit(scene, targets, loss, harm, EncodeOptions(**FAST))
+        fitted, left_out, fits = fit(scene, targets, loss, error, EncodeOptions(**FAST))
         data, report = encode_with_report(fitted, **FAST, left_out=left_out)
         whole_file = encode(fitted, **FAST, omit="nothing")  # at coarser steps more may be left out
         assert len(data) <= len(whole_file)
@@ -146,17 +146,17 @@ def test_layers_meet_their_targets_and_the_loss_grows_as_they_shrink(scene):
     assert losses[0] == 0 < losses[1] < losses[2]
 
 
-def test_anchors_of_least_harm_move_to_the_next_layer_and_out_of_the_highest(scene, monkeypatch):
+def test_anchors_of_least_error_move_to_the_next_layer_and_out_of_the_highest(scene, monkeypatch):
     monkeypatch.setattr(target, "OCTAVES", (0.0,))
     whole = added(encode(scene, **FAST))
-    fitted, left_out, (row,) = fit(scene, {0: round(0.8 * whole[0])}, lambda decoded: 0.0, harm, EncodeOptions(**FAST))
+    fitted, left_out, (row,) = fit(scene, {0: round(0.8 * whole[0])}, lambda decoded: 0.0, error, EncodeOptions(**FAST))
     moved, own = fitted.mask[0] == 0, np.arange(scene.rows[-1]) < scene.rows[0]
     assert row.moved == (moved & own).sum() > 0 and row.to_layer == 1 and not left_out
-    assert harm(scene, 0)[moved & own].max() == row.omission_error < harm(scene, 0)[~moved & own].min()
+    assert error(scene, 0)[moved & own].max() == row.omission_error < error(scene, 0)[~moved & own].min()
     assert (fitted.mask[1] > 0).all(), "they are shown from there on"
 
     alone = plan(scene, EncodeOptions(layers=0)).scene
-    fitted, left_out, (row,) = fit(alone, {0: round(0.8 * whole[0])}, lambda decoded: 0.0, harm, EncodeOptions(**FAST))
+    fitted, left_out, (row,) = fit(alone, {0: round(0.8 * whole[0])}, lambda decoded: 0.0, error, EncodeOptions(**FAST))
     assert row.to_layer is None and row.moved == len(alone.anchor_q) - len(fitted.anchor_q) > 0
     report = encode_with_report(fitted, **FAST, left_out=left_out)[1]
     assert [told["what"] for told in report.left_out] == [f"{row.moved} anchors"]
@@ -167,10 +167,10 @@ def test_a_target_out_of_reach_says_what_could_be_reached(scene):
     with pytest.raises(
         EncodeError, match=r"layer 2 takes at least [\d,]+ bytes \(steps up to x16.*expected at most 100$"
     ):
-        fit(scene, {2: 100}, coarseness(scene), harm, EncodeOptions(**FAST))
+        fit(scene, {2: 100}, coarseness(scene), error, EncodeOptions(**FAST))
 
 
 def test_a_layer_that_is_not_there_meets_any_target(scene):
     alone = plan(scene, EncodeOptions(layers=0)).scene
-    fitted, left_out, (row,) = fit(alone, {2: 1}, coarseness(alone), harm, EncodeOptions(**FAST))
+    fitted, left_out, (row,) = fit(alone, {2: 1}, coarseness(alone), error, EncodeOptions(**FAST))
     assert fitted is alone and not left_out and (row.bytes, row.moved, row.factors) == (0, 0, {})

@@ -11,7 +11,7 @@ from pd4dgs_codec.train import rollout
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.initialise import TIED
 from pd4dgs_codec.train.learner import Learner
-from pd4dgs_codec.train.rollout import as_taught, draw_levels, near_key, next_view
+from pd4dgs_codec.train.rollout import draw_levels, near_key, next_view, view_for_level
 from pd4dgs_codec.train.schedule import LOWEST, Schedule
 
 
@@ -58,14 +58,14 @@ def test_level_0_learns_nothing_where_motion_changes_the_picture(dataset, monkey
     still, moved = (render(state.model, level, *place).image for level in (0, 2))
     differs = (still - moved).abs().amax(-1) >= rollout.STILL_CONTRAST
     assert differs.any() and not differs.all()
-    taught = as_taught(state, view, 0).weights
-    assert torch.equal(taught == 0, differs | (view.weights == 0))
-    assert as_taught(state, view, 1) is view
+    weights = view_for_level(state, view, 0).weights
+    assert torch.equal(weights == 0, differs | (view.weights == 0))
+    assert view_for_level(state, view, 1) is view
     at_key = replace(view, view=replace(view.view, time=instant(field.key)))
-    assert torch.equal(as_taught(state, at_key, 0).weights, view.weights), "at t* level 0 is all that there is"
+    assert torch.equal(view_for_level(state, at_key, 0).weights, view.weights), "at t* level 0 is all that there is"
 
 
 def test_other_rollouts_have_no_key_instant(dataset):
     state = learner(dataset, rollout="adaptive")
     assert state.key is None and state.model.global_deformation.key is None
-    assert as_taught(state, state.views[0], 0) is state.views[0]
+    assert view_for_level(state, state.views[0], 0) is state.views[0]

@@ -51,8 +51,8 @@ class SelectLevels(phases.Phase):
 
     def due(self, state: TrainState) -> bool:
         """At `Schedule.rounding`, if views are held back for it and a timed run has not become too slow."""
-        judges = state.reached(state.schedule.rounding) and bool(held_back_views(state))
-        return judges and (state.share is None or state.steps_in(1.0) >= MIN_TIMED)
+        selects = state.reached(state.schedule.rounding) and bool(held_back_views(state))
+        return selects and (state.share is None or state.steps_in(1.0) >= MIN_TIMED)
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
         """Removes levels from the highest down, until one stays."""

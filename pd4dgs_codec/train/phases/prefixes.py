@@ -43,8 +43,8 @@ class Prefixes(Phase):
 
     def due(self, state: TrainState) -> bool:
         """At `Schedule.rounding`, if a first slice would lack anchors."""
-        taught = long_enough(state) and 0 in state.trained_levels()
-        return taught and state.reached(state.schedule.rounding) and state.active_anchors()[0] > FEWEST
+        trained = long_enough(state) and 0 in state.trained_levels()
+        return trained and state.reached(state.schedule.rounding) and state.active_anchors()[0] > FEWEST
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
         """Logs nothing; the steps log the size of their prefix."""
@@ -64,7 +64,7 @@ class Prefixes(Phase):
     def restore(self, stored: Mapping[str, Any]) -> None:
         self.rank = stored["rank"] if len(stored["rank"]) else None
         if self.rank is not None and self.rank.shape != stored["densifier"]["opacity"].shape:
-            raise ValueError(f"a rank of shape {tuple(self.rank.shape)}, not one number for each anchor")
+            raise ValueError(f"rank has shape {tuple(self.rank.shape)}, expected one number per anchor")
 
 
 def rank_anchors(model: Model, views: Sequence[View]) -> Tensor:
@@ -73,9 +73,9 @@ def rank_anchors(model: Model, views: Sequence[View]) -> Tensor:
     absent = (model.masks(0).detach() <= MASK_THRESHOLD).cpu().numpy()
     scene = without(to_scene(model).prefix(0), np.flatnonzero(absent))
     scene = replace(scene, steps=scene.steps.scaled(1.0))  # binary32, as a file has them
-    places = [(view.camera, view.time) for view in views[:: -(-len(views) // VIEWS)]]
+    viewpoints = [(view.camera, view.time) for view in views[:: -(-len(views) // VIEWS)]]
     rank = torch.full((len(absent),), -torch.inf, dtype=torch.float64)
-    rank[torch.from_numpy(~absent)] = torch.from_numpy(utility(scene, places, fewest=FEWEST))
+    rank[torch.from_numpy(~absent)] = torch.from_numpy(utility(scene, viewpoints, fewest=FEWEST))
     return rank
 
 

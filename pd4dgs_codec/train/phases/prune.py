@@ -21,7 +21,7 @@ from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train import workers
 from pd4dgs_codec.train.phases import Phase, long_enough
 from pd4dgs_codec.train.phases.levels import held_back_views
-from pd4dgs_codec.train.rollout import taught_views
+from pd4dgs_codec.train.rollout import views_by_level
 from pd4dgs_codec.train.schedule import PRUNING_ROUNDS
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
@@ -61,8 +61,8 @@ class Prune(Phase):
         order = [i for i in range(len(state.views)) if i not in held_back]
         stride = -(-len(order) // VIEWS)
         views = [state.views[i] for i in order[self.turn % stride :: stride]]
-        taught = taught_views(state, views)
-        errors = added_error(model, taught, state.rounding(noisy=False), omission_error).to(state.device)
+        by_level = views_by_level(state, views)
+        errors = added_error(model, by_level, state.rounding(noisy=False), omission_error).to(state.device)
         errors[:, round_of(model.anchor_q) != self.turn] = torch.inf
         redundant = least(errors.amax(0), share)
         keep = (~redundant | redundant.all()).nonzero()[:, 0]
@@ -98,8 +98,8 @@ def relative_error(
     generator = torch.Generator().manual_seed(0)
     total, met, error = torch.zeros((), dtype=torch.float64), torch.zeros((), dtype=torch.bool), 0.0
     for view in views:
-        place = (level, view.view.time, view.view.camera)
-        added, near, image = error_of(model, *place, generator, weights=view.weights, rounding=rounding)
+        viewpoint = (level, view.view.time, view.view.camera)
+        added, near, image = error_of(model, *viewpoint, generator, weights=view.weights, rounding=rounding)
         total, met = total + added, met | near
         error += min(view.squared_error(image), LEARNT)
     return total / max(error, 1e-12), met

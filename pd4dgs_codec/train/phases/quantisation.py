@@ -26,7 +26,7 @@ from pd4dgs_codec.scene import MASK_THRESHOLD, MAX_CLASS, SCAFFOLD_NETWORKS
 from pd4dgs_codec.train import phases, workers
 from pd4dgs_codec.train.optimiser import Optimiser
 from pd4dgs_codec.train.phases.prune import added_error, relative_error
-from pd4dgs_codec.train.rollout import taught_views
+from pd4dgs_codec.train.rollout import views_by_level
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
 #: Training views in which the error of a step is measured.
@@ -47,7 +47,7 @@ class FitQuantisation(phases.Phase):
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
         """Grades and whitens, and logs how many anchors each step class has."""
         model, config, rounding = state.model, state.config, state.rounding(noisy=False)
-        views = taught_views(state, state.views.spread(VIEWS))
+        views = views_by_level(state, state.views.spread(VIEWS))
         found: list[int] = []
         if config.grading:
             found = grade(model, views, config.grading, rounding)
@@ -140,10 +140,10 @@ def whitening_transform(errors: Tensor, covariance: Tensor) -> Tensor:
     return found
 
 
-def _feature_error(model: Model, *place: Any, **about: Any) -> tuple[Tensor, Tensor, Tensor]:
+def _feature_error(model: Model, *viewpoint: Any, **options: Any) -> tuple[Tensor, Tensor, Tensor]:
     """As `rounding_error`, but float64 [D, D]: the sum of the anchors' Gauss-Newton matrices by the features, in
     units of their steps."""
-    slopes, met, image = attribute_slopes(model, *place, **about)
+    slopes, met, image = attribute_slopes(model, *viewpoint, **options)
     slope = (slopes["feature"] * model.spacing[:, None]).double()
     return slope.T @ slope, met, image
 
