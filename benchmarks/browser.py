@@ -51,7 +51,7 @@ def launched() -> Iterator[Any]:
     named = os.environ.get("PD4DGS_BROWSER")
     found = shutil.which(named) if named else next(filter(None, map(shutil.which, BROWSERS)), None)
     if found is None:
-        raise DataError(f"there is no browser {named or ' or '.join(BROWSERS)} (PD4DGS_BROWSER names one)")
+        raise DataError(f"found no browser, expected {named or ' or '.join(BROWSERS)} (PD4DGS_BROWSER names one)")
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=found, args=FLAGS)
         yield browser

@@ -56,10 +56,10 @@ def error_text(rows: Sequence[Row]) -> str:
         if r["what"] == "render" and not r.get("missing")
     ]
     return (
-        "`pd4dgs-bench codec`: PSNR of pictures against those of the checkpoint, whose tensors lie on the steps of "
+        "`pd4dgs-bench codec`: PSNR against pictures of the checkpoint, whose tensors are multiples of the steps at "
         "scale 1.\n\n"
         f"{table(('scene', 'steps x', 'mode', 'effort', 'bytes', 'PSNR dB', 'encode s', 'decode ms'), codec)}\n\n"
-        "`pd4dgs-bench render`: the same Gaussians against a float64 oracle; times are of rasterising alone.\n\n"
+        "`pd4dgs-bench render`: the same Gaussians against a float64 reference; times are of rasterising alone.\n\n"
         f"{table(('scene', 'rasteriser', 'ms', 'RMSE'), render)}"
     )
 
@@ -97,7 +97,7 @@ def stability_text(rows: Sequence[Row]) -> str:
     cells = [(r["group"], r["pass"], r["refused"], r["fail"], number(r["largest"], 3)) for r in rows]
     head = ("group", "within the bound", "refused", "failed", "largest error / bound")
     return (
-        "`pd4dgs-bench stability` feeds extreme cases and compares with references in high precision; "
+        "`pd4dgs-bench stability` compares extreme cases with references in high precision; "
         f"[robustness and stability](robustness.md) explains it.\n\n{table(head, cells)}"
     )
 
@@ -159,9 +159,9 @@ def speed_text(rows: Sequence[Row]) -> str:
         "step ms",
     )
     return (
-        "Medians of wall time on all threads. Encoding includes verification. The commands start with nothing loaded; "
-        "`pd4dgs-render` draws one picture. *step*: a training step at levels 0 / 1 (/ 2) on one thread, with another "
-        "training beside it.\n\n" + table(head, cells)
+        "Medians of wall time on all threads. Encoding includes verification. Commands run in new processes; "
+        "`pd4dgs-render` draws one picture. *step*: a training step at levels 0 / 1 (/ 2) on one thread, beside "
+        "another training.\n\n" + table(head, cells)
     )
 
 
@@ -218,7 +218,7 @@ def gauss_bytes(channels: Sequence[np.ndarray]) -> int:
         words = coder.get_compressed()
         size += words.nbytes
         if not np.array_equal(stream.stack.AnsCoder(words).decode(model, channel.size), channel):
-            raise DataError("constriction decoded other symbols than it encoded")
+            raise DataError("constriction decoded a channel to different symbols")
     return size
 
 
@@ -257,7 +257,7 @@ def rivals_text(rows: Sequence[Row]) -> str:
     head = ("scene", "part", "symbols", "ours", "Gaussian per channel", "LZMA", "Draco")
     return (
         "Bytes of the same integers in other lossless coders: constriction's QuantizedGaussian with "
-        f"{GAUSS_PARAMETERS} bytes of parameters a channel, LZMA (preset 9, extreme) on the narrowest integers, "
+        f"{GAUSS_PARAMETERS} bytes of parameters per channel, LZMA (preset 9, extreme) on the narrowest integers, "
         f"Draco's kd-tree for positions.\n\n{table(head, cells)}"
     )
 
@@ -291,8 +291,8 @@ def export_text(rows: Sequence[Row]) -> str:
         cells.append((row["scene"], row["kind"], *numbers, told))
     head = ("scene", "file", "frames", "Gaussians", "bytes", "s", "held-out mPSNR dB")
     return (
-        "`pd4dgs-export`, harmonics of degree 3, refined against the training cameras; every held-out view is exported "
-        f"at its own instant for the last column.\n\n{table(head, cells)}"
+        "`pd4dgs-export` with spherical harmonics of degree 3, refined on the training cameras. The last column "
+        f"compares the scene with exports at the instants of the held-out views.\n\n{table(head, cells)}"
     )
 
 
@@ -320,9 +320,11 @@ def batch_text(rows: Sequence[Row]) -> str:
     for row in rows:
         rate, beside = (60 * row["done"] / row["seconds"], row["cpu_seconds"] - row["work_cpu_seconds"])
         workers = f"{row['workers'] or 'no'} workers"
-        told.append(f"{rate:,.0f} scenes a minute with {workers}, {beside / row['done']:.3f} CPU seconds a scene")
+        told.append(
+            f"{rate:,.0f} scenes per minute with {workers} (overhead {beside / row['done']:.3f} CPU seconds per scene)"
+        )
     what = f"`pd4dgs-batch --op encode` of {rows[0]['scene']}, {rows[0]['done']} times, on one machine"
-    return f"{what}: {'; '.join(told)} beside the encoding itself."
+    return f"{what}: {'; '.join(told)}."
 
 
 ERROR = Benchmark("error-time", "Error against run time", ONE, measure_error, error_text, error_pictures)

@@ -80,7 +80,7 @@ SCENES = {
         Scene("orbit", str(SHARED / "bouncing-balls"), "renders of a 4D Gaussian model, 200 x 200", 4, "small", 3_000),
         Scene("static", "synthetic:static", "nothing moves, 160 x 120"),
         Scene("global", f"synthetic:global?{JUMP}", "large objects move, 160 x 120"),
-        Scene("local", f"synthetic:local?{JUMP}", "and small parts move on their own, 160 x 120"),
+        Scene("local", f"synthetic:local?{JUMP}", "large objects and small parts move, 160 x 120"),
         Scene("fast", f"synthetic:fast?{JUMP}", "quick motion, 160 x 120"),
         Scene("flyby", "synthetic:flyby", "a ball flies past a cube, on white, 100 x 100"),
         Scene("rods", "synthetic:rods", "thin rods move, on white, 100 x 100"),
@@ -88,7 +88,7 @@ SCENES = {
         Scene("mutant-200", MUTANT, "D-NeRF, 200 x 200", 4, "small", 8_000, "3dgs"),
         Scene("mutant-400", MUTANT, "D-NeRF, 400 x 400", 2, training=ALL_VIEW, **LARGE),
         Scene("mutant", MUTANT, "D-NeRF, 800 x 800", **LARGE),
-        Scene("mutant-black", MUTANT, "the same on black", training=("--background", "black"), **LARGE),
+        Scene("mutant-black", MUTANT, "D-NeRF, 800 x 800, on black", training=("--background", "black"), **LARGE),
         Scene("basketball", str(OFFICIAL / "basketball"), "Panoptic Sports, 640 x 360", **LARGE),
     )
 }

@@ -37,9 +37,9 @@ def latency_text(rows: Sequence[Row]) -> str:
     ]
     head = ("scene", "Mbps", "level", "bytes S", "8S/B", "last byte", "picture", "after the last byte", "cold process")
     return (
-        "Seconds since the request, medians, over `pd4dgs-serve --rate`: until the last byte of the level has arrived, "
-        "until its picture is drawn on the CPU, and until then in a process that starts with the request "
-        f"(`pd4dgs-bench latency`). With empty kernel caches the first picture takes {rows[0]['first_start']:.1f} s."
+        "Median seconds from the request over `pd4dgs-serve --rate` to the last byte of the level, to its picture "
+        "drawn on the CPU, and to its picture in a process that starts with the request (`pd4dgs-bench latency`). With "
+        f"empty kernel caches the first picture takes {rows[0]['first_start']:.1f} s."
         f"\n\n{table(head, cells)}"
     )
 
@@ -91,12 +91,22 @@ def slices_text(rows: Sequence[Row]) -> str:
             + (texts[1] if moving else "-", texts[-1], f"{points[-1][0] / whole[-1][0] - 1:+.1%}")
             + (number(max(fall, 0.0), 3), number(share_of_bytes(points, whole)))
         )
-    head = ("scene", "slices", "first slice", "s at 2 Mbps", "mPSNR dB", "layer 0 whole", "first that moves", "all")
-    more = ("cost", "largest fall dB", "share")
+    head = (
+        "scene",
+        "slices",
+        "first slice",
+        "s at 2 Mbps",
+        "mPSNR dB",
+        "layer 0 whole",
+        "first with motion",
+        "whole file",
+    )
+    more = ("cost", "largest drop dB", "share")
     return (
-        "`pd4dgs-encode --slices 50k --data SOURCE`; the quality of every prefix on held-out views. *layer 0 whole* "
-        "and *cost* compare with a file of one slice for each layer. *share*: the bytes to a quality, of those that "
-        f"whole layers take; median of all qualities above the first slice's.\n\n{table((*head, *more), cells)}"
+        "`pd4dgs-encode --slices 50k --data SOURCE`: the quality of every prefix on held-out views. *layer 0 whole* "
+        "and *cost* compare with a file of one slice per layer. *share*: bytes to reach a quality, as a share of the "
+        "bytes in that file; median over all qualities above that of the first slice.\n\n"
+        f"{table((*head, *more), cells)}"
     )
 
 
@@ -194,10 +204,10 @@ def player_text(rows: Sequence[Row]) -> str:
         if r["what"] == "rate"
     ]
     return (
-        f"{rows[0]['browser']}, which draws in software here; two cores. Seconds from navigation to the settled "
-        f"picture of a level, cold cache, round trip {ROUND_TRIP}; page and player arrive over the same link.\n\n"
+        f"{rows[0]['browser']} with software rendering on two cores. Seconds from navigation to the final picture of "
+        f"a level, cold cache, round trip {ROUND_TRIP}; page and player arrive over the same link.\n\n"
         f"{table(('scene', 'Mbps', 'level', 'bytes', '8S/B', 'picture'), shown)}\n\n"
-        "Pictures a second (`?bench`), with a moving camera and with running time:\n\n"
+        "Pictures per second (`?bench`) with a moving camera and in playback:\n\n"
         f"{table(('scene', 'level', 'size', 'Gaussians', 'moving', 'playing'), rates)}"
     )
 

@@ -14,8 +14,8 @@ from pd4dgs_codec.io import finite, whole_file
 
 DIGITS = 6  #: significant digits of a figure in git
 INTRODUCTION = """\
-`python benchmarks/run.py` made this page: it trains every scene, packs it and measures. Times are wall
-times of a machine that other work may share; sizes and qualities repeat for the same package and machine. 1 MB is 1e6
+`python benchmarks/run.py` made this page: it trains, packs and measures every scene. Times are wall
+times on a machine that may run other work; sizes and qualities repeat for the same package and machine. 1 MB is 1e6
 bytes."""
 
 
@@ -36,7 +36,7 @@ def text(benchmarks: Sequence[Benchmark], figures: Row) -> str:
     made = [f"commit `{s['commit']}`, {s['date']}, `{s['command']}`, {s['machine']}" for s in sections]
     usual = max(made, key=made.count)
     common = sections[made.index(usual)]
-    parts = ["# Results", wrapped(INTRODUCTION), wrapped(f"Where nothing else is said: {usual}.")]
+    parts = ["# Results", wrapped(INTRODUCTION), wrapped(f"Unless a section says otherwise: {usual}.")]
     for found, by in zip(sections, made, strict=True):
         title = known[found["name"]].title
         shown = [f"![{title}: {name.rsplit('.', 1)[0]}](img/{name})" for name in found["pictures"]]

@@ -104,9 +104,9 @@ def text(rows: Sequence[Row]) -> str:
             )
     heads = ("scene", "method", "mPSNR dB", "bytes", "layer 0 bytes", "published mPSNR", "published MB")
     return (
-        f"One training each of one tiny synthetic scene, {SHORT:.0%} of its steps unless the row says otherwise: they "
-        "compare methods, not with what is published, which is of the Dycheck iPhone scenes. Our levels are prefixes "
-        "of one file, the models beside them are trained for one level.\n\n"
+        f"One training per model on one tiny synthetic scene, with {SHORT:.0%} of its steps unless the row says "
+        "otherwise. Rows compare methods with each other; published figures are for the DyCheck iPhone scenes. Our "
+        "levels are prefixes of one file; each of the other models is trained for one level.\n\n"
         f"{table(head, models)}\n\n"
         f"The highest level with one part of the method left out or replaced:\n\n{table(heads, parts)}"
     )
@@ -146,7 +146,7 @@ def dial_text(rows: Sequence[Row]) -> str:
         )
         for (scene, quality), found in groups.items()
     ]
-    return "`pd4dgs-train --quality` on one tiny synthetic scene; every level that the file holds.\n\n" + table(
+    return "`pd4dgs-train --quality` on one tiny synthetic scene, for every level in the file.\n\n" + table(
         ("scene", "quality", "bytes so far", "mPSNR dB"), cells
     )
 

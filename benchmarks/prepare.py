@@ -166,8 +166,10 @@ def main() -> None:
     """The table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", help="recordings (default: all)")
-    parser.add_argument("--package", type=Path, default=ROOT, help="checkout whose package runs (default: this one)")
-    parser.add_argument("--frames", type=int, default=COUNT, help=f"frames that are used (default: {COUNT})")
+    parser.add_argument(
+        "--package", type=Path, default=ROOT, help="checkout of the package to measure (default: this one)"
+    )
+    parser.add_argument("--frames", type=int, default=COUNT, help=f"most frames to use (default: {COUNT})")
     options = parser.parse_args()
     head = "recording", "CPU s", "poses", "error, pixels", "largest turn", "distance", "time"
     print(f"| {' | '.join(head)} |\n" + "|-" * len(head) + "|")

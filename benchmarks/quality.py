@@ -42,13 +42,13 @@ PUBLISHED: dict[str, tuple[tuple[str, float, float | None, float | None], ...]] 
     "basketball": (("GIFStream, mean with boxes", 29.5, None, None),),
 }
 OFFICIAL_TEXT = {
-    "": "By `pd4dgs-eval --protocol 3dgs`: metrics without masks, means over pictures. Rows that name a method are "
-    "published.",
-    "mutant": "mutant is D-NeRF's, with its official split (20 test views), on white; a number is the side of our "
-    "pictures, where published ones have 800. Published rows are of arXiv 2510.10030, supplement, table 1, where its "
-    "authors ran them again, but 4DGS-1K-PP of arXiv 2503.16422, table 6; their backgrounds differ.",
-    "mutant-black": "mutant-black is the same on black.",
-    "basketball": "basketball is Panoptic Sports', 4 test cameras at 150 instants; GIFStream: arXiv 2505.07539.",
+    "": "By `pd4dgs-eval --protocol 3dgs`: metrics without masks, means over pictures. Rows with the name of a method "
+    "are published figures.",
+    "mutant": "mutant is D-NeRF's scene with its official split (20 test views) on white. A number in the name is the "
+    "side of our pictures in pixels; published ones have 800. Published rows are from arXiv 2510.10030, supplement, "
+    "table 1 (rerun by its authors), 4DGS-1K-PP from arXiv 2503.16422, table 6; their backgrounds differ.",
+    "mutant-black": "mutant-black is mutant on black.",
+    "basketball": "basketball is from Panoptic Sports, 4 test cameras at 150 instants; GIFStream: arXiv 2505.07539.",
 }
 #: Bytes of a picture in git.
 LARGEST_PICTURE = 300_000
@@ -130,8 +130,8 @@ def text(rows: Sequence[Row]) -> str:
     parts = [
         "Quality is measured on held-out views, from the prefix of the file whose size is in the same row. *monolith*: "
         "the same scene trained for the highest level alone, without a rate term, stored as float32 under LZMA. "
-        "*moving*: pixels whose truth changes over time, where test cameras stand still. Each training has one thread, "
-        f"with another beside it.{told}",
+        "*moving*: mPSNR of the pixels whose true colour changes over time, for fixed test cameras. Each training has "
+        f"one thread and runs beside another one.{told}",
     ]
     if shown:
         parts.append(table(("scene", "shows", "`pd4dgs-train`"), shown))

@@ -64,7 +64,7 @@ def section(benchmark: Benchmark, run: Run, names: Sequence[str], made: Row) -> 
     if benchmark.scenes:
         scenes = [QUICK] if run.quick else list(present([n for n in benchmark.scenes if n in names]))
     if not scenes:
-        raise DataError(f"{benchmark.name}: none of the scenes {', '.join(benchmark.scenes)} is there")
+        raise DataError(f"{benchmark.name}: found none of the scenes {', '.join(benchmark.scenes)}")
     start, rows = time.monotonic(), []
     run.train(job for scene in scenes if scene for job in benchmark.trainings(run, scene))
     for scene in scenes:
@@ -87,7 +87,7 @@ def aged(sections: Sequence[Row]) -> list[str]:
     for name, made in ((found["name"], found["commit"]) for found in sections):
         if paths := changed(made.partition(",")[0], *measured[name]):
             more = f" and {len(paths) - 1} more" if len(paths) > 1 else ""
-            lines.append(f"{name}: made at {made}, before changes of {paths[0]}{more}")
+            lines.append(f"{name}: made at {made}; changed since: {paths[0]}{more}")
     return lines
 
 
@@ -116,15 +116,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     names = [benchmark.name for benchmark in ALL]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=f"some of {', '.join(names)}")
-    parser.add_argument("--scenes", nargs="+", choices=list(SCENES), metavar="SCENE", help=f"of {', '.join(SCENES)}")
-    parser.add_argument("--seeds", type=int, default=1, help="trainings of each scene in quality (%(default)s)")
+    parser.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=f"sections: {', '.join(names)}")
+    parser.add_argument(
+        "--scenes", nargs="+", choices=list(SCENES), metavar="SCENE", help=f"scenes: {', '.join(SCENES)}"
+    )
+    parser.add_argument("--seeds", type=int, default=1, help="trainings per scene in the section quality (%(default)s)")
     parser.add_argument("--quick", action="store_true", help="a tiny scene; without the player unless --only names it")
     parser.add_argument("--resume", action="store_true", help="keep the sections that were made at this commit")
-    parser.add_argument("--render", action="store_true", help="make the page from its figures and measure nothing")
-    what = "name sections whose measured code, comments apart, has changed since; exit code 1 if any"
+    parser.add_argument("--render", action="store_true", help="render the page from its figures without measuring")
+    what = "name sections whose measured code has changed (without comments); exit code 1 if any"
     parser.add_argument("--check", action="store_true", help=what)
-    parser.add_argument("-o", "--out", type=Path, default=ROOT / "out" / "benchmarks", help="trainings and files")
+    parser.add_argument(
+        "-o",
+        "--out",
+        type=Path,
+        default=ROOT / "out" / "benchmarks",
+        help="folder of checkpoints and files (%(default)s)",
+    )
     parser.add_argument("--docs", type=Path, help="folder of the page (docs; with --quick OUT/docs)")
     args = parser.parse_args(argv)
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # each process that is timed would compile its modules anew
@@ -140,7 +148,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     kept = {found["name"]: found for found in json.loads(stored.read_text())["sections"]} if stored.is_file() else {}
     if args.check:
         lines = aged(list(kept.values()))
-        print("\n".join(lines or ["the code that each section measures is as it was"]))
+        print("\n".join(lines or ["no section's measured code has changed"]))
         return bool(lines)
     run.images.mkdir(parents=True, exist_ok=True)
     scenes = args.scenes or [name for name, scene in SCENES.items() if scene.usual]
@@ -160,7 +168,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         if args.render:
             write(docs, ALL, kept)
     except (Pd4Error, OSError, KeyboardInterrupt) as error:
-        say(f"run: error: {str(error) or 'interrupted; the same command continues'}")
+        say(f"run: error: {str(error) or 'interrupted; --resume continues'}")
         return 1
     return 0
 

@@ -1,4 +1,4 @@
-"""Which levels runs keep: what each level was judged to be worth, and what held-out views say."""
+"""Which levels runs keep: the measured gain of each level, and its quality on held-out views."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def scenes(run: Run) -> dict[tuple[str, int], Scene]:
 
 
 def measure(run: Run, _: None) -> list[Row]:
-    """A row per training. gains: of the levels that were judged, the highest first; by level, held-out quality."""
+    """A row per training. gains: of the levels that were tested, the highest first; by level, held-out quality."""
     rows = []
     run.train(map(Training, scenes(run).values()))
     for (motion, seed), scene in scenes(run).items():
@@ -48,15 +48,15 @@ def text(rows: Sequence[Row]) -> str:
     head = ("scene", "seed", "top level", "gain of 1", "gain of 2", "mPSNR dB", "moving dB", "bytes so far")
     return (
         f"`pd4dgs-train 'synthetic:SCENE?seed=SEED' --preset tiny --iterations {STEPS}`: the camera sweeps. "
-        "*gain*: dB by which a level stays or goes, in pixels that it changes of views held back from training, over "
-        f"the level below after practice. 2 needs {SHARE_2:.0%} of what it gains over level 0, {MIN_GAIN_2:g} dB at "
-        f"least; 1 needs {MIN_GAIN_1:g} dB, to which the gain of 2 counts, and is judged where 2 goes.\n\n"
-        f"{table(head, cells)}"
+        "*gain*: dB over the level below after its trial training, in the pixels that the level changes in views held "
+        f"back from training. Level 2 stays if it gains at least {SHARE_2:.0%} of its gain over level 0 and "
+        f"{MIN_GAIN_2:g} dB. If it is removed, level 1 is tested and stays if both gains sum to at least "
+        f"{MIN_GAIN_1:g} dB.\n\n{table(head, cells)}"
     )
 
 
 def gain(row: Row, level: int) -> str:
-    """What `level` was judged to be worth; a dash where it was not judged."""
+    """The measured gain of `level`; a dash if it was not tested."""
     return number(dict(zip((2, 1), row["gains"], strict=False)).get(level), 1)
 
 

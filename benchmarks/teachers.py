@@ -1,7 +1,8 @@
-"""Runs in the layouts of 4DGaussians and Deformable-3DGS, made from their published formulas, and what teaching loses.
+"""Runs in the layouts of 4DGaussians and Deformable-3DGS, from their published formulas, and the quality lost by
+learning from them.
 
 The modules stand on their own: plain torch layers and `grid_sample`, so that tests compare the package's readers with
-them. `python benchmarks/teachers.py` bends a ball of Gaussians with each, teaches a model from each run, and prints
+them. `python benchmarks/teachers.py` bends a ball of Gaussians with each, trains a model from each run, and prints
 bytes, quality of the packed file against the run's own pictures from held-out cameras and times, and processor minutes.
 """
 
@@ -39,7 +40,7 @@ def parameters(splats: Splats) -> dict[str, Tensor]:
 
 
 def save(run: Path, splats: Splats, network: nn.Module, file: str, options: dict[str, object]) -> Path:
-    """A run with one iteration. file: the place of the network in the run."""
+    """A run with one iteration. file: path of the network in the run."""
     for path in (run / "point_cloud/iteration_7/point_cloud.ply", run / file):
         path.parent.mkdir(parents=True, exist_ok=True)
     (run / "point_cloud/iteration_7/point_cloud.ply").write_bytes(ply_bytes(splats))
@@ -132,10 +133,10 @@ class FourD(nn.Module):
 
     def save(self, run: Path, splats: Splats) -> Path:
         """A run of it."""
-        place = "point_cloud/iteration_7/"
-        save(run, splats, self, place + "deformation.pth", self.options | {"kplanes_config": {"resolution": [12, 10]}})
-        torch.save(torch.ones(len(splats.means), dtype=torch.bool), run / place / "deformation_table.pth")
-        torch.save(torch.zeros(len(splats.means), 3), run / place / "deformation_accum.pth")
+        folder = "point_cloud/iteration_7/"
+        save(run, splats, self, folder + "deformation.pth", self.options | {"kplanes_config": {"resolution": [12, 10]}})
+        torch.save(torch.ones(len(splats.means), dtype=torch.bool), run / folder / "deformation_table.pth")
+        torch.save(torch.zeros(len(splats.means), 3), run / folder / "deformation_accum.pth")
         return run
 
 
@@ -202,7 +203,7 @@ class Deformable(nn.Module):
         return save(run, splats, self, "deform/iteration_7/deform.pth", options)
 
 
-# -- what teaching loses -----------------------------------------------------------------------------------------------
+# -- lost quality -----------------------------------------------------------------------------------------------------
 
 
 def ball(count: int = 1500) -> Splats:
@@ -217,7 +218,7 @@ def ball(count: int = 1500) -> Splats:
 
 
 def bent(means: Tensor, t: float) -> Tensor:
-    """The goal of the motion: the ball leans and turns more at its top."""
+    """The target of the motion: the ball leans and turns more at its top."""
     angle = torch.sin(torch.tensor(2 * np.pi * t)) * 0.7 * means[:, 2]
     x, y, z = means.unbind(1)
     return torch.stack([x * angle.cos() - y * angle.sin() + 0.4 * t * z, x * angle.sin() + y * angle.cos(), z], dim=1)
@@ -230,8 +231,8 @@ def fit(model: FourD | Deformable, steps: int = FIT_STEPS) -> None:
     for _ in range(steps):
         t = float(rng.uniform())
         found = model(t)
-        goals = {"means": bent(model.rest["means"], t), "quats": model.rest["quats"], "scales": scales}
-        loss = sum((found[name] - goal).square().mean() for name, goal in goals.items())
+        targets = {"means": bent(model.rest["means"], t), "quats": model.rest["quats"], "scales": scales}
+        loss = sum((found[name] - target).square().mean() for name, target in targets.items())
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -240,7 +241,7 @@ def fit(model: FourD | Deformable, steps: int = FIT_STEPS) -> None:
 def main() -> None:
     """The table."""
     torch.manual_seed(0)
-    print("| run | its bytes | .pd4 bytes | held-out dB | processor minutes |\n" + "| - " * 5 + "|")
+    print("| run | bytes of the run | .pd4 bytes | held-out dB | processor minutes |\n" + "| - " * 5 + "|")
     for name, model in (("4DGaussians", FourD(ball())), ("Deformable-3DGS", Deformable(ball(), is_blender=True))):
         fit(model)
         with tempfile.TemporaryDirectory() as folder:

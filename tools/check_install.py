@@ -33,8 +33,8 @@ class Environment:
     """A virtual environment in `folder` and an empty folder beside it, in which its commands run."""
 
     def __init__(self, folder: Path) -> None:
-        self.place, self.bin = folder / "work", folder / "venv" / ("Scripts" if os.name == "nt" else "bin")
-        self.place.mkdir()
+        self.work, self.bin = folder / "work", folder / "venv" / ("Scripts" if os.name == "nt" else "bin")
+        self.work.mkdir()
         subprocess.run([sys.executable, "-m", "venv", folder / "venv"], check=True)
 
     def run(self, program: str, *arguments: object) -> str:
@@ -43,7 +43,7 @@ class Environment:
         environment = {key: value for key, value in os.environ.items() if key not in ("PYTHONPATH", "PYTHONHOME")}
         command = [str(self.bin / program), *map(str, arguments)]
         return subprocess.run(
-            command, cwd=self.place, env=environment, check=True, text=True, encoding="utf-8", stdout=subprocess.PIPE
+            command, cwd=self.work, env=environment, check=True, text=True, encoding="utf-8", stdout=subprocess.PIPE
         ).stdout
 
 
@@ -62,8 +62,8 @@ def expected_layers() -> object:
 
 def check_decoding(env: Environment) -> None:
     """What the package does without an extra."""
-    shutil.copy(ROOT / "spec" / "vectors" / VECTOR, env.place / "scene.pd4")
-    assert "site-packages" in env.run("python", "-c", INSTALLED), "the package was imported from elsewhere"
+    shutil.copy(ROOT / "spec" / "vectors" / VECTOR, env.work / "scene.pd4")
+    assert "site-packages" in env.run("python", "-c", INSTALLED), "the package was not imported from the environment"
     assert json.loads(env.run("pd4dgs-info", "scene.pd4", "--hashes", "--json"))["hashes"] == expected_layers()
     env.run("pd4dgs-decode", "scene.pd4", "-o", "scene.npz")
     env.run("pd4dgs-package", "scene.pd4", "-o", "site", "--no-video")

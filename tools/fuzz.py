@@ -71,10 +71,10 @@ class Figures:
     def text(self) -> str:
         """A table."""
         rows: list[tuple[str, Any]] = [("inputs", self.inputs), ("legal files", self.legal)]
-        rows += [("right CRCs after the mutation", self.sealed)]
+        rows += [("CRCs recomputed after the mutation", self.sealed)]
         rows += [(f"ends in {name}", count) for name, count in self.outcomes.most_common()]
         rows += [(f"compared with {name}", count) for name, count in self.compared.items()]
-        rows += [("another name for a fault", self.differences.total()), ("memory, of its bound", f"{self.memory:.0%}")]
+        rows += [("faults under two names", self.differences.total()), ("largest memory / bound", f"{self.memory:.0%}")]
         lines = [
             "| figure | value |\n|---|---|",
             *(f"| {n} | {v} |" for n, v in [*rows, ("findings", len(self.findings))]),
@@ -133,7 +133,10 @@ def run_safely(files: Sequence[Seed], run: int, inputs: range, names: Sequence[s
                 yield reader.recv()
             except EOFError:
                 child.join()
-                message, recipe = f"the process ended with {child.exitcode}", make_case(files, run, index).recipe
+                message, recipe = (
+                    f"the process ended with exit code {child.exitcode}",
+                    make_case(files, run, index).recipe,
+                )
                 yield Figures(inputs=1, findings=[_row(index, "crash", message, recipe)])
                 break
         child.join()
@@ -145,9 +148,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     assert __doc__
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("files", nargs="*", type=Path, help="more files to mutate, .pd4 or folders of them")
-    p.add_argument("--inputs", type=int, default=20_000, help="how many (default: 20000)")
-    p.add_argument("--seed", type=int, default=0, help="number of the run (default: 0)")
-    p.add_argument("--decoders", default=",".join(DECODERS), help="of python,refdec,javascript (default: all)")
+    p.add_argument("--inputs", type=int, default=20_000, help="number of inputs (default: 20000)")
+    p.add_argument("--seed", type=int, default=0, help="seed of the run (default: 0)")
+    p.add_argument(
+        "--decoders", default=",".join(DECODERS), help="decoders to compare, of python,refdec,javascript (default: all)"
+    )
     p.add_argument("--input", type=int, metavar="I", help="examine input I alone, in this process")
     p.add_argument("--out", type=Path, default=ROOT / "out" / "fuzz", help="folder for findings (default: out/fuzz)")
     args = p.parse_args(argv)

@@ -63,7 +63,7 @@ def files(found: list[Vector]) -> dict[str, bytes]:
 def surprises(found: list[Vector]) -> Iterator[str]:
     """One line per vector that the package does not decode as its table says."""
     names = [v.name for v in found]
-    yield from (f"{name}: two vectors of this name" for name in sorted(set(names)) if names.count(name) > 1)
+    yield from (f"{name}: two vectors have this name" for name in sorted(set(names)) if names.count(name) > 1)
     for vector in found:
         try:
             outcome: Any = hashes(vector.data)
@@ -77,12 +77,12 @@ def differences(wanted: dict[str, bytes], folder: Path) -> Iterator[str]:
     """One line per file that is missing, different or not a vector."""
     there = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.suffix in (SUFFIX, ".json")}
     for name in sorted(there - set(wanted)):
-        yield f"{name}: not a vector"
+        yield f"{name}: unexpected file"
     for name, content in wanted.items():
         if name not in there:
             yield f"{name}: missing"
         elif (folder / name).read_bytes() != content:
-            yield f"{name}: other bytes"
+            yield f"{name}: bytes differ"
 
 
 def write(wanted: dict[str, bytes], folder: Path) -> None:
@@ -98,7 +98,7 @@ def write(wanted: dict[str, bytes], folder: Path) -> None:
 def main() -> int:
     """Entry point; returns the exit code."""
     parser = argparse.ArgumentParser(description="Write or check the conformance vectors.")
-    parser.add_argument("--check", action="store_true", help="compare with the present files, write nothing")
+    parser.add_argument("--check", action="store_true", help="compare with the existing files, write nothing")
     arguments = parser.parse_args()
     found = list(vectors())
     wanted = files(found)

@@ -176,10 +176,10 @@ def test_sections_whose_code_has_changed_are_named(tmp_path, monkeypatch):
     words = commit("pd4dgs_codec/x.py", '"""Adds one."""\na = 2  # two\n')
     commit("player/x.js", "1;")
     for section in ("quality", "player"):
-        assert named(section, first).startswith(f"{section}: made at {first}, before changes of pd4dgs_codec/x.py")
-        assert named(section, "abcdef1").startswith(f"{section}: made at abcdef1, before changes of")
+        assert named(section, first).startswith(f"{section}: made at {first}; changed since: pd4dgs_codec/x.py")
+        assert named(section, "abcdef1").startswith(f"{section}: made at abcdef1; changed since:")
     assert named("quality", f"{code}, changed") == named("quality", words) == ""
-    assert named("player", words) == f"player: made at {words}, before changes of player/x.js"
+    assert named("player", words) == f"player: made at {words}; changed since: player/x.js"
 
 
 def test_several_seeds_are_shown_with_their_spread():

@@ -210,7 +210,7 @@ def test_the_tool_names_every_difference(tmp_path):
     assert list(make_vectors.differences(wanted, tmp_path)) == []
     (tmp_path / "valid" / "a.pd4").write_bytes(b"A")
     (tmp_path / "valid" / "b.pd4").rename(tmp_path / "valid" / "c.pd4")
-    differences = ["valid/c.pd4: not a vector", "valid/a.pd4: other bytes", "valid/b.pd4: missing"]
+    differences = ["valid/c.pd4: unexpected file", "valid/a.pd4: bytes differ", "valid/b.pd4: missing"]
     assert list(make_vectors.differences(wanted, tmp_path)) == differences
     make_vectors.write(wanted, tmp_path)
     assert list(make_vectors.differences(wanted, tmp_path)) == []

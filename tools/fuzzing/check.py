@@ -120,7 +120,7 @@ def check_memory(data: bytes) -> float:
     finally:
         tracemalloc.stop()
     if peak > bound:
-        raise Finding("memory", f"{peak} bytes at once, bound {bound} for {symbols} symbols, {len(data)} bytes")
+        raise Finding("memory", f"peak of {peak} bytes, bound {bound} for {symbols} symbols, {len(data)} bytes")
     return peak / bound
 
 
@@ -144,7 +144,7 @@ def check_package(case: Case, rng: random.Random) -> str:
         if seconds > MAX_SECONDS:
             raise Finding("time", f"{seconds:.2f} s of processor time, limit {MAX_SECONDS} s")
         if name == DECODED and not case.sealed and case.data not in case.origins:
-            raise Finding("silent", "decoded although the CRCs are those of before the mutation")
+            raise Finding("silent", "decoded a mutated file without an error, although its CRCs are wrong")
         _other_entry_point(case.data, name, result, rng)
     return name
 
@@ -209,7 +209,7 @@ class JavaScript:
         self._process.stdin.write(base64.b64encode(data).decode() + "\n")
         self._process.stdin.flush()
         line = self._process.stdout.readline()
-        found = json.loads(line) if line else {"crash": f"the process ended with {self._process.wait()}"}
+        found = json.loads(line) if line else {"crash": f"the process ended with exit code {self._process.wait()}"}
         if "crash" in found:
             return f"crash, {found['crash']}", None
         return (found["error"], found["message"]) if "error" in found else (DECODED, found["hashes"])
@@ -231,7 +231,7 @@ def compare(data: bytes, decoders: dict[str, Decoder], meaning: list[dict[str, A
         if DECODED in (found, expected) and found != expected:
             raise Finding("disagreement", f"{first}: {expected} ({given}), {name}: {found} ({result})"[:600])
         if found == DECODED and result != given:
-            raise Finding("disagreement", f"{first} and {name} give other hashes")
+            raise Finding("disagreement", f"{first} and {name} give different hashes")
         if found != expected:
             return f"{name} {found}, {first} {expected}"
     return None
