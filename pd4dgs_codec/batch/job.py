@@ -135,7 +135,7 @@ def arguments(verb: str, source: str, output: str, options: dict[str, Any]) -> l
     options = dict(options)
     if verb == "eval":
         if not isinstance(options.get("data"), str):
-            raise DataError("eval needs the option data, its dataset")
+            raise DataError("found no option data, expected the dataset for eval")
         argv = [source, options.pop("data")]
     else:
         argv = [source, "--output", output]
@@ -251,7 +251,7 @@ def _outcome(job: Job, command: Command) -> Outcome:
 
 def _done_once(job: Job, command: Command) -> Outcome:
     if job.version != __version__:
-        raise DataError(f"found pd4dgs-codec {__version__} on the worker, expected {job.version} as at the start")
+        raise DataError(f"found pd4dgs-codec {__version__} on the worker, expected {job.version}")
     line, root = job.line, store.Root(job.root)
     record = root.record(line.output, job.overwrite)
     inputs = {"": line.source} | {name: line.options[name] for name in OPS[job.verb].inputs if name in line.options}

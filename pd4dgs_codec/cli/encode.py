@@ -86,11 +86,12 @@ def parser() -> options.Parser:
 def _encode(args: argparse.Namespace, console: Console) -> int:
     if args.output == STDIO and args.json:
         raise UsageError("-o - and --json both write to stdout, expected -o FILE")
-    options.conditional(
-        args, args.data, "needs --data SOURCE", holdout=8, views=16, min_gain=ENCODE_MIN_DB_PER_MEGABYTE
-    )
-    renders = args.data or args.slices or args.target_size
-    options.conditional(args, renders, "needs --data, --slices or --target-size", downscale=1)
+    fits, gains = args.slices or args.target_size, args.layers == "auto"
+    options.conditional(args, fits or gains, "needs --layers auto, --slices or --target-size", data=None)
+    options.conditional(args, args.data or fits, "needs --data, --slices or --target-size", downscale=1)
+    options.conditional(args, args.data, "needs --data SOURCE", holdout=8, views=16)
+    needs = "needs --data SOURCE and --layers auto"
+    options.conditional(args, args.data and gains, needs, min_gain=ENCODE_MIN_DB_PER_MEGABYTE)
     common.check_output(args.output, args.overwrite)
     chosen = _options(args)
     scene, metadata = _load(args)

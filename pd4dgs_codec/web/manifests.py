@@ -257,5 +257,5 @@ def fragments(data: bytes) -> tuple[int, list[Fragment]]:
             samples = sum(struct.unpack_from(">I", data, run.content + 4)[0] for run in runs)
             result.append(Fragment(moof.start, mdat.end, samples))
     if not result:
-        raise DeliveryError("found an MP4 file without fragments, expected some")
+        raise DeliveryError("found no fragments in an MP4 file, expected some")
     return result[0].start, result
