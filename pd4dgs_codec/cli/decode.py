@@ -69,7 +69,7 @@ def _decode(args: argparse.Namespace, console: Console) -> int:
     elif kind == ".npz":
         common.write_bytes(args.output, _npz(scene, args.symbols), args.overwrite)
     if not complete:
-        console.message(f"pd4dgs-decode: warning: the input is truncated; decoded layers {_listed(scene.layers)}")
+        console.message(f"pd4dgs-decode: warning: the input is truncated; decoded layers: {_listed(scene.layers)}")
     result = _summary(scene, data, complete, seconds, args)
     console.result(result, _text(result), on_stdout=not args.output)
     return OK if complete else PARTIAL
@@ -124,11 +124,11 @@ def _summary(scene: Scene, data: bytes, complete: bool, seconds: float, args: ar
     from pd4dgs_codec.format.info import info
 
     described = {row["layer"]: row for row in info(data)["layers"]}
-    rows = []
+    rows, limit = [], min(len(data), args.max_bytes or len(data))
     for i, (layer, total) in enumerate(zip(scene.layers, scene.rows, strict=True)):
         slices = described[layer]["slices"]
         ends = [part["end"] for part in slices]
-        end = max(end for end in ends if end == ends[0] or args.max_bytes is None or end <= args.max_bytes)
+        end = max(end for end in ends if end == ends[0] or end <= limit)
         size = sum(part["bytes"] for part in slices if part["end"] <= end)
         anchors, active = total - (scene.rows[i - 1] if i else 0), int((scene.mask[i] > 0).sum())
         about = {"layer": layer, "offset": described[layer]["offset"], "bytes": size, "end": end}

@@ -156,13 +156,15 @@ def test_decoding_needs_no_torch_no_numba_and_for_a_local_file_no_network(scene_
     assert json.loads(done.stdout.splitlines()[0])["complete"] is True
 
 
-def test_max_bytes_stops_at_a_slice(cli, tmp_path):
+def test_max_bytes_and_a_truncated_file_stop_at_a_slice(cli, tmp_path):
     data, path = encode(make_scene(3, anchors=200), slices=2000, effort=1), tmp_path / "scene.pd4"
     path.write_bytes(data)
     ends = [part["end"] for row in info(data)["layers"] for part in row["slices"]]
     done = cli("decode", path, "--max-bytes", str(ends[1] + 3), "--json")
     assert (done.code, done.json["layers"][-1]["end"], done.json["complete"]) == (0, ends[1], True)
     assert done.json["anchors"] == len(decode(data, max_bytes=ends[1]).anchor_q)
+    done = cli("decode", "-", "--allow-partial", "--json", stdin=data[: ends[1] + 3])
+    assert (done.code, done.json["layers"][-1]["end"], done.json["complete"]) == (3, ends[1], False)
     done = cli("decode", path, "--max-bytes", str(ends[0] - 1))
     assert done.code == 1 and f"{ends[0] - 1} bytes end before the first slice" in done.err
     assert f"{ends[1]:,}".encode() in cli("info", path).out
