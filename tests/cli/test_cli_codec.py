@@ -163,8 +163,8 @@ def test_max_bytes_and_a_truncated_file_stop_at_a_slice(cli, tmp_path):
     done = cli("decode", path, "--max-bytes", str(ends[1] + 3), "--json")
     assert (done.code, done.json["layers"][-1]["end"], done.json["complete"]) == (0, ends[1], True)
     assert done.json["anchors"] == len(decode(data, max_bytes=ends[1]).anchor_q)
-    done = cli("decode", "-", "--allow-partial", "--json", stdin=data[: ends[1] + 3])
-    assert (done.code, done.json["layers"][-1]["end"], done.json["complete"]) == (3, ends[1], False)
+    done = cli("decode", "-", "--allow-partial", "--json", stdin=data[: ends[0] + 3])
+    assert (done.code, done.json["layers"][-1]["end"], done.json["complete"]) == (3, ends[0], False)
     done = cli("decode", path, "--max-bytes", str(ends[0] - 1))
     assert done.code == 1 and f"{ends[0] - 1} bytes end before the first slice" in done.err
     assert f"{ends[1]:,}".encode() in cli("info", path).out
