@@ -91,7 +91,7 @@ def test_short_runs_and_few_views_have_no_measured_phases(dataset, tmp_path, req
     trainer = trainer_of(views, 12, prune=0.5, grading=0.5)
     assert not held_back_views(trainer.learner)
     records = records_of(trainer, tmp_path)
-    assert not any({"left_model", "step_classes", "judged_psnr"} & set(record) for record in records)
+    assert not any({"left_model", "step_classes", "level_gains"} & set(record) for record in records)
     request.getfixturevalue("short_runs_have_phases")
     assert held_back_views(trainer.learner) == {8, 24, 40, 56}
     for off in ({"keep_layers": True}, {"max_layer": 0}, {"rollout": "top"}):
@@ -277,8 +277,8 @@ def test_a_scene_that_needs_no_anchor_keeps_some(dataset, monkeypatch, rollout):
 # -- selection of levels -----------------------------------------------------------------------------------------------
 
 
-def judged(dataset, monkeypatch, least):
-    """(a learner after its levels were judged with `least` as what they need, its parameters and moments before)."""
+def selected(dataset, monkeypatch, least):
+    """(a learner after selecting levels, which need a gain of `least`; its parameters and moments before)."""
     for name in ("MIN_GAIN_1", "MIN_GAIN_2"):
         monkeypatch.setattr(levels, name, least)
     monkeypatch.setattr(levels, "SHARE_2", min(least, 0.0))
@@ -289,7 +289,7 @@ def judged(dataset, monkeypatch, least):
             for parameter in field.weights:
                 parameter.add_(0.1)
         learner.model.mask_logits[:, 0] -= 3.0
-    learner.iteration = 21  # past the place where a step judges them
+    learner.iteration = 21  # past the step that selects levels
     for _ in range(2):
         learner.step()
     before = [p.detach().clone() for p in learner.optimiser.parameters]
@@ -300,7 +300,7 @@ def judged(dataset, monkeypatch, least):
 
 @pytest.mark.usefixtures("short_runs_have_phases")
 def test_the_practice_of_a_level_below_one_that_stays_is_undone(dataset, monkeypatch):
-    learner, before, moments = judged(dataset, monkeypatch, -math.inf)
+    learner, before, moments = selected(dataset, monkeypatch, -math.inf)
     assert learner.model.level == 2 and learner.levels.left_out == []
     assert all(map(torch.equal, learner.optimiser.parameters, before))
     assert all(torch.equal(m["exp_avg"], b) for m, b in zip(learner.optimiser.moments.values(), moments, strict=True))
@@ -309,7 +309,7 @@ def test_the_practice_of_a_level_below_one_that_stays_is_undone(dataset, monkeyp
 @pytest.mark.usefixtures("short_runs_have_phases")
 def test_a_level_that_changes_no_picture_and_stays_leaves_the_model_as_it_is(dataset, monkeypatch):
     monkeypatch.setattr(levels, "MIN_PIXELS", math.inf)
-    learner, before, _ = judged(dataset, monkeypatch, -math.inf)
+    learner, before, _ = selected(dataset, monkeypatch, -math.inf)
     assert learner.model.level == 2 and all(map(torch.equal, learner.optimiser.parameters, before))
 
 
@@ -327,7 +327,7 @@ def test_steps_since_a_snapshot_are_undone_as_often_as_needed(dataset):
 
 @pytest.mark.usefixtures("short_runs_have_phases")
 def test_levels_without_gain_go_from_the_top_and_leave_their_anchors(dataset, monkeypatch):
-    learner, before, _ = judged(dataset, monkeypatch, math.inf)
+    learner, before, _ = selected(dataset, monkeypatch, math.inf)
     assert [row["level"] for row in learner.levels.left_out] == [2, 1] and learner.model.level == 0
     assert learner.model.masks(0).mean() > torch.sigmoid(before[3][:, 0]).mean() + 0.2
 
