@@ -20,7 +20,7 @@ from pd4dgs_codec.model.networks import EXACT, Rounding
 from pd4dgs_codec.model.picture import draw, render_image
 from pd4dgs_codec.scene import ATTRIBUTES, Camera, Scene
 
-Place = tuple[Camera, float]  #: a camera and a normalised time
+Viewpoint = tuple[Camera, float]  #: a camera and a normalised time
 
 #: Random pictures of signs per view for each estimate.
 PROBES = 2
@@ -145,11 +145,11 @@ STAY, FEW = 0.8, 64
 
 
 def utility(
-    scene: Scene, places: Sequence[Place], step: Callable[[], None] = lambda: None, fewest: int = 0
+    scene: Scene, viewpoints: Sequence[Viewpoint], step: Callable[[], None] = lambda: None, fewest: int = 0
 ) -> np.ndarray:
-    """Ranks the n anchors of the highest layer by the gain per byte of the pictures at `places` (times 0..1), with all
-    earlier layers present. Returns float64 [n], higher for anchors that should come earlier, 0 for anchors that reach
-    no picture. step is called after each round.
+    """Ranks the n anchors of the highest layer by the gain per byte of the pictures at `viewpoints` (times 0..1), with
+    all earlier layers present. Returns float64 [n], higher for anchors that should come earlier, 0 for anchors that
+    reach no picture. step is called after each round.
 
     Backward elimination: the anchors of least gain leave round by round, since the gain of an anchor depends on the
     others (it may hide them). The last `fewest` are equal. Omitting anchor i changes the squared error of a picture I
@@ -157,18 +157,18 @@ def utility(
     scales that goes from 1 to 0. The first term separates anchors that make up for absent ones from anchors that have
     become wrong.
     """
-    places = [(smaller(camera), time) for camera, time in places]
+    viewpoints = [(smaller(camera), time) for camera, time in viewpoints]
     level, first = scene.level, scene.rows[-2] if len(scene.rows) > 1 else 0
     bits = layer_symbols(scene, len(scene.layers) - 1).bits_per_row()
     rank, alive = np.zeros(len(bits)), np.ones(len(bits), bool)
     whole = from_scene(scene)
-    references = [torch.from_numpy(render_image(whole, level, time, camera)) for camera, time in places]
+    references = [torch.from_numpy(render_image(whole, level, time, camera)) for camera, time in viewpoints]
     generator, rounds = torch.Generator().manual_seed(0), 0
     while alive.sum() > fewest:
         rows = np.flatnonzero(alive)
         model = from_scene(without(scene, first + np.flatnonzero(~alive)))
         gain, met = np.zeros(len(rows)), np.zeros(len(rows), bool)
-        for (camera, time), reference in zip(places, references, strict=True):
+        for (camera, time), reference in zip(viewpoints, references, strict=True):
             linear, square, near = anchor_slopes(model, level, time, camera, generator, reference)
             gain += (square - 2 * linear).numpy()[first:]
             met |= near.numpy()[first:]

@@ -190,8 +190,8 @@ class _Pictures:
             planned = plan(scene, options)
             left_out = [*left_out, *planned.left_out]
             with self.progress("ordering anchors") as step:
-                places = [(frame.camera, frame.time) for frame in frames]
-                scene, values = in_order(planned.scene, places, options, step, passing=passing)
+                viewpoints = [(frame.camera, frame.time) for frame in frames]
+                scene, values = in_order(planned.scene, viewpoints, options, step, passing=passing)
 
             def order(_: Scene) -> np.ndarray:
                 return values

@@ -12,7 +12,7 @@ from pd4dgs_codec.format.registry import LAYER_KINDS
 from pd4dgs_codec.format.symbols import layer_symbols
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.picture import render_image
-from pd4dgs_codec.model.sensitivity import Place, smaller, utility, without
+from pd4dgs_codec.model.sensitivity import Viewpoint, smaller, utility, without
 from pd4dgs_codec.scene import Scene
 
 #: A layer's bytes are divided into so many parts; the next layer may begin after any of them.
@@ -21,7 +21,7 @@ PARTS = 16
 
 def in_order(
     scene: Scene,
-    places: Sequence[Place],
+    viewpoints: Sequence[Viewpoint],
     options: EncodeOptions,
     step: Callable[[], None] = lambda: None,
     *,
@@ -30,18 +30,18 @@ def in_order(
     """Orders the anchors of a planned scene. Returns the scene in file order, with some anchors passed to the next
     layer, and float64 [N], the utility of each anchor in its layer, see `utility`.
 
-    A layer keeps its most useful anchors until the next layer's planes and networks improve the pictures at `places`
-    more per byte than its own next anchors; with `passing` the other anchors pass. The highest level is unchanged. step
-    is called after each round of `utility`.
+    A layer keeps its most useful anchors until the next layer's planes and networks improve the pictures at
+    `viewpoints` more per byte than its own next anchors; with `passing` the other anchors pass. The highest level is
+    unchanged. step is called after each round of `utility`.
     """
-    shots = [(smaller(camera), time) for camera, time in places]
-    whole, found = _pictures(scene, scene.level, shots), list[np.ndarray]()
+    viewpoints = [(smaller(camera), time) for camera, time in viewpoints]
+    whole, found = _pictures(scene, scene.level, viewpoints), list[np.ndarray]()
     for index, layer in enumerate(scene.layers):
-        own = utility(scene.prefix(layer), shots, step)
+        own = utility(scene.prefix(layer), viewpoints, step)
         if passing and layer < scene.level:
             order = np.argsort(-own, kind="stable")
             first = scene.rows[index] - len(own)
-            kept, others = np.split(order, [_enough(scene, index, first + order, shots, whole, options)])
+            kept, others = np.split(order, [_enough(scene, index, first + order, viewpoints, whole, options)])
             voxels = scene.anchor_q[first + kept]
             scene, _ = in_file_order(passed(scene, index, first + others), scene.layers)
             by_voxel = np.lexsort(scene.anchor_q[first : first + len(kept)].T)
@@ -54,7 +54,7 @@ def _enough(
     scene: Scene,
     index: int,
     order: np.ndarray,
-    shots: Sequence[Place],
+    viewpoints: Sequence[Viewpoint],
     whole: Sequence[np.ndarray],
     options: EncodeOptions,
 ) -> int:
@@ -66,7 +66,7 @@ def _enough(
         """Returns the pictures' squared error at `level` with `count` of the anchors and none of later layers."""
         prefix = scene.prefix(level)
         later = np.arange(scene.rows[index], prefix.rows[-1])
-        shown = _pictures(without(prefix, np.concatenate([order[count:], later])), level, shots)
+        shown = _pictures(without(prefix, np.concatenate([order[count:], later])), level, viewpoints)
         return float(sum(np.square(a - b).sum() for a, b in zip(shown, whole, strict=True)))
 
     motion = tensor_bytes(scene.tensors(above), LAYER_KINDS[above], scene.steps, options)
@@ -83,7 +83,7 @@ def _enough(
     return len(order)
 
 
-def _pictures(scene: Scene, level: int, shots: Sequence[Place]) -> list[np.ndarray]:
+def _pictures(scene: Scene, level: int, viewpoints: Sequence[Viewpoint]) -> list[np.ndarray]:
     """Renders the pictures [H, W, 3] at `level`."""
     model = from_scene(scene)
-    return [render_image(model, level, time, camera) for camera, time in shots]
+    return [render_image(model, level, time, camera) for camera, time in viewpoints]

@@ -12,7 +12,7 @@ from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.model.sensitivity import utility
 from pd4dgs_codec.quality.slicing import in_order
 
-PLACES = [(camera_ahead(3.0, 20.0, 24, 16), time) for time in (0.0, 0.5, 1.0)]
+VIEWPOINTS = [(camera_ahead(3.0, 20.0, 24, 16), time) for time in (0.0, 0.5, 1.0)]
 OPTIONS = EncodeOptions(effort=1)
 
 
@@ -34,7 +34,7 @@ def moving(by):
 @pytest.mark.parametrize("seed", range(3))
 def test_the_highest_level_stays_and_masks_rise(seed):
     scene = planned(seed)
-    found, values = in_order(scene, PLACES, OPTIONS)
+    found, values = in_order(scene, VIEWPOINTS, OPTIONS)
     assert values.shape == scene.anchor_q.shape[:1] and found.rows[-1] == scene.rows[-1]
     for before, after in zip(by_voxel(scene), by_voxel(found), strict=True):
         np.testing.assert_array_equal(before, after)
@@ -49,22 +49,22 @@ def test_the_highest_level_stays_and_masks_rise(seed):
 def test_values_belong_to_the_anchors_in_the_order_of_a_file():
     """Morton order depends on which anchors a layer has."""
     scene = moving(3.0)
-    found, values = in_order(scene, PLACES, OPTIONS)
+    found, values = in_order(scene, VIEWPOINTS, OPTIONS)
     assert 0 < found.rows[0] < found.rows[1]
-    of_voxel = dict(zip(map(tuple, scene.anchor_q.tolist()), utility(scene.prefix(0), PLACES), strict=True))
+    of_voxel = dict(zip(map(tuple, scene.anchor_q.tolist()), utility(scene.prefix(0), VIEWPOINTS), strict=True))
     own = [of_voxel[voxel] for voxel in map(tuple, found.anchor_q[: found.rows[0]].tolist())]
     np.testing.assert_array_equal(values[: found.rows[0]], own)
     assert sorted(own) == sorted(of_voxel.values())[-len(own) :]
-    np.testing.assert_array_equal(values[found.rows[0] :], utility(found, PLACES))
+    np.testing.assert_array_equal(values[found.rows[0] :], utility(found, VIEWPOINTS))
 
 
 def test_motion_of_everything_comes_before_most_anchors_and_motion_of_nothing_after_all():
     far, still = moving(3.0), moving(0.0)
-    assert in_order(far, PLACES, OPTIONS)[0].rows[0] < 0.3 * far.rows[0]
-    assert in_order(still, PLACES, OPTIONS)[0].rows == still.rows
+    assert in_order(far, VIEWPOINTS, OPTIONS)[0].rows[0] < 0.3 * far.rows[0]
+    assert in_order(still, VIEWPOINTS, OPTIONS)[0].rows == still.rows
 
 
 def test_anchors_stay_where_they_may_not_pass():
     scene = moving(3.0)
-    found, _ = in_order(scene, PLACES, OPTIONS, passing=False)
+    found, _ = in_order(scene, VIEWPOINTS, OPTIONS, passing=False)
     assert found is scene
