@@ -128,6 +128,7 @@ def _scan(args: argparse.Namespace, console: Console) -> int:
 
 def _batch(args: argparse.Namespace, console: Console) -> int:
     options.conditional(args, args.on != "local", "needs --on ray or slurm", gpus=0)
+    options.conditional(args, args.on != "local" or args.workers != 0, "has no effect with --workers 0", timeout=None)
     options.conditional(args, args.on == "ray", "needs --on ray", address=None)
     options.conditional(args, args.on == "slurm", "needs --on slurm", slurm=[])
     cores = args.threads or available()

@@ -66,6 +66,7 @@ CASES = [
         for option in ("--port 0", "--rate 2M", "--latency 0")
     ),
     *((2, f"batch m.jsonl -o out --op encode {option}", "needs --on") for option in ("--gpus 1", "--address a:1")),
+    (2, "batch m.jsonl -o out --op encode --workers 0 --timeout 9s", "--timeout has no effect with --workers 0"),
     (2, "batch m.jsonl -o out --op encode --on ray --slurm cluster=local", "--slurm needs --on slurm"),
     (2, "prepare kept.gif -o out --fps 5", "--fps needs a folder of frames"),
     (2, "train synthetic:local -o m.pt --rollout top --key-instant 0", "--key-instant needs --rollout key"),
