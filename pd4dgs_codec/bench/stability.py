@@ -86,7 +86,7 @@ def counts(rows: Sequence[Row]) -> dict[str, int]:
 
 def text(rows: Sequence[Row]) -> str:
     """Formats the rows as one Markdown table per group, and a line with the counts."""
-    head, parts = ("case", "fed", "promised", "got", "error", "bound", "status"), []
+    head, parts = ("case", "input", "promise", "result", "error", "bound", "status"), []
     for group in dict.fromkeys(row["group"] for row in rows):
         cells = [
             [*(r[key].replace("|", "\\|") for key in ("case", "fed", "promised", "got"))]

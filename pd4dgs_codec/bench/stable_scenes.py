@@ -377,7 +377,7 @@ PROMISES = [
     Promise("training", TRAINED, lambda how: _run(_trainer(**how)), [
         ("an ordinary run", "six views of a synthetic scene", {}),
         ("learning rates times 1e4", "every learning rate times 10,000", {"factor": 1e4}),
-        ("a single Gaussian", "one anchor, of whose Gaussians one is seen", {"anchors": 1, "prepare": _single}),
+        ("a single Gaussian", "one anchor with one visible Gaussian", {"anchors": 1, "prepare": _single}),
         ("10^6 between scales", "Gaussians and offsets of 1 and of 1e-6 scene units", {"prepare": _two_scales}),
         ("one instant", "six views with one time stamp, time range 0",
          {"view": {"time": 0.0}, "time_range": (2.0, 2.0)}),

@@ -261,12 +261,12 @@ RATES = "sigma/Q 1e-8..1e8, |a - mu|/sigma up to 1e6"
 #: (name, dtype, bound, where it holds)
 TYPES = (("float64", torch.float64, 1e-9, ""), ("float32", torch.float32, 1e-4, " where P >= 1e-30"))
 LOSSLESS = "every symbol decoded, with any priors and effort"
-NO_STEP, IN_OFFSETS = "a step that is no positive normal binary32", "among the offsets of a scene"
+NO_STEP, IN_OFFSETS = "a step that is not a positive normal binary32", "among the offsets of a scene"
 
 PROMISES = [
     *(Promise("rate", f"within {bound:g} of mpmath relative to max(1, |x|){where}", _value_and_gradients,
               [(f"ln P and gradients, {name}", RATES, dtype)], bound) for name, dtype, bound, where in TYPES),
-    *(Promise("rate", f"bits are min(R, 19.93), and beyond the clip slope as R does, within {bound:g}", _bits_and_slope,
+    *(Promise("rate", f"bits min(R, 19.93), gradient of R beyond the clip, within {bound:g}", _bits_and_slope,
               [(f"clipped bits, {name}", RATES, dtype)], bound) for name, dtype, bound, _ in TYPES),
     Promise("rate", "value and gradients finite", _not_finite,
             [(f"finite, {name}", RATES, dtype) for name, dtype, _, _ in TYPES]),

@@ -140,7 +140,7 @@ def refuse(error):
         (lambda: ("fine", 0.0), EncodeError, "fail"),
     ],
 )
-def test_judgement(measure, refuses, status):
+def test_the_status_of_a_row(measure, refuses, status):
     promise = stability.Promise("group", "promised", measure, (), 1.0, refuses)
     assert stability.run_case(promise, ("name", "fed"))["status"] == status
 

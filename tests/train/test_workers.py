@@ -19,7 +19,7 @@ from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import PRESETS
 from pd4dgs_codec.train import workers
 
-#: Trains the folder given as argument in the tiny size of the tests, so long that anchors grow and are judged. No
+#: Trains the folder given as argument in the tiny size of the tests, so long that anchors grow. No
 #: thread that talks to others may be left: one that meets the end of the interpreter aborts the process.
 PROGRAM = """
 import sys
