@@ -14,6 +14,7 @@ from pd4dgs_codec.entropy import channels
 from pd4dgs_codec.errors import DataError, EncodeError
 from pd4dgs_codec.format import quantise
 from pd4dgs_codec.model import hexplane, networks, rate, reference
+from pd4dgs_codec.threads import one_torch_thread
 
 KEYS = {"case", "group", "fed", "promised", "got", "error", "bound", "status"}
 GROUPS = ("rate", "fitting", "quantiser", "masks", "hexplane", "deformation", "rasteriser", "training")
@@ -21,10 +22,8 @@ GROUPS = ("rate", "fitting", "quantiser", "masks", "hexplane", "deformation", "r
 
 @pytest.fixture(autouse=True)
 def _one_torch_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
+    with one_torch_thread():
+        yield
 
 
 def failed(name):
