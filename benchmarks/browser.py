@@ -30,7 +30,7 @@ FLAGS = [
     "--enable-precise-memory-info",
 ]
 #: A busy machine may take long over a picture; only a hang takes this long, milliseconds.
-PATIENCE_MS = 120_000
+TIMEOUT_MS = 120_000
 #: Other viewers, by the name of their harness in player/test-browser/, and what it imports of player/node_modules.
 VIEWERS = {
     "spark": ("three", "@sparkjsdev/spark"),

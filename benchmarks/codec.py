@@ -171,7 +171,7 @@ def speed_text(rows: Sequence[Row]) -> str:
 GAUSS_PARAMETERS = 16
 
 
-def measure_rivals(run: Run, scene: Scene) -> list[Row]:
+def measure_coders(run: Run, scene: Scene) -> list[Row]:
     """A row per part of the file: its bytes, and those of other lossless coders of the same integers."""
     file = run.packed(scene)
     arrays = file.with_name("symbols.npz")
@@ -247,7 +247,7 @@ def draco_bytes(cells: np.ndarray) -> int:
     return len(data)
 
 
-def rivals_text(rows: Sequence[Row]) -> str:
+def coders_text(rows: Sequence[Row]) -> str:
     """A row per scene and part."""
     cells = [
         (r["scene"], r["part"], number(r["symbols"], 0), number(r["ours"], 0))
@@ -330,6 +330,6 @@ def batch_text(rows: Sequence[Row]) -> str:
 ERROR = Benchmark("error-time", "Error against run time", ONE, measure_error, error_text, error_pictures)
 STABILITY = Benchmark("stability", "Extreme cases", (), measure_stability, stability_text)
 SPEED = Benchmark("speed", "Speed", TWO, measure_speed, speed_text)
-RIVALS = Benchmark("rivals", "Other coders", TWO, measure_rivals, rivals_text)
+CODERS = Benchmark("rivals", "Other coders", TWO, measure_coders, coders_text)
 EXPORT = Benchmark("export", "Exported files", ("orbit",), measure_export, export_text)
 BATCH = Benchmark("batch", "Batches", ONE, measure_batch, batch_text)

@@ -140,7 +140,7 @@ class Run:
         if kept.get("made_by") == made_by and kept["finished"] and path.is_file():
             return path, kept
         say(f"training {path}")
-        train = command if self.quick else command_apart
+        train = command if self.quick else command_in_subprocess
         if kept.get("made_by") == made_by and path.is_file():
             result = train("train", scene.source, "-o", path, "--resume", path, "--log", log, "-j", 1)
         else:
@@ -195,7 +195,7 @@ def command(name: str, *arguments: object) -> Row:
     return result
 
 
-def command_apart(name: str, *arguments: object) -> Row:
+def command_in_subprocess(name: str, *arguments: object) -> Row:
     """The same in a process of its own. What it says on stderr is kept for its error alone."""
     words = [sys.executable, "-m", "pd4dgs_codec", name, *map(str, arguments), "--json"]
     done = subprocess.run(words, capture_output=True, text=True, cwd=ROOT)
@@ -215,7 +215,7 @@ def levels(scene: Scene, file: Path) -> list[Row]:
     return [{"bytes": row["cumulative_bytes"]} | {key: row[key] for key in kept if key in row} for row in found]
 
 
-def present(names: Sequence[str]) -> Iterator[Scene]:
+def available(names: Sequence[str]) -> Iterator[Scene]:
     """The scenes of these names whose data are on this machine; the others are named on stderr."""
     for name in names:
         if SCENES[name].there:

@@ -10,7 +10,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from browser import PATIENCE_MS, launched
+from browser import TIMEOUT_MS, launched
 from common import ONE, TWO, Benchmark, Row, Run, Scene, command, levels, number, seconds_at, table
 
 from pd4dgs_codec.bench.latency import python
@@ -164,7 +164,7 @@ def measure_player(run: Run, scene: Scene) -> list[Row]:
         with served(folder) as url:
             page = opened(browser)
             page.goto(f"{url}?bench&sizes={SIZES}")
-            page.wait_for_function("!!window.benchResult", timeout=5 * PATIENCE_MS)
+            page.wait_for_function("!!window.benchResult", timeout=5 * TIMEOUT_MS)
             rows += [{"what": "rate"} | row for row in page.evaluate("benchResult.rows")]
             page.context.close()
         version = f"Chromium {browser.version.split('.')[0]}"
@@ -174,7 +174,7 @@ def measure_player(run: Run, scene: Scene) -> list[Row]:
 def opened(browser: Any) -> Any:
     """A page with nothing in its caches."""
     context = browser.new_context(viewport={"width": 480, "height": 360})
-    context.set_default_timeout(PATIENCE_MS)
+    context.set_default_timeout(TIMEOUT_MS)
     return context.new_page()
 
 

@@ -31,7 +31,7 @@ import paper
 import quality
 import refining_gif
 import selection
-from common import QUICK, ROOT, SCENES, Benchmark, Row, Run, commit, git, present, say
+from common import QUICK, ROOT, SCENES, Benchmark, Row, Run, available, commit, git, say
 from page import write
 
 from pd4dgs_codec.bench.report import machine, machine_line
@@ -44,7 +44,7 @@ ALL = (
     paper.PAPER,
     paper.DIAL,
     codec.STABILITY,
-    codec.RIVALS,
+    codec.CODERS,
     codec.SPEED,
     codec.ERROR,
     delivery.LATENCY,
@@ -62,7 +62,7 @@ def section(benchmark: Benchmark, run: Run, names: Sequence[str], made: Row) -> 
     """Measures one benchmark: its figures, and what they were made with (`made`: commit and command)."""
     scenes: list[Any] = [None]
     if benchmark.scenes:
-        scenes = [QUICK] if run.quick else list(present([n for n in benchmark.scenes if n in names]))
+        scenes = [QUICK] if run.quick else list(available([n for n in benchmark.scenes if n in names]))
     if not scenes:
         raise DataError(f"{benchmark.name}: found none of the scenes {', '.join(benchmark.scenes)}")
     start, rows = time.monotonic(), []
@@ -81,7 +81,7 @@ def section(benchmark: Benchmark, run: Run, names: Sequence[str], made: Row) -> 
     }
 
 
-def aged(sections: Sequence[Row]) -> list[str]:
+def outdated(sections: Sequence[Row]) -> list[str]:
     """A line for every section whose measured code has changed since it was made."""
     lines, measured = [], {benchmark.name: benchmark.measured for benchmark in ALL}
     for name, made in ((found["name"], found["commit"]) for found in sections):
@@ -147,7 +147,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     stored = docs / "figures" / "results.json"
     kept = {found["name"]: found for found in json.loads(stored.read_text())["sections"]} if stored.is_file() else {}
     if args.check:
-        lines = aged(list(kept.values()))
+        lines = outdated(list(kept.values()))
         print("\n".join(lines or ["no section's measured code has changed"]))
         return bool(lines)
     run.images.mkdir(parents=True, exist_ok=True)

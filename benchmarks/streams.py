@@ -23,7 +23,7 @@ from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-from browser import PATIENCE_MS, PLAYER, launched
+from browser import PLAYER, TIMEOUT_MS, launched
 from common import peak_bytes
 
 from pd4dgs_codec import decode, open_stream
@@ -102,7 +102,7 @@ def chromium(path: Path, way: str, size: int) -> tuple[float, int]:
     others = renderers()
     with served(path, size) as address, launched() as browser:
         page = browser.new_page()
-        page.set_default_timeout(PATIENCE_MS)
+        page.set_default_timeout(TIMEOUT_MS)
         page.goto(f"{address}/package.json")
         page.evaluate(
             """async ([way, size, url]) => {

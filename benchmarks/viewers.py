@@ -48,7 +48,7 @@ def draw(data: bytes, folder: Path) -> None:
         command("export", Path(name) / "scene.pd4", "-o", Path(name) / "still.ply", "--to", "ply")
         with browser.launched() as opened, code.running(), files.running():
             page = opened.new_page(viewport={"width": camera.width, "height": camera.height})
-            page.set_default_timeout(browser.PATIENCE_MS)
+            page.set_default_timeout(browser.TIMEOUT_MS)
             pictures = dict(taken(page, f"{code.url}player/", files.url, scene, camera, at))
     with whole_files([f"{folder / name}.jpg" for name in pictures], overwrite=True) as paths:
         for picture, path in zip(pictures.values(), paths, strict=True):

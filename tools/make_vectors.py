@@ -60,7 +60,7 @@ def files(found: list[Vector]) -> dict[str, bytes]:
     return {MANIFEST: manifest.encode(), **{v.name + SUFFIX: v.data for v in found}}
 
 
-def surprises(found: list[Vector]) -> Iterator[str]:
+def wrong_outcomes(found: list[Vector]) -> Iterator[str]:
     """One line per vector that the package does not decode as its table says."""
     names = [v.name for v in found]
     yield from (f"{name}: two vectors have this name" for name in sorted(set(names)) if names.count(name) > 1)
@@ -102,7 +102,7 @@ def main() -> int:
     arguments = parser.parse_args()
     found = list(vectors())
     wanted = files(found)
-    lines = list(differences(wanted, VECTORS) if arguments.check else surprises(found))
+    lines = list(differences(wanted, VECTORS) if arguments.check else wrong_outcomes(found))
     for line in lines:
         print(line, file=sys.stderr)
     if lines:

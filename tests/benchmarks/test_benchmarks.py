@@ -135,7 +135,7 @@ def test_a_command_that_fails_is_named():
     with pytest.raises(DataError, match="pd4dgs-info nowhere.pd4 --json: exit code 1, expected 0"):
         common.command("info", "nowhere.pd4")
     with pytest.raises(DataError, match=r"pd4dgs-info nowhere.pd4 --json: exit code 1: .*nowhere.pd4"):
-        common.command_apart("info", "nowhere.pd4")
+        common.command_in_subprocess("info", "nowhere.pd4")
 
 
 def test_trainings_side_by_side_are_those_that_are_measured(tmp_path, monkeypatch):
@@ -147,7 +147,7 @@ def test_trainings_side_by_side_are_those_that_are_measured(tmp_path, monkeypatc
         Path(words[words.index("-o") + 1]).touch()
         return {"finished": True}
 
-    monkeypatch.setattr(common, "command_apart", train)
+    monkeypatch.setattr(common, "command_in_subprocess", train)
     monkeypatch.setattr(common.os, "cpu_count", lambda: 1)
     here, jobs = Run(tmp_path, tmp_path), [Training(QUICK), Training(QUICK, longer=2), Training(QUICK)]
     here.train(jobs)
@@ -169,7 +169,7 @@ def test_sections_whose_code_has_changed_are_named(tmp_path, monkeypatch):
         return common.git("rev-parse", "--short=7", "HEAD")
 
     def named(section: str, commit: str) -> str:
-        return "".join(run.aged([{"name": section, "commit": commit}]))
+        return "".join(run.outdated([{"name": section, "commit": commit}]))
 
     first = commit("pd4dgs_codec/x.py", '"""Adds."""\na = 1\n')
     code = commit("pd4dgs_codec/x.py", '"""Adds."""\na = 2\n')

@@ -26,8 +26,8 @@ import numpy as np
 import pytest
 from browser import (
     ELEMENT,
-    PATIENCE_MS,
     PLAYER,
+    TIMEOUT_MS,
     call,
     check_packages,
     eyes_of_headset,
@@ -159,7 +159,7 @@ def server(folder: Path) -> Iterator[Server]:
 def context(browser: Any) -> Any:
     """What all pages share, since a new one takes seconds of CPU. Nothing here is kept from page to page."""
     context = browser.new_context(viewport={"width": 480, "height": 360})
-    context.set_default_timeout(PATIENCE_MS)
+    context.set_default_timeout(TIMEOUT_MS)
     return context
 
 

@@ -71,7 +71,7 @@ def outcome(function: Callable[..., Any], *args: Any, **options: Any) -> tuple[s
 
 @contextmanager
 def junk_in_new_memory() -> Iterator[None]:
-    """Within the block `numpy.empty` gives what a process can find there that has done other things, never zeros."""
+    """Within the block `numpy.empty` returns memory full of JUNK, as after other work of the process, never zeros."""
     empty = np.empty
 
     def filled(shape: Any, dtype: Any = float, **options: Any) -> np.ndarray:
@@ -150,19 +150,19 @@ def check_package(case: Case, rng: random.Random) -> str:
 
 
 def _other_entry_point(data: bytes, name: str, result: Any, rng: random.Random) -> None:
-    door = rng.randrange(4)
-    if door == 0:
+    entry = rng.randrange(4)
+    if entry == 0:
         other, found = outcome(streamed, data, rng)
         places = [(r.chunk, r.offset) if isinstance(r, DecodeError) else r for r in (result, found)]
         if other != name or places[1] != (result.layers if name == DECODED else places[0]):
             raise Finding("disagreement", f"decode ends in {name} at {places[0]}, a stream in {other} at {places[1]}")
-    elif door == 1:
+    elif entry == 1:
         other, found = outcome(decode_partial, data, allow_partial=True)
         if not (other == name or (name == "Truncated" and other == DECODED)):
             raise Finding("disagreement", f"decode ends in {name}, with allow_partial in {other}")
         if other == DECODED and found[1] != (name == DECODED):
             raise Finding("disagreement", f"decode ends in {name}, with allow_partial complete is {found[1]}")
-    elif door == 2:
+    elif entry == 2:
         other, _ = outcome(decode, data, max_layer=0)
         if other not in (DECODED, name):
             raise Finding("disagreement", f"decode ends in {name}, with max_layer=0 in {other}")
