@@ -88,8 +88,8 @@ def plan(scene: Scene, options: EncodeOptions = DEFAULTS) -> Plan:
         scene, dropped = _drop_heads(scene, LAYER_KINDS[layer])
         left_out += dropped
     kept = [layer for layer in scene.layers if layer == 0 or not auto or scene.deformation(layer) is not None]
-    arranged, inactive = in_file_order(scene, tuple(kept))
-    if inactive:
+    arranged, rows = in_file_order(scene, tuple(kept))
+    if inactive := scene.rows[-1] - len(rows):
         why = f"mask at or below the threshold at level {scene.level}"
         left_out.append(LeftOut(f"{inactive} anchors", why, anchors=inactive))
     symbols = SceneSymbols.of(arranged)
@@ -144,8 +144,9 @@ def passed(scene: Scene, index: int, rows: np.ndarray) -> Scene:
     return replace(scene, rows=(scene.rows[-1],) * len(masks), mask=tuple(masks))
 
 
-def in_file_order(scene: Scene, kept: tuple[int, ...]) -> tuple[Scene, int]:
-    """Returns (scene with the layers `kept` and rows sorted by (layer, Morton order), number of anchors dropped)."""
+def in_file_order(scene: Scene, kept: tuple[int, ...]) -> tuple[Scene, np.ndarray]:
+    """Returns (scene with the layers `kept` and rows sorted by (layer, Morton order), int64 [n], rows of the given
+    scene in this order). Anchors with masks of 0 in all of these layers are dropped."""
     codes = scene.full_masks()
     by_layer = dict(zip(scene.layers, codes, strict=True))
     masks = np.stack([*(by_layer[layer] for layer in kept[:-1]), codes[-1]])
@@ -159,7 +160,7 @@ def in_file_order(scene: Scene, kept: tuple[int, ...]) -> tuple[Scene, int]:
         scene = replace(scene, grading=None)
     masks_of = tuple(m[order][:n] for m, n in zip(masks, rows, strict=True))
     arranged = replace(scene, layers=kept, rows=rows, mask=masks_of, **scene.of_anchors(order))
-    return arranged, scene.rows[-1] - order.size
+    return arranged, order
 
 
 def _without_unread(scene: Scene, symbols: SceneSymbols) -> tuple[Scene, SceneSymbols, list[LeftOut]]:

@@ -42,10 +42,8 @@ def in_order(
             order = np.argsort(-own, kind="stable")
             first = scene.rows[index] - len(own)
             kept, others = np.split(order, [_enough(scene, index, first + order, viewpoints, whole, options)])
-            voxels = scene.anchor_q[first + kept]
-            scene, _ = in_file_order(passed(scene, index, first + others), scene.layers)
-            by_voxel = np.lexsort(scene.anchor_q[first : first + len(kept)].T)
-            own = own[kept[np.lexsort(voxels.T)]][np.argsort(by_voxel)]
+            scene, rows = in_file_order(passed(scene, index, first + others), scene.layers)
+            own = own[rows[first : first + len(kept)] - first]
         found.append(own)
     return scene, np.concatenate(found)
 
