@@ -127,13 +127,13 @@ class _Machine:
         elif name == "BUILD":
             self._build(*self._taken(1))
         elif name not in ("PROTO", "FRAME", "STOP"):
-            raise Refused(f"the pickle has the operation {name}")
+            raise Refused(f"the pickle uses the operation {name}")
 
     def _taken(self, count: int | None) -> list[Any]:
         """Pops the last `count` values of the stack, or all values since the last mark if `count` is None."""
         start = self.marks.pop() if count is None else len(self.stack) - count
         if start < 0:
-            raise Refused("a pickle that ends in its middle")
+            raise Refused("the pickle is truncated")
         values = self.stack[start:]
         del self.stack[start:]
         return values
@@ -146,7 +146,7 @@ class _Machine:
             self.storages[key] = self._read(f"data/{key}")
         values = np.frombuffer(self.storages[key], dtype)
         if len(values) != count:
-            raise Refused(f"a storage of {len(values)} numbers that should hold {one_line(str(count), 24)}")
+            raise Refused(f"a storage of {len(values)} numbers, expected {one_line(str(count), 24)}")
         return values
 
     def _call(self, what: Any, values: Any) -> Any:
@@ -158,14 +158,14 @@ class _Machine:
             return values[0]
         if isinstance(what, Name) and what.module.startswith("__torch__."):
             return Module(what.name)
-        raise Refused("the pickle makes something of what is no class")
+        raise Refused("the pickle calls something other than a class of tensors or modules")
 
     def _build(self, state: Any) -> None:
         """Sets the members of a module. Ignores those of an OrderedDict, which are torch's own metadata."""
         if isinstance(self.stack[-1], Module) and isinstance(state, dict):
             self.stack[-1].members.update(state)
         elif not isinstance(self.stack[-1], dict):
-            raise Refused("the pickle gives members to what is no module, or no members")
+            raise Refused("the pickle sets the state of something other than a module")
 
     def _tensor(self, storage: np.ndarray, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: Any) -> Any:
         """Returns `made` of a view of the storage."""
@@ -174,10 +174,10 @@ class _Machine:
         last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True)) if whole and count else offset
         # each axis is bounded even if another is empty: a caller may allocate an array of its length
         if not whole or count > len(storage) or (count and last >= len(storage)) or max(size, default=0) > self.size:
-            raise Refused("a tensor that reaches beyond its storage")
+            raise Refused("a tensor extends beyond its storage")
         self.left -= count * storage.itemsize
         if self.left < 0:
-            raise Refused("tensors of more bytes than the file")
+            raise Refused("the tensors take more bytes than the file")
         strides = tuple(step * storage.itemsize for step in stride)
         return self.made(np.lib.stride_tricks.as_strided(storage[offset:], tuple(size), strides, writeable=False))
 
@@ -188,7 +188,7 @@ def _known(module: str, name: str) -> Any:
         return np.dtype(STORAGES[name])
     found = Name(module, name)
     if found not in (ORDERED, TENSOR, PARAMETER) and not module.startswith("__torch__."):
-        raise Refused(f"the pickle asks for {one_line(f'{module}.{name}', 80)}")
+        raise Refused(f"the pickle imports {one_line(f'{module}.{name}', 80)}")
     return found
 
 
@@ -196,14 +196,14 @@ def _again(value: Any) -> Any:
     """Returns a reused value: a number, name, short string or short tuple. Others could turn few bytes to gigabytes."""
     parts = value if isinstance(value, tuple) and len(value) <= FEW else (value,)
     if not all(isinstance(v, (int, float, np.dtype)) or isinstance(v, str) and len(v) <= SHORT for v in parts):
-        raise Refused("a part that has two places")
+        raise Refused("the pickle uses an object twice")
     return value
 
 
 def _set(items: list[Any], target: Any) -> None:
     if not isinstance(target, dict) or len(items) % 2:
-        raise Refused("a pickle that sets items of what is no dict")
+        raise Refused("the pickle sets items of something other than a dict")
     for key in items[::2]:
         if not (isinstance(key, str) and len(key) <= SHORT or isinstance(key, int) and abs(key) <= MAX_KEY):
-            raise Refused(f"a key that is no short text or number: {one_line(repr(key), 60)}")
+            raise Refused(f"a key is neither a short string nor a number: {one_line(repr(key), 60)}")
     target.update(zip(items[::2], items[1::2], strict=True))

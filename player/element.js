@@ -321,7 +321,7 @@ export class Pd4Player extends HTMLElement {
     if (bytes) parts.push(`${size(bytes)}${loading && total ? ` of ${size(total)}` : ""}`);
     if (fps > 1) parts.push(`${fps} fps`);
     if (drawn && scale < 1) parts.push(`${Math.round(100 * scale)} %`);
-    if (drawn && software) parts.push("no GPU: the CPU draws, fewer pixels while the picture moves");
+    if (drawn && software) parts.push("no GPU: drawn by the CPU, with fewer pixels in motion");
     this._statusLine.textContent = parts.join(" · ");
 
     const whole = ends.filter(({ layer }, i) => layer !== ends[i + 1]?.layer); // of slices the last one

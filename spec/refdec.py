@@ -45,7 +45,7 @@ def need(ok, what, name="Malformed"):
 
 # 14 Limits: "A declared value over its limit is LimitExceeded, and nothing is allocated for it"
 def limited(value, high, what, low=0):
-    need(type(value) is int, f"{what} is no integer")
+    need(type(value) is int, f"{what} is not an integer")
     need(value <= high, f"{what} is {value}, limit {high}", "LimitExceeded")
     need(value >= low, f"{what} is {value}, expected at least {low}")
     return value
@@ -54,8 +54,8 @@ def limited(value, high, what, low=0):
 # 15 Errors and security: "UnsupportedFeature is an integer of whatever size and sign that is not a registered mode,
 # form of a section, predictor, network or prior family"
 def registered(value, known, what):
-    need(type(value) is int, f"{what} is no integer")
-    need(value in known, f"{what} is {value}", "UnsupportedFeature")
+    need(type(value) is int, f"{what} is not an integer")
+    need(value in known, f"{what} is {value}, which is not registered", "UnsupportedFeature")
     return value
 
 
@@ -72,7 +72,7 @@ class Reader:
 
     def take(self, count):
         part = self.data[self.at : self.at + count]
-        need(len(part) == count, f"{len(part)} bytes, expected {count} more")
+        need(len(part) == count, f"{len(part)} bytes are left, expected {count}")
         self.at += len(part)
         return part
 
@@ -186,8 +186,8 @@ def msgpack_items(reader, kind, size, depth):
     result, last = {}, None
     for _ in range(size):
         key = msgpack_value(reader, depth + 1)
-        need(type(key) is int and 0 <= key < 1 << 32, f"map key {key!r}")
-        need(last is None or key > last, f"map key {key} after {last}")
+        need(type(key) is int and 0 <= key < 1 << 32, f"map key {key!r}, expected an integer below 2^32")
+        need(last is None or key > last, f"map key {key} after {last}, expected ascending keys")
         result[key], last = msgpack_value(reader, depth + 1), key
     return result
 
@@ -200,9 +200,9 @@ def check_finite(value):
 # 4 Canonical msgpack: "a key under 64 that this text does not define is an UnsupportedFeature; unknown keys from 64
 # on MUST be ignored. A missing required key is Malformed"
 def fields(value, known, required, what):
-    need(type(value) is dict, f"{what} is no map")
+    need(type(value) is dict, f"{what} is not a map")
     unknown = [key for key in value if key not in known and key < 64]
-    need(not unknown, f"{what}: key {unknown}", "UnsupportedFeature")
+    need(not unknown, f"{what}: unknown critical key {unknown}", "UnsupportedFeature")
     missing = [key for key in required if key not in value]
     need(not missing, f"{what}: keys {missing} are missing")
     return value
@@ -224,7 +224,7 @@ def real(value, what):
 
 # 5.1 Header map: "Steps and voxel size MUST be positive normal binary32 values."
 def a_step(value):
-    need(value >= 2.0**-126, f"step {value!r}")
+    need(value >= 2.0**-126, f"step {value!r}, expected a normal binary32")
     return value
 
 
@@ -233,11 +233,11 @@ def read_preamble(data):
     need(SIGNATURE.startswith(data[:8]), "not a .pd4 file", "BadSignature")
     need(len(data) >= 20, "the file ends in the preamble", "Truncated")
     major, _, size, crc = struct.unpack_from("<HHII", data, 8)
-    need(major == 3, f"major version {major}", "UnsupportedVersion")
+    need(major == 3, f"major version {major}, expected 3", "UnsupportedVersion")
     limited(size, 1 << 14, "the header's length")
     need(len(data) >= 20 + size, "the file ends in the header", "Truncated")
     header = data[20 : 20 + size]
-    need(zlib.crc32(data[:16] + header) == crc, "CRC-32 of the header", "ChecksumMismatch")
+    need(zlib.crc32(data[:16] + header) == crc, "the header's CRC-32 differs", "ChecksumMismatch")
     return read_header(header), 20 + size
 
 
@@ -255,10 +255,10 @@ def read_header(data):
     for step in (*steps, voxel_size):
         a_step(step)
     need(all(a <= b for a, b in zip(box[:3], box[3:])), "a lower corner of the box above the upper one")
-    need(start <= end, f"time from {start} to {end}")
-    need(all(0 <= c <= 1 for c in background), f"background {background}")
-    need(0 <= near < far, f"near {near}, far {far}")
-    need(unit >= 0, f"unit {unit}")
+    need(start <= end, f"time range {start}..{end}, expected it to ascend")
+    need(all(0 <= c <= 1 for c in background), f"background {background}, expected 0..1")
+    need(0 <= near < far, f"near {near} and far {far}, expected 0 <= near < far")
+    need(unit >= 0, f"unit {unit}, expected 0 or more")
     if 12 in header:
         read_camera(header[12])
     read_error_bounds(header[13])
@@ -300,7 +300,7 @@ def read_camera(value):
     camera = fields(value, range(1, 5), range(1, 5), "camera")
     reals(camera[1], "camera matrix", 12)
     fx, fy, _, _ = reals(camera[2], "camera intrinsics", 4)
-    need(fx > 0 and fy > 0, f"focal lengths {fx} and {fy}")
+    need(fx > 0 and fy > 0, f"focal lengths {fx} and {fy}, expected both positive")
     for key in (3, 4):
         limited(camera[key], 65535, "camera size", 1)
 
@@ -309,7 +309,7 @@ def read_camera(value):
 def read_error_bounds(value):
     bounds = fields(value, range(8), range(4), "error bounds")
     for key in set(bounds) & set(range(8)):
-        need(real(bounds[key], f"error bound {key}") >= 0, f"error bound {key} is {bounds[key]}")
+        need(real(bounds[key], f"error bound {key}") >= 0, f"error bound {key} is {bounds[key]}, expected 0 or more")
 
 
 # 5.2 Chunk list: "The first type MUST be 0; the types of layers among all entries MUST NOT descend"
@@ -320,8 +320,8 @@ def read_chunk_list(rows):
         limited(kind, 65535, "a chunk type")
         limited(size, (1 << 31) - 1, "a payload's length")
     layers = [kind for kind, _ in rows if kind in range(3)]
-    need(rows[0][0] == 0, f"the first chunk is of type {rows[0][0]}")
-    need(layers == sorted(layers), f"layers {layers}")
+    need(rows[0][0] == 0, f"the first chunk has type {rows[0][0]}, expected 0")
+    need(layers == sorted(layers), f"layers {layers}, expected them to ascend")
 
 
 # 3.3 Scene identity: "the header from the end of its chunk list (the value of key 1, the first entry of the map)"
@@ -339,14 +339,14 @@ def read_chunk(data, at, kind, size, scene_id):
     need(len(data) >= at + 16, "the file ends in a chunk's head", "Truncated")
     found_kind, flags, found_size, found_id = struct.unpack_from("<HHI8s", data, at)
     limited(found_size, (1 << 31) - 1, "a payload's length")
-    need(found_size == size, f"payload of {found_size} bytes, listed {size}")
+    need(found_size == size, f"payload of {found_size} bytes, expected {size} as listed")
     end = at + 16 + size
     need(len(data) >= end + 4, "the file ends in a chunk", "Truncated")
     crc = struct.unpack_from("<I", data, end)[0]
-    need(zlib.crc32(data[at:end]) == crc, f"CRC-32 of the chunk at {at}", "ChecksumMismatch")
-    need(flags & 0b111100 == 0, f"flags {flags:#x}")
+    need(zlib.crc32(data[at:end]) == crc, f"the CRC-32 of the chunk at {at} differs", "ChecksumMismatch")
+    need(flags & 0b111100 == 0, f"flags {flags:#x}, expected reserved bits 0")
     need(flags & 1 == 0 or flags == 1, f"flags {flags:#x} of an ancillary chunk")
-    need(found_kind == kind, f"chunk type {found_kind}, listed {kind}")
+    need(found_kind == kind, f"chunk type {found_kind}, expected {kind} as listed")
     check_scene_id(found_id, scene_id)
     check_critical(kind, flags & 1)
     return data[at + 16 : end], flags, end + 4
@@ -402,7 +402,7 @@ def read_layer(payload, number, later, before, below, header, past):
     parameters = reader.take(limited(reader.number("<I"), 4096, "the parameters' length"))
     read_parameters(layer, unpack(parameters))
     parts = {section: reader.take(layer.sections[section]) for section in sorted(layer.sections)}
-    need(not reader.left, f"{reader.left} bytes behind the sections")
+    need(not reader.left, f"{reader.left} bytes after the sections")
     check_sizes(layer, len(payload), before)
     read_sections(layer, parts)
     return layer
@@ -416,11 +416,11 @@ def read_parameters(layer, value):
     sections = fields(parameters[2], range(6), (), "sections")
     layer.sections = {s: limited(sections[s], (1 << 31) - 1, "a section", 1) for s in sections if s < 64}
     if 6 in parameters:
-        need(layer.number and 5 in parameters and not layer.later, f"layer {layer.number} with a key instant")
+        need(layer.number and 5 in parameters and not layer.later, "a key instant without a deformation")
         limited(parameters[6], 65535, "the key instant")
-    found = {3, 4, 5} & set(parameters)
-    wanted = [set()] if layer.later else [{3, 4, 5}, set()] if layer.number else [{3, 5}]
-    need(found in wanted, f"layer {layer.number} with keys {found}")
+    found = sorted({3, 4, 5} & set(parameters))
+    wanted = [[]] if layer.later else [[3, 4, 5], []] if layer.number else [[3, 5]]
+    need(found in wanted, f"layer {layer.number} has keys {found}, expected one of {wanted}")
     layer.networks = read_networks(layer.number, layer.header, parameters[5]) if 5 in parameters else {}
     layer.deformed = bool(layer.networks) and layer.number > 0
     steps = reals(parameters[3], "steps", 1 + layer.deformed) if layer.networks else []
@@ -442,7 +442,7 @@ def read_scales(rows, below):
     for row in rows:
         a_list(row, "a scale", 11)
         limited(row[0], 256, "plane channels", 1)
-        need(row[0] == (below or rows)[0][0], "scales with different channels")
+        need(row[0] == (below or rows)[0][0], "scales have different numbers of channels")
         for side in row[1:5]:
             limited(side, 4096, "a plane's side", 1)
         for predictor in row[5:]:
@@ -457,14 +457,14 @@ def read_networks(number, header, rows):
     for row in a_list(rows, "networks"):
         need(a_list(row, "a network"), "an empty network")
         key = registered(row[0], known, "a network's id")
-        need(key > last, f"network {key} after {last}")
+        need(key > last, f"network {key} after {last}, expected ascending ids")
         limited(len(row) - 1, 16, "linear layers", 1)
         for width in row[1:]:
             limited(width, 4096, "a network's width", 1)
-        need(known[key] in (None, row[-1]), f"network {key} with {row[-1]} outputs")
+        need(known[key] in (None, row[-1]), f"network {key} has {row[-1]} outputs, expected {known[key]}")
         networks[key], last = row[1:], key
     if number == 0:
-        need(len(networks) == 3, f"networks {list(networks)} in layer 0")
+        need(len(networks) == 3, f"layer 0 has networks {list(networks)}, expected three")
     else:
         need(0 in networks, "a deformation without a trunk")
         need(len(networks) > 1, "a deformation without a head")
@@ -501,7 +501,7 @@ def weight_shapes(layer):
 def check_sizes(layer, payload_bytes, before):
     """before: N, S and L of the slices before it. Sets those with it."""
     samples = sum(c * h * w for _, _, (c, h, w) in plane_shapes(layer))
-    need(samples <= 1 << 28, f"{samples} plane samples", "LimitExceeded")
+    need(samples <= 1 << 28, f"{samples} plane samples, limit 2^28", "LimitExceeded")
     row = channel_count(layer.header) + 4 + (3 in layer.header)
     symbols = layer.rises + row * layer.rows + samples + sum(size for _, size in weight_shapes(layer))
     layer.declared = [a + b for a, b in zip(before, (layer.rows, symbols, payload_bytes))]
@@ -539,7 +539,7 @@ def read_sections(layer, parts):
                 channels[section] = decode_planes(data, [shape for _, _, shape in planes])
             else:
                 channels[section] = decode_channels(data, sizes, past.of(section))
-    need(not parts, f"sections {sorted(parts)} have nothing to code")
+    need(not parts, f"sections {sorted(parts)} are present for 0 symbols")
     keep_symbols(layer, positions, channels, planes, weights)
 
 
@@ -548,7 +548,7 @@ def read_sections(layer, parts):
 # Malformed."
 def keep_symbols(layer, positions, channels, planes, weights):
     rise, own = channels[MASKS]
-    need(all(v >= 0 for v in rise), "a mask code that falls")  # that neither is over 255 follows in finish_last
+    need(all(v >= 0 for v in rise), "a mask code decreases")  # that neither is over 255 follows in finish_last
     need(all(v >= 3 for v in own), "a mask code under 3")
     layer.symbols = {"anchor": [v for cell in positions for v in cell], "mask_rise": rise, "mask_own": own}
     first = 0
@@ -629,9 +629,9 @@ def histogram_table(heights, top, step):
 # be empty; its first word MUST NOT be 0."
 class Ans:
     def __init__(self, data):
-        need(len(data) % 4 == 0, "an ANS stream that is no multiple of 4 bytes")
+        need(len(data) % 4 == 0, "an ANS stream is not a multiple of 4 bytes")
         self.words, self.at, self.x = struct.unpack(f"<{len(data) // 4}I", data), 0, 0
-        need(not self.words or self.words[0], "an ANS stream that begins with 0")
+        need(not self.words or self.words[0], "an ANS stream begins with a zero word")
         while self.x < 1 << 32 and self.at < len(self.words):
             self.x = self.x << 32 | self.words[self.at]
             self.at += 1
@@ -674,7 +674,7 @@ def read_prior(reader, family):
     if family == 0:
         return Prior(kmin, 1, [0, TOTAL])
     n = 2 + reader.varint((1 << 14) - 2)
-    need(kmin + n - 1 <= K, "a window passes the largest symbol")
+    need(kmin + n - 1 <= K, "a window reaches beyond symbol K")
     if family == 3:
         return read_histogram(reader, Prior(kmin, n, None))
     mu8, si, floor = read_normal(reader, n)
@@ -727,14 +727,15 @@ def take_heights(stream, prior):
 # more exceptions than symbols, the symbol MUST lie in −K..K and its position within the channel, else Malformed."
 def read_exceptions(reader, count, prior):
     number = 1 + reader.varint(VARINT_MAX)
-    need(number <= min(count, reader.left // 2), f"{number} exceptions among {count} symbols")
+    most = min(count, reader.left // 2)
+    need(number <= most, f"{number} exceptions, expected at most {most}")
     result, at = {}, -1
     for _ in range(number):
         at += 1 + reader.varint(VARINT_MAX)
         c = reader.varint(4 * K + 2)
         value = prior.kmin - 1 - (c >> 1) if c & 1 else prior.end + (c >> 1)
-        need(at < count, f"an exception at {at} of {count}")
-        need(abs(value) <= K, f"an exception {value}")
+        need(at < count, f"an exception at symbol {at} of {count}")
+        need(abs(value) <= K, f"an exception of value {value}, limit K")
         result[at] = value
     return result
 
@@ -752,7 +753,7 @@ def decode_channels(data, counts, known=None):
     for count in counts:
         if count == 0:
             continue
-        need(count <= MAX_COUNT, f"a channel of {count} symbols", "LimitExceeded")
+        need(count <= MAX_COUNT, f"a channel of {count} symbols, limit {MAX_COUNT}", "LimitExceeded")
         token = reader.varint(2 * (MAX_COUNT + 8))
         if token >> 1 < 8:
             defined.append(read_prior(reader, token >> 1))
@@ -795,7 +796,7 @@ def decode_attributes(data, feature, slots, n, past, graded):
         return grades + decode_classes(reader.take(reader.left), [one] * (p + 3 * slots), 7 if graded else 1, known)
     if form == 1:
         past.block = read_block(reader, p, slots, graded)
-    need(past.block, "no slice before has a prediction block")
+    need(past.block, "no earlier slice has a prediction block")
     terms, class_counts, splits, scales = past.block
     own = [[64 >> c for c in grades[0]]] * 4 if graded else []  # four times the relative magnitude of one
     *stages, stage_y, stage_z = take_stages(reader, 8)
@@ -984,7 +985,7 @@ def classes_by_activity(activity, class_count):
 
 # 9.3 LZMA2: "A stream is a list of chunks, each behind its control byte, and ends with the control byte 0."
 def unpack_lzma(data, size):
-    need(size <= 1 << 31, f"{size} bytes under LZMA", "LimitExceeded")
+    need(size <= 1 << 31, f"{size} bytes uncompressed, limit 2^31", "LimitExceeded")
     reader, out, start, lzma = Reader(data), bytearray(), None, None
     while control := reader.byte():
         need(control <= 2 or control >= 0x80, f"LZMA2 control byte {control:#x}")
@@ -1005,7 +1006,7 @@ def unpack_lzma(data, size):
             lzma.reset()
         lzma.unpack(reader.take(length), out, start, end)
     need(len(out) >= size, f"an LZMA stream of {len(out)} bytes, expected {size}")
-    need(not reader.left, "bytes behind the end of an LZMA stream")
+    need(not reader.left, "bytes after the end of an LZMA stream")
     return bytes(out)
 
 
@@ -1150,7 +1151,7 @@ def decode_lzma_symbols(data, counts):
     planar = reader.bits(1)
     bases, forms = [], []
     for count in counts:
-        need(count <= MAX_COUNT, f"a channel of {count} symbols", "LimitExceeded")
+        need(count <= MAX_COUNT, f"a channel of {count} symbols, limit {MAX_COUNT}", "LimitExceeded")
         code = reader.varint(8 * K + 3) if count else 0
         need(code & 3 < 3, "a channel of 8-byte symbols")
         bases.append(unzigzag(code >> 2))
@@ -1178,12 +1179,12 @@ def decode_positions(data, count, known=None):
     levels = read_levels(reader, depth, count)
     sizes = [reader.varint(MAX_COUNT) for _ in range(2, 8)] if count > 1 else []
     several = sum(nodes - single for nodes, single in levels)
-    need(sum(sizes) <= several, f"{sum(sizes)} nodes with 2 to 7 children, {several} with more than one")
+    need(sum(sizes) <= several, f"{sum(sizes)} nodes with 2 to 7 children, expected at most {several}")
     channels = decode_channels(reader.take(reader.left), channel_lengths(levels, count) + sizes, known)
     nodes = grow(levels, iter(channels), count, sizes)
     for axis in range(3):
         need(min(node[axis] for node in nodes) == 0, "no anchor at the minimum")
-    need(max(v for node in nodes for v in node).bit_length() == depth, "the depth does not fit")
+    need(max(v for node in nodes for v in node).bit_length() == depth, "the offsets have another depth than declared")
     cells = [tuple(p + m for p, m in zip(node, low)) for node in nodes]
     need(all(v <= MAX_VOXEL for cell in cells for v in cell), "a voxel index over 2^20")
     return cells
@@ -1205,8 +1206,8 @@ def read_levels(reader, depth, count):
         )
         levels.append((nodes, single))
         nodes = 2 * nodes - single + more
-        need(nodes <= count, f"{nodes} nodes, {count} anchors")
-    need(nodes == count, f"{nodes} nodes at the end, {count} anchors")
+        need(nodes <= count, f"{nodes} nodes, expected at most {count}")
+    need(nodes == count, f"{nodes} nodes at the end, expected {count}")
     return levels
 
 
@@ -1236,12 +1237,12 @@ def grow(levels, channels, count, sizes):
         if nodes < count:
             of_one, of_more = within(next(channels), 8), within(next(channels), 8)
             children = [1 + next(of_one if only else of_more) for only in only_child]
-            need(children.count(1) == single, f"{children.count(1)} nodes with one child, stated {single}")
-            need(sum(children) == after, f"{sum(children)} children, stated {after}")
+            need(children.count(1) == single, f"{children.count(1)} nodes with one child, expected {single}")
+            need(sum(children) == after, f"{sum(children)} children, expected {after}")
         only_child = [k == 1 for k in children for _ in range(k)]
         steps.append((children, within(next(channels), 8)))
     numbers = [k for children, _ in steps for k in children]
-    need(not sizes or sizes == [numbers.count(k) for k in range(2, 8)], "the numbers of children are not those stated")
+    need(not sizes or sizes == [numbers.count(k) for k in range(2, 8)], "other numbers of children than stated")
     indices = {k: within(next(channels), len(PATTERNS[k])) for k in range(2, 8) if sizes}
     nodes = [(0, 0, 0)]
     for children, octants in steps:

@@ -105,7 +105,7 @@ def _registered(model: Path, kind: str) -> tuple[list[UnreadView], np.ndarray | 
     for name, camera, values in images:
         where = f"{model / f'images{kind}'}: {name}"
         if camera not in lenses:
-            raise DataError(f"{where}: taken by camera {camera}, which cameras{kind} does not have")
+            raise DataError(f"{where}: camera {camera} is not in cameras{kind}")
         pose = np.array([number(value, f"{where}: pose") for value in values])
         rotation = checked_rotation(pose[:4], where)
         viewmat = world_to_camera(rotation, -rotation.T @ pose[4:])

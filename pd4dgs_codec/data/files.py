@@ -177,7 +177,7 @@ def find_image(folder: Path, name: str) -> Path:
         with contextlib.suppress(OSError):  # a name too long for the system
             if path.is_file():
                 return path
-    raise DataError(f"{folder / name}: image is missing (tried as it is, .png, .jpg and .jpeg)")
+    raise DataError(f"{folder / name}: image is missing (tried the name alone, .png, .jpg and .jpeg)")
 
 
 def check_pixels(count: int, files: Iterable[Path], where: str) -> None:
@@ -187,7 +187,7 @@ def check_pixels(count: int, files: Iterable[Path], where: str) -> None:
     except OSError:
         return  # reading the file reports the error
     if count > held:
-        raise DataError(f"{where}: {count:,} pixels, expected {held:,} at most in pictures of so few bytes")
+        raise DataError(f"{where}: {count:,} pixels, expected {held:,} at most for files of this size")
 
 
 def _open(path: Path, what: str = "image", size: tuple[int, int] | None = None) -> Picture:
@@ -237,7 +237,7 @@ def _check_readable(image: Picture, where: str) -> None:
         found = "has 16-bit grey with a transparent value, expected 8 bits or an alpha channel"
     elif image.getexif().get(ORIENTATION, UPRIGHT) != UPRIGHT:  # some tools rotate, some do not
         flag = image.getexif()[ORIENTATION]
-        found = f"is stored turned (orientation flag {flag}), expected upright pixels that fit the camera"
+        found = f"is stored rotated (orientation flag {flag}), expected upright pixels as the camera has"
     elif not GAMMA[0] <= image.info.get("gamma", GAMMA[0]) <= GAMMA[1]:
         found = f"has a gamma of {image.info['gamma']:g}, expected that of sRGB (0.455)"
     if found:
@@ -359,7 +359,7 @@ def _header(path: Path, raw: bytes) -> tuple[str, int, np.dtype, int]:
                 count = int(words[2])
         elif words[:1] == ["property"] and elements == 1:
             if len(words) != 3 or words[1] not in SCALARS:
-                raise DataError(f"{path}: vertex property {' '.join(words[1:])!r} is not a scalar this reader knows")
+                raise DataError(f"{path}: unknown vertex property {' '.join(words[1:])!r}, expected a scalar")
             fields.append((words[2], SCALARS[words[1]]))
     if kind not in ("ascii", "binary_little_endian") or count < 0 or newline < 0:
         found = f"format {kind!r}, first element with {count} vertices"

@@ -193,7 +193,7 @@ def _covisible(view: View, frame: UnreadView, folder: Path, downscale: int) -> V
     """The view with its covisibility mask."""
     path = inside(folder, f"{frame.name}.png")
     if not path.is_file():
-        raise DataError(f"{path}: covisibility mask is missing, though others of its folder are there")
+        raise DataError(f"{path}: covisibility mask is missing, but its folder has others")
     mask = read_mask(path, (frame.lens.width, frame.lens.height), downscale=downscale)
     return replace(view, mask=mask if view.mask is None else mask & view.mask)
 

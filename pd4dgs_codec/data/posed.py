@@ -33,7 +33,7 @@ def without_first_camera(folder: Path, frames: Sequence[Posed], holdout: int) ->
     first = min(frame.camera_id for frame in frames) if holdout else None
     train = [frame for frame in frames if frame.camera_id != first]
     if not train:
-        raise DataError(f"{folder}: one camera, which is held out, expected others to train on or --holdout 0")
+        raise DataError(f"{folder}: the only camera is held out, expected others to train on or --holdout 0")
     return train, [frame for frame in frames if frame.camera_id == first]
 
 
@@ -58,7 +58,7 @@ def posed_dataset(
     frames, under = [*train, *test], (background or WHITE) if composite else None
     files = {frame.image for frame in frames}
     if len(frames) > USES * len(files):
-        raise DataError(f"{folder}: {len(frames)} frames are of {len(files)} pictures, expected {USES} of one at most")
+        raise DataError(f"{folder}: {len(frames)} frames of {len(files)} pictures, expected at most {USES} per picture")
     check_pixels(sum(frame.lens.width * frame.lens.height for frame in frames), files, str(folder))
     behind = background
     if composite:

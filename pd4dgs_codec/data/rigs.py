@@ -42,7 +42,7 @@ def read_neu3d(folder: Path, downscale: int, holdout: int, background: Color | N
     """
     videos, poses = sorted(folder.glob("cam*.mp4")), _poses(folder / POSES)
     if len(videos) != len(poses):
-        raise DataError(f"{folder}: {len(poses)} poses in {POSES} and {len(videos)} videos cam*.mp4, expected as many")
+        raise DataError(f"{folder}: {len(videos)} videos cam*.mp4, expected {len(poses)} as in {POSES}")
     pairs = enumerate(zip(videos, poses, strict=True))
     cameras = [_neu3d_camera(row, i, video_size(video), video) for i, (video, row) in pairs]
     near, far = 0.5 * float(poses[:, 15].min()), float(poses[:, 16].max())
@@ -99,11 +99,11 @@ def _panoptic_frames(folder: Path, path: Path) -> list[UnreadView]:
     width, height = (whole_number(meta.get(key), f"{path}: {key}", low=1) for key in ("w", "h"))
     rows = [meta.get(key) for key in ("k", "w2c", "fn", "cam_id")]
     if not all(isinstance(row, list) and row and len(row) == len(rows[0] or []) for row in rows):
-        raise DataError(f"{path}: expected k, w2c, fn and cam_id, lists of as many instants")
+        raise DataError(f"{path}: expected lists of equal length k, w2c, fn and cam_id")
     frames = []
     for t, instant in enumerate(zip(*rows, strict=True)):
         if not all(isinstance(row, list) and row and len(row) == len(instant[0]) for row in instant):
-            raise DataError(f"{path}: instant {t}: expected k, w2c, fn and cam_id of as many cameras")
+            raise DataError(f"{path}: instant {t}: expected lists of equal length k, w2c, fn and cam_id")
         for k, w2c, name, key in zip(*instant, strict=True):
             if not isinstance(name, str):
                 raise DataError(f"{path}: instant {t}: fn {one_line(repr(name), 60)} is not the name of a picture")

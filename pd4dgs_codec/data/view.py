@@ -77,8 +77,8 @@ class Dataset:
             count = f"{len(self.left_out)} of {len(self.train) + len(self.test) + len(self.left_out)} views"
             remarks.append(f"{count} left out, no valid pixel in the mask: {names}")
         if len({view.time for view in self.train}) == 1:
-            remarks.append("all training views are of one instant: levels 1 and 2 can learn no motion")
+            remarks.append("all training views show one instant: levels 1 and 2 cannot learn motion")
         first = self.train[0].viewmat
         if all(np.array_equal(view.viewmat, first) for view in self.train):
-            remarks.append("all training views are from one place: depth stays a guess, other viewpoints look wrong")
+            remarks.append("all training views are from one viewpoint: depth is unknown, other viewpoints look wrong")
         return remarks

@@ -145,8 +145,8 @@ def _write_channel(out: bytearray, prior: Prior, exceptions: _Exceptions, define
 def _read_exceptions(reader: ByteReader, count: int, window: Window) -> _Exceptions:
     at = reader.offset
     number = 1 + reader.varint(VARINT_MAX, "the number of exceptions")
-    if number > min(count, reader.remaining // 2):
-        raise Malformed(f"{number} exceptions among {count} symbols, in {reader.remaining} bytes", offset=at)
+    if number > (most := min(count, reader.remaining // 2)):
+        raise Malformed(f"{number} exceptions, expected at most {most}", offset=at)
     positions, values, position = [], [], -1
     for _ in range(number):
         at = reader.offset
@@ -154,7 +154,7 @@ def _read_exceptions(reader: ByteReader, count: int, window: Window) -> _Excepti
         code = reader.varint(4 * K_MAX + 2, "an exception's value")
         value = window.kmin - 1 - code // 2 if code & 1 else window.end + code // 2
         if position >= count or abs(value) > K_MAX:
-            raise Malformed(f"an exception {value} at {position} of {count} symbols", offset=at)
+            raise Malformed(f"exception {value} at symbol {position} of {count}, limit |k| <= {K_MAX}", offset=at)
         positions.append(position)
         values.append(value)
     return _Exceptions(np.array(positions, dtype=np.int64), np.array(values, dtype=np.int64))
@@ -235,7 +235,7 @@ def _read_channel(reader: ByteReader, count: int, defined: list[Prior]) -> _Head
     else:
         index = len(defined) - 1 - (family - FIRST_REUSE)
         if index < 0:
-            raise Malformed(f"a channel reuses a prior {-index} before the first", offset=at)
+            raise Malformed(f"a channel reuses prior {index}, expected 0..{len(defined) - 1}", offset=at)
     return index, count, _read_exceptions(reader, count, defined[index].window) if token & 1 else None
 
 

@@ -107,7 +107,7 @@ def _compress(head: bytes, numbers: Sequence[np.ndarray], effort: int) -> bytes:
         raise EncodeError(f"effort is {effort}, expected 1..9")
     layouts = {False: _layout(numbers, False)}
     if len(layouts[False]) > MAX_RAW:
-        raise EncodeError(f"{len(layouts[False])} bytes before LZMA, limit {MAX_RAW}")
+        raise EncodeError(f"LZMA: {len(layouts[False])} bytes uncompressed, limit {MAX_RAW}")
     if effort >= 4 and any(n.itemsize > 1 for n in numbers):
         layouts[True] = _layout(numbers, True)
     trials = [(planar, setting) for planar in layouts for setting in _settings(effort)]
@@ -123,7 +123,7 @@ def _decompress(
 ) -> list[np.ndarray]:
     size = sum(count * dtype.itemsize for count, dtype in zip(counts, dtypes, strict=True))
     if size > MAX_RAW:
-        raise LimitExceeded(f"{size} bytes under LZMA, limit {MAX_RAW}")
+        raise LimitExceeded(f"LZMA: {size} bytes uncompressed, limit {MAX_RAW}")
     data = _inflate(bytes(reader.rest()), size)
     arrays, at = [], 0
     for count, dtype in zip(counts, dtypes, strict=True):
@@ -143,6 +143,6 @@ def _inflate(packed: bytes, size: int) -> bytes:
     except lzma.LZMAError as error:
         raise Malformed(f"LZMA: {error}") from None
     if len(data) != size or not decoder.eof or decoder.unused_data:
-        end = "ends" if decoder.eof else "goes on or is cut"
-        raise Malformed(f"the LZMA stream gives {len(data)} bytes and {end}, expected {size} and its end")
+        end = "then ends" if decoder.eof else "does not end"
+        raise Malformed(f"LZMA: the stream holds {len(data)} bytes and {end}, expected the end after {size}")
     return data

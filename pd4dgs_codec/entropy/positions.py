@@ -115,7 +115,7 @@ def decode_positions(payload: bytes | memoryview, count: int, known: list[Prior]
     """
     if count <= 0:
         if count or len(payload):
-            raise Malformed(f"positions: {len(payload)} bytes for {count} cells")
+            raise Malformed(f"positions: {len(payload)} bytes for {count} cells, expected 0 bytes for 0 cells")
         return np.zeros((0, 3), dtype=np.int32)
     reader = ByteReader(payload)
     low = [reader.zigzag(MAX_VOXEL, "the smallest cell") for _ in range(3)]
@@ -124,7 +124,7 @@ def decode_positions(payload: bytes | memoryview, count: int, known: list[Prior]
     sizes = [reader.varint(MAX_COUNT, f"the number of nodes with {k} children") for k in _CODED] if count > 1 else []
     several = sum(nodes) - sum(single)
     if sum(sizes) > several:
-        raise Malformed(f"positions: {sum(sizes)} nodes with 2 to 7 children, {several} with more than one")
+        raise Malformed(f"positions: {sum(sizes)} nodes with 2 to 7 children, expected at most {several}")
     lengths, only = [], 0
     for have, alone in zip(nodes, single, strict=True):
         lengths += [only, have - only, alone] if have < count else [alone]
@@ -136,7 +136,7 @@ def decode_positions(payload: bytes | memoryview, count: int, known: list[Prior]
         raise Malformed("positions: the minimum or the depth does not fit the cells")
     cells = offsets + np.array(low, dtype=np.int64)
     if int(cells.max()) > MAX_VOXEL:
-        raise Malformed(f"positions: a cell of {int(cells.max())}, limit {MAX_VOXEL}")
+        raise Malformed(f"positions: voxel index {int(cells.max())}, limit {MAX_VOXEL}")
     return cells.astype(np.int32)
 
 
@@ -156,7 +156,7 @@ def _read_counts(reader: ByteReader, depth: int, count: int) -> tuple[list[int],
         single.append(alone)
         have += have - alone + more
     if have != count:
-        raise Malformed(f"positions: {have} nodes after {depth} levels, {count} cells declared", offset=reader.offset)
+        raise Malformed(f"positions: {have} nodes after {depth} levels, expected {count}", offset=reader.offset)
     return nodes, single
 
 
@@ -176,7 +176,7 @@ def _grow(channels: list[np.ndarray], nodes: list[int], single: list[int], sizes
         children += 1
         after = nodes[level + 1] if level + 1 < len(nodes) else count
         if np.count_nonzero(children == 1) != alone or int(children.sum()) != after:
-            raise Malformed("positions: the numbers of children do not add up to those stated")
+            raise Malformed("positions: the numbers of children differ from their stated sums")
         occupancy = np.full(have, 255, dtype=np.int64)  # eight children have one pattern
         occupancy[children == 1] = 1 << _within(next(levels), 8)
         for k in _CODED:

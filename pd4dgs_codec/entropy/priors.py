@@ -61,7 +61,7 @@ class Window:
         kmin = reader.zigzag(K_MAX, "the window's first symbol")
         n = 2 + reader.varint(MAX_WINDOW - 2, "the window's size")
         if kmin + n - 1 > K_MAX:
-            raise Malformed(f"a window of {n} from {kmin} passes the largest symbol {K_MAX}", offset=at)
+            raise Malformed(f"a window of symbols {kmin}..{kmin + n - 1}, limit {K_MAX}", offset=at)
         return cls(kmin, n)
 
 
@@ -316,5 +316,5 @@ def top_limit(step: int) -> int:
 def read_prior(reader: ByteReader, family: int) -> Prior:
     """Reads a prior of a family. Raises UnsupportedFeature for a family outside the registry."""
     if family not in _FAMILIES:
-        raise UnsupportedFeature(f"prior {family} is not in the registry {sorted(_FAMILIES)}", offset=reader.offset)
+        raise UnsupportedFeature(f"prior family {family}, expected one of {sorted(_FAMILIES)}", offset=reader.offset)
     return _FAMILIES[family].read(reader)

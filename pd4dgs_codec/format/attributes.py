@@ -396,7 +396,7 @@ def read_attributes(
     if form == STAGED:
         block = _read_block(reader, widths)
     if block is None:
-        raise Malformed("attributes that go on with a prediction block, but no slice before has one")
+        raise Malformed("attributes continue a prediction block, but no earlier slice has one")
     symbols = np.zeros((widths.channels, rows), np.int32)
     coded = (symbols[channels.start : channels.stop] for channels in _measured_stages(widths))
     read_stages(reader, N_STAGES, _groups(symbols, coded, classes, block), past.stages if past else None)

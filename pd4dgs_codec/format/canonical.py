@@ -121,7 +121,7 @@ class _Reader:
     def _take(self, size: int) -> bytes:
         part = self.data[self.at : self.at + size]
         if len(part) < size:
-            raise self.fault(f"cut: {size} bytes expected, {len(part)} left")
+            raise self.fault(f"truncated: {len(part)} bytes left, expected {size}")
         self.at += size
         return part
 
@@ -164,7 +164,7 @@ class Fields:
             raise Malformed(f"{where}: {type(data).__name__}, expected a map")
         unknown = [key for key in data if key not in known and key < FIRST_IGNORABLE_KEY]
         if unknown:
-            raise UnsupportedFeature(f"{where}: unknown key {unknown[0]} below {FIRST_IGNORABLE_KEY}, so critical")
+            raise UnsupportedFeature(f"{where}: unknown critical key {unknown[0]} (below {FIRST_IGNORABLE_KEY})")
         self._data = data
         self._where = where
 

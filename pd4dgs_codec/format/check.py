@@ -27,7 +27,7 @@ _TIES = 2.0**-29
 def check_scene(scene: Scene) -> None:
     """Raises EncodeError unless `scene` has the shapes, dtypes and ranges that scene.Scene documents."""
     layers, rows = scene.layers, scene.rows
-    expect(layers[:1] == (0,) and set(layers) <= {0, 1, 2}, f"layers {layers}, expected 0 first and none but 0, 1, 2")
+    expect(layers[:1] == (0,) and set(layers) <= {0, 1, 2}, f"layers {layers}, expected 0 first and only 0, 1, 2")
     expect(all(a < b for a, b in pairwise(layers)), f"layers {layers}, expected ascending numbers")
     expect(len(rows) == len(layers) == len(scene.mask), "rows, mask and layers differ in length")
     expect(all(a <= b for a, b in pairwise((0, *rows))), f"rows {rows}, expected a non-decreasing sequence")
@@ -37,7 +37,7 @@ def check_scene(scene: Scene) -> None:
     expect(reach <= MAX_VOXEL, f"anchor_q: voxel index of magnitude {reach}, expected at most {MAX_VOXEL}")
     size = scene.info.voxel_size
     finite = not is_step(size) or all_finite(scene.anchor_q, size)
-    expect(finite, f"anchor_q: a position is infinite at voxel size {size:g}, expected finite ones")
+    expect(finite, f"anchor_q: a position is infinite at voxel size {size:g}, expected finite positions")
     for name, axes in (("feature", 2), ("offset", 3)):
         found = scene.attributes[name].shape
         expect(len(found) == axes, f"{name}: an array of {len(found)} axes, expected {axes}")
@@ -70,7 +70,7 @@ def _check_masks(scene: Scene) -> None:
             not odd.any(), f"mask of layer {layer}: a code below {MASK_MIN_CODE}, expected 0 or {MASK_MIN_CODE}..255"
         )
     for (low, high), layer in zip(pairwise(scene.mask), scene.layers[1:], strict=True):
-        expect(bool((high[: low.size] >= low).all()), f"mask of layer {layer} falls below that of the layer before")
+        expect(bool((high[: low.size] >= low).all()), f"mask of layer {layer} is below the mask of the layer before")
 
 
 def _check_info(scene: Scene) -> None:
@@ -80,7 +80,7 @@ def _check_info(scene: Scene) -> None:
     expect(bool((info.box[0] <= info.box[1]).all()), "box: a lower corner above the upper one")
     reals = [*info.time_range, *info.background, info.near, info.far, *info.up, info.unit]
     with np.errstate(over="ignore"):
-        expect(bool(np.isfinite(np.array(reals, np.float32)).all()), "info: a value is NaN, infinite or over binary32")
+        expect(bool(np.isfinite(np.array(reals, np.float32)).all()), "info: a value is not a finite binary32")
     if info.camera is not None:
         expect_array("camera.viewmat", info.camera.viewmat, np.float32, (4, 4))
         expect_array("camera.K", info.camera.K, np.float32, (3, 3))
@@ -138,8 +138,8 @@ def verify_errors(given: Scene, symbols: SceneSymbols, declared: Mapping[str, fl
         bounds = np.minimum(_bounds(np.abs(restored), steps[what]), declared[what])
         if not (errors <= bounds).all():
             place = np.unravel_index(int((errors - bounds).argmax()), errors.shape)
-            row = f"{what}: {x[place]} comes back as {restored[place]} at step {steps[what]:g}"
-            raise EncodeError(f"verification: {row}, expected at most {bounds[place]:.9g} between them")
+            row = f"{what}: {x[place]} is decoded as {restored[place]} at step {steps[what]:g}"
+            raise EncodeError(f"verification: {row}, expected an error of at most {bounds[place]:.9g}")
         largest[what] = max(largest[what], float(errors.max(initial=0.0)))
     return [ErrorBound(what, steps[what], bound, largest[what]) for what, bound in declared.items()]
 

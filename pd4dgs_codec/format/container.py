@@ -165,7 +165,7 @@ def read_chunk(
 def _need(view: memoryview, size: int, what: str, index: int | None = None, start: int = 0) -> None:
     if len(view) < size:
         end, needs = start + len(view), start + size
-        raise Truncated(f"{end} bytes end inside {what}, which needs {needs}", offset=end, chunk=index, needs=needs)
+        raise Truncated(f"truncated in {what}: {end} bytes, expected {needs}", offset=end, chunk=index, needs=needs)
 
 
 def _check_crc(view: memoryview, at: int, computed: int, what: str, index: int | None = None, start: int = 0) -> None:

@@ -150,7 +150,7 @@ def _read(
         while (part := reader.next_slice(data, max_layer, max_bytes)) is not None:
             take(part)
         if not reader.count:
-            raise Truncated(f"{max_bytes} bytes end before the first slice does", offset=max_bytes)
+            raise Truncated(f"{max_bytes} bytes end before the first slice is complete", offset=max_bytes)
     except Truncated:
         if not (allow_partial and reader.count):
             raise

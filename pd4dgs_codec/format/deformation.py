@@ -98,7 +98,8 @@ def check_tensors(tensors: Deformation, kind: LayerKind, widths: Widths, below: 
     expect(not unknown, f"{own}: networks {unknown}, expected some of {list(kind.network_ids)}")
     missing = [name for name in required if name not in tensors.networks]
     expect(not missing, f"{own} networks {missing} are missing")
-    expect(bool(tensors.planes) == bool(kind.layer), f"{own}: planes of {len(tensors.planes)} scales")
+    scales, wanted = len(tensors.planes), "at least one" if kind.layer else "none"
+    expect(bool(scales) == bool(kind.layer), f"{own}: {scales} scales of planes, expected {wanted}")
     expect(not below or len(below.networks) > 1, f"{LAYER_KINDS[1].name} has no head, expected one below {own}")
     channels_below = len(below.planes[0]["xy"]) if below else 0
     for s, planes in enumerate(tensors.planes):
@@ -110,7 +111,7 @@ def check_tensors(tensors: Deformation, kind: LayerKind, widths: Widths, below: 
         expect(min(channels, *plane_sides(planes)) >= 1, f"{own} scale {s}: an empty plane")
     key = tensors.key
     valid = key is None or (kind.layer > 0 and type(key) is int and 0 <= key <= INSTANTS)
-    expect(valid, f"{own}: key instant {key!r}, expected none, or of a deformation an integer 0..{INSTANTS}")
+    expect(valid, f"{own}: key instant {key!r}, expected None or, in a deformation, an integer 0..{INSTANTS}")
     for name, network in tensors.networks.items():
         expect(len(network) > 0, f"{own} network {name}: no layers")
     shape = Shape.of(tensors, kind, widths, below.channels if below else 0)
@@ -258,7 +259,7 @@ def unpack_parameters(
     scales = _unpack_scales(fields, where, below) if networks and kind.layer > 0 else ()
     for key, expected in ((STEPS, bool(networks)), (SCALES, bool(scales)), (NETWORKS, bool(networks))):
         if (key in fields) != expected:
-            found, wanted = ("missing", "it") if expected else ("there", "no such key")
+            found, wanted = ("missing", "it") if expected else ("present", "none")
             raise Malformed(f"{where}: key {key} is {found}, expected {wanted}")
     instant_code = _unpack_key(fields, kind, networks, where)
     features = sum(scale.channels for scale in below)
@@ -273,7 +274,7 @@ def _unpack_key(fields: Fields, kind: LayerKind, networks: dict[str, tuple[int, 
     if KEY not in fields:
         return None
     if kind.layer == 0 or not networks:
-        raise Malformed(f"{where}: key {KEY} is there, expected it in a deformation alone")
+        raise Malformed(f"{where}: key {KEY} is present, expected only in a deformation")
     return fields.integer(KEY, INSTANTS)
 
 
@@ -309,7 +310,7 @@ def _unpack_networks(fields: Fields, kind: LayerKind, widths: Widths, where: str
     rows = fields.sequence(NETWORKS) if NETWORKS in fields else []
     names, heads = {number: name for name, number in kind.network_ids.items()}, kind.heads(widths)
     if NETWORKS in fields and not rows:
-        raise Malformed(f"{where}: an empty list of networks, expected some or no list")
+        raise Malformed(f"{where}: an empty list of networks, expected entries or no list")
     networks: dict[str, tuple[int, ...]] = {}
     last = -1
     for row in rows:

@@ -62,7 +62,7 @@ class EncodeOptions:
         if not 0 < self.step_scale < math.inf:
             raise EncodeError(f"step_scale {self.step_scale!r}, expected a positive number")
         if self.slices and self.slices < LEAST_SLICE:
-            raise EncodeError(f"slices of {self.slices} bytes, expected 0 or {LEAST_SLICE} and more")
+            raise EncodeError(f"slices of {self.slices} bytes, expected 0 or at least {LEAST_SLICE}")
         if self.slices and self.mode != "ans":
             raise EncodeError(f"slices in mode {self.mode}, expected mode ans or one slice per layer")
 

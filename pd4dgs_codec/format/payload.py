@@ -86,7 +86,7 @@ def read_parameters(
     if length > MAX_PARAMETERS:
         raise LimitExceeded(f"{where}: parameters of {length} bytes, limit {MAX_PARAMETERS}")
     if length > len(payload) - 4:
-        raise Malformed(f"{where}: parameters of {length} bytes in a payload of {len(payload)}")
+        raise Malformed(f"{where}: parameters of {length} bytes, expected at most {len(payload) - 4}")
     fields = Fields(canonical.unpack(payload[4 : 4 + length]), where, set(range(ROWS, deformation.KEY + 1)))
     known = {int(section) for section in Section}
     sections = Fields(fields.get(SECTIONS), f"{where} sections", known)
@@ -120,7 +120,7 @@ def _check_declared(total: Declared, where: str) -> None:
     ):
         limit = free + per_byte * total.payload_bytes
         if found > limit:
-            size = f"{total.payload_bytes} bytes of payload so far"
+            size = f"{total.payload_bytes} bytes of payloads up to here"
             raise LimitExceeded(f"{where}: {found} {what} in {size}, limit {limit}")
 
 
@@ -262,15 +262,15 @@ class _Sections:
     def take(self, section: Section, symbols: int) -> bytes:
         """Returns a section's bytes. Raises Malformed if it is missing with symbols to code, or there without any."""
         if (section in self._parts) != (symbols > 0):
-            found = "there" if section in self._parts else "missing"
-            raise Malformed(f"section {section.name.lower()} is {found}, with {symbols} symbols to code")
+            found = "present" if section in self._parts else "missing"
+            raise Malformed(f"section {section.name.lower()} is {found} for {symbols} symbols")
         return self._parts.pop(section, b"")
 
     def check_empty(self) -> None:
         """Raises Malformed if a section has not been taken."""
         if self._parts:
             where = f"layer {self._kind.layer}: section {min(self._parts)}"
-            raise Malformed(f"{where} is there, but nothing is left for it to code")
+            raise Malformed(f"{where} is present for 0 symbols")
 
 
 #: Rises, own codes, step classes, attributes, planes and networks of a slice, as in LayerSymbols.

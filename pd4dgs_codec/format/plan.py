@@ -101,7 +101,7 @@ def plan(scene: Scene, options: EncodeOptions = DEFAULTS) -> Plan:
 
 def _cut(scene: Scene, highest: int) -> tuple[Scene, list[LeftOut]]:
     """Returns (the layers <= highest with the anchors of all layers, a LeftOut for each layer above)."""
-    why = f"layers up to {highest} were asked for"
+    why = f"only layers up to {highest} were requested"
     left_out = [
         LeftOut(f"layer {layer}", why, LAYER_KINDS[layer], scene.deformation(layer))
         for layer in scene.layers
@@ -128,7 +128,7 @@ def _drop_heads(scene: Scene, kind: LayerKind) -> tuple[Scene, list[LeftOut]]:
     zero = [name for name in heads if deformation.is_zero(symbols, name)]
     if len(zero) == len(heads) and any(map(scene.deformation, range(kind.layer + 1, 3))):
         zero = zero[1:]  # a deformation has at least one head
-    why = "zero after quantisation" if heads else "it has no heads"
+    why = "zero after quantisation" if heads else "no heads"
     if len(zero) == len(heads):
         return scene.with_tensors(kind.layer, None), [LeftOut(kind.name, why, kind, given)]
     rest = deformation.with_heads(given, [name for name in heads if name not in zero])
@@ -175,7 +175,7 @@ def _without_unread(scene: Scene, symbols: SceneSymbols) -> tuple[Scene, SceneSy
         kind, given = layer.kind, scene.tensors(layer.kind.layer)
         tensors, what, bits = deformation.without_unread(layer.tensors, unit)
         if tensors is not layer.tensors:
-            left_out.append(LeftOut(f"{kind.name}: {what}", "no anchor is ever there", bits=bits, lossless=True))
+            left_out.append(LeftOut(f"{kind.name}: {what}", "no anchor reads them", bits=bits, lossless=True))
             rows = zip(arrays_of(given, kind), arrays_of(layer.tensors, kind), arrays_of(tensors, kind), strict=True)
             arrays = [
                 np.where(before == k, x, dequantise(k, layer.steps[of])) for (of, _, x), (*_, before), (*_, k) in rows

@@ -68,7 +68,7 @@ def quantise(
     if largest > MAX_SYMBOL:
         raise EncodeError(f"{name}: symbol of magnitude {largest:.0f} at step {step:g}, expected at most {MAX_SYMBOL}")
     if not all_finite(at, step):
-        raise EncodeError(f"{name}: a value that comes back as infinity at step {step:g}, expected a finite one")
+        raise EncodeError(f"{name}: a value is decoded as infinity at step {step:g}, expected a finite one")
     symbols: np.ndarray = k.astype(np.int32)
     return symbols
 

@@ -229,7 +229,7 @@ def read_stages(
     lengths = [reader.varint(reader.remaining, f"the length of stage {stage}") for stage in range(number - 1)]
     rest = reader.rest()
     if sum(lengths) > len(rest):
-        raise Malformed(f"stages of {sum(lengths)} bytes and more in the {len(rest)} that are left")
+        raise Malformed(f"stages of {sum(lengths)} bytes or more, {len(rest)} bytes are left")
     bounds = [0, *accumulate(lengths), len(rest)]
     for stage, targets in enumerate(groups):
         payload = rest[bounds[stage] : bounds[stage + 1]]

@@ -60,7 +60,7 @@ def checked(
     good = finite_rows(parts)
     good &= (np.linalg.norm(quats, axis=1) > 0) & (scales >= 0).all(axis=1) & (opacities >= 0) & (opacities <= 1)
     if not good.any():
-        raise DataError(f"{where}: none of {n} Gaussians is finite with a rotation, expected one at least")
+        raise DataError(f"{where}: none of {n} Gaussians is valid (finite, quaternion not 0), expected one at least")
     kept = {name: np.ascontiguousarray(array[good], np.float32) for name, array in parts.items()}
     return Splats(**kept | {"quats": unit(kept["quats"])})
 
@@ -155,10 +155,10 @@ def _check_spz(path: Path, data: bytes) -> None:
     try:
         head = unpacker.decompress(data, 20) if zipped else data[:20]
         if head[:4] != SPZ_MAGIC or len(head) < 16:
-            raise DataError(f"{path}: is no SPZ file, expected one that begins with {SPZ_MAGIC.decode()}")
+            raise DataError(f"{path}: is not an SPZ file, expected it to begin with {SPZ_MAGIC.decode()}")
         count = int.from_bytes(head[8:12], "little")
         if count > SPZ_MOST:
-            raise DataError(f"{path}: says it has {count:,} Gaussians, expected {SPZ_MOST:,} at most")
+            raise DataError(f"{path}: declares {count:,} Gaussians, expected {SPZ_MOST:,} at most")
         size, most = len(head), min(len(head) + SPZ_BYTES * count, FREE_BYTES + INFLATES * len(data))
         while zipped and not unpacker.eof and size <= most:
             part = unpacker.decompress(unpacker.unconsumed_tail, 1 << 20)
@@ -166,12 +166,12 @@ def _check_spz(path: Path, data: bytes) -> None:
                 break
             size += len(part)
     except zlib.error as error:
-        raise DataError(f"{path}: is no SPZ file: {error}") from None
+        raise DataError(f"{path}: is not an SPZ file: {error}") from None
     if not zipped:  # a table of streams: packed and unpacked bytes of each
         table = data[int.from_bytes(head[16:20], "little") :][: 16 * head[15]]
         size = sum(int.from_bytes(table[i + 8 : i + 16], "little") for i in range(0, len(table), 16))
     if size > most:
-        raise DataError(f"{path}: unpacks to more than {most:,} bytes, for {count:,} Gaussians in {len(data):,} bytes")
+        raise DataError(f"{path}: unpacks to more bytes than {count:,} Gaussians need, expected at most {most:,}")
 
 
 def read_gsplat(path: Path) -> Splats:
@@ -274,7 +274,7 @@ def spz_bytes(splats: Splats) -> bytes:
     reach = float(np.abs(splats.means).max(initial=0))
     if reach >= SPZ_REACH:
         found = f"a Gaussian lies {reach:.4g} units from 0"
-        raise DataError(f"{found}, SPZ holds {SPZ_REACH:g} at most: --scale less than 1")
+        raise DataError(f"{found}, expected less than {SPZ_REACH:g} in SPZ: use --scale below 1")
     with quiet():
         forge = required("gaussforge", EXTRA, "SPZ files").GaussForge()
         result = forge.convert(ply_bytes(splats), "ply", "spz", spz_version=3)

@@ -247,7 +247,7 @@ def _hexplane_move(state: State, config: Config, rest: Parts) -> Move:
     """Reads the network of 4DGaussians. Its Move takes parameters with the shapes of `rest` and activates them."""
     for name in UNREAD:
         if (value := config.get(name)) not in (None, "False", "0"):
-            raise DataError(f"{config.path}: has {name}={value}, expected a model without")
+            raise DataError(f"{config.path}: has {name}={value}, expected 0 or False")
     net = "deformation_net"
     field, features = _field(state, f"{net}.grid")
     trunk = state.chain(f"{net}.feature_out", _places(state, f"{net}.feature_out"), features)

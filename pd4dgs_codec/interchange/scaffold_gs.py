@@ -97,8 +97,8 @@ def _iteration(folder: Path, number: int | None) -> Path:
         what = f"iteration_{number}" if number is not None else f"{PLY}, here or in point_cloud/iteration_N"
         raise DataError(f"{folder}: has no {what}; expected a checkpoint of Scaffold-GS")
     if network := network_of(place):
-        how = f"pd4dgs-train teacher:{folder} learns from it"
-        raise DataError(f"{folder}: its Gaussians move by {network.name}, expected a checkpoint of Scaffold-GS; {how}")
+        how = f"train with pd4dgs-train teacher:{folder}"
+        raise DataError(f"{folder}: {network.name} moves its Gaussians, expected a checkpoint of Scaffold-GS; {how}")
     return place
 
 
@@ -207,7 +207,7 @@ def _network(
         raise DataError(f"{path}: takes {found}, expected {expects}")
     if embedding is not None and taken:
         if choices.appearance is None or not 0 <= choices.appearance < len(embedding):
-            how = f"choose the appearance of one of {len(embedding)} with --appearance 0..{len(embedding) - 1}"
+            how = f"choose one of {len(embedding)} pictures with --appearance 0..{len(embedding) - 1}"
             raise DataError(f"{path.parent}: colours depend on the picture; {how}")
         w1, b1 = w1[:, :usual], b1 + w1[:, usual:] @ embedding[choices.appearance]
     return (w1.astype(np.float32), b1.astype(np.float32)), (w2, b2)
@@ -220,7 +220,7 @@ def _grid(anchor: np.ndarray, path: Path) -> float:
     gaps = np.diff(np.concatenate([[0.0], values]))
     gaps = gaps[gaps > 4 * tolerance]
     if not gaps.size:
-        raise DataError(f"{path}: no voxel size can be found in the anchors; expected --voxel-size")
+        raise DataError(f"{path}: the anchors do not determine the voxel size, expected --voxel-size")
     voxel = float(gaps.min())
     for limit in np.geomspace(16, MAX_VOXEL, 24):  # a better estimate reaches farther
         near = values[values <= limit * voxel]
@@ -239,5 +239,5 @@ def _cells(anchor: np.ndarray, voxel: float, path: Path) -> np.ndarray:
     off = np.abs(exact - cells) - ULPS * np.spacing(np.abs(anchor)).astype(np.float64) / voxel
     if off.max() > OFF_GRID:
         found = f"anchors lie up to {off.max():.3g} voxels off the grid of {voxel:g}"
-        raise DataError(f"{path}: {found}, expected multiples of it; --voxel-size names another")
+        raise DataError(f"{path}: {found}, expected multiples of it; --voxel-size sets another")
     return cells.astype(np.int32)

@@ -243,7 +243,7 @@ def _fourdgs(path: Path) -> Teacher:
     data = read_file(path)
     most = FREE_BYTES + INFLATES * len(data)
     if _numbers(data, most) > most:
-        raise DataError(f"{path}: holds more than {most:,} numbers in {len(data):,} bytes")
+        raise DataError(f"{path}: more than {most:,} numbers in a file of {len(data):,} bytes")
     try:
         with np.errstate(all="ignore"):  # `checked` drops Gaussians that are not finite
             scene = fourdgs.read(data)

@@ -19,7 +19,7 @@ export class AnsDecoder {
     const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
     this._words = new Uint32Array(count);
     for (let i = 0; i < count; i++) this._words[i] = view.getUint32(4 * i, true);
-    if (count && this._words[0] === 0) throw malformed("an ANS stream that begins with a word of 0");
+    if (count && this._words[0] === 0) throw malformed("an ANS stream begins with a zero word");
     const [first = 0, second] = this._words;
     const both = second !== undefined; // the state is one word, or two if there are
     this._at = Math.min(count, 2);
@@ -77,8 +77,8 @@ export class AnsDecoder {
 
   /** The stream's end: Malformed unless the state is 0 and no word is left. */
   finish() {
-    if (this._th || this._tl || this._q) throw malformed("an ANS stream that ends in another state than 0");
+    if (this._th || this._tl || this._q) throw malformed("an ANS stream does not end in state 0");
     const left = this._words.length - this._at;
-    if (left) throw malformed(`${left} words behind the end of an ANS stream`);
+    if (left) throw malformed(`an ANS stream has ${left} words left at its end`);
   }
 }

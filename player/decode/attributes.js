@@ -59,7 +59,7 @@ export function decodeAttributes(bytes, rows, kind, continuation) {
   } else if (form === 1 || form === 2) {
     const own = form === 1;
     const block = own ? readBlock(reader, kind) : continuation.block;
-    if (!block) throw malformed("attributes that continue a block, and the layer has none before");
+    if (!block) throw malformed("attributes continue a prediction block, but no earlier slice has one");
     decodeStaged(reader, stepClasses, kind.widths, block, own, continuation, channels);
     continuation.block = block;
   } else throw unsupported(`form ${form} of the attributes`);

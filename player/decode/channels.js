@@ -50,7 +50,7 @@ export function decodeChannels(bytes, counts, out, priors = []) {
       if (entries > most) throw limitExceeded(`tables of ${entries} entries for one section, limit ${most}`);
     } else {
       prior = priors[priors.length - 1 - (family - FIRST_REUSE)];
-      if (!prior) throw malformed("a channel refers to a prior before the first");
+      if (!prior) throw malformed("a channel reuses a prior before the first");
     }
     channels.push({ count, prior, exceptions: token & 1 ? readExceptions(reader, count, prior.window) : null });
   }
@@ -87,7 +87,7 @@ function takeChannel(stream, prior, exceptions, out, at, count) {
 /** 8.3. @param {ByteReader} reader @param {number} count @param {Window} window @returns {Exceptions} */
 function readExceptions(reader, count, window) {
   const number = 1 + reader.varint(MAX_VARINT, "the number of exceptions");
-  if (number > count) throw malformed(`${number} exceptions among ${count} symbols`);
+  if (number > count) throw malformed(`${number} exceptions, expected at most ${count}`);
   const end = window.kmin + window.n;
   const positions = [];
   const values = [];
@@ -97,7 +97,7 @@ function readExceptions(reader, count, window) {
     const code = reader.varint(4 * MAX_CODED + 2, "an exception's value");
     const value = code & 1 ? window.kmin - 1 - (code >> 1) : end + (code >> 1);
     if (position >= count || value > MAX_CODED || value < -MAX_CODED) {
-      throw malformed(`an exception of ${value} at ${position} of ${count} symbols`);
+      throw malformed(`exception ${value} at symbol ${position} of ${count}, limit ±${MAX_CODED}`);
     }
     positions.push(position);
     values.push(value);
@@ -117,7 +117,7 @@ function readPrior(reader, family) {
   const first = readNormal(reader, window.n);
   if (family === GAUSS) return { window, makeTable: () => normTable(window.n, first.mu8, first.si, first.floor) };
   const second = readNormal(reader, window.n);
-  if (second.floor !== 1) throw malformed("the second normal of a mixture has a floor bit, which is reserved");
+  if (second.floor !== 1) throw malformed("the second normal of a mixture has a floor bit, expected 0");
   const weight = reader.byte("the weight of a mixture");
   if (!weight) throw malformed("a mixture of weight 0");
   return { window, makeTable: () => mixtureTable(window.n, first, second, weight) };
@@ -128,7 +128,7 @@ function readWindow(reader) {
   const kmin = reader.zigzag(MAX_CODED, "the start of a window");
   const n = 2 + reader.varint(MAX_WINDOW - 2, "the length of a window");
   const last = kmin + n - 1;
-  if (last > MAX_CODED) throw malformed(`a window whose last entry is ${last}, limit ${MAX_CODED}`);
+  if (last > MAX_CODED) throw malformed(`a window up to symbol ${last}, limit ${MAX_CODED}`);
   return { kmin, n };
 }
 

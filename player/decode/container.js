@@ -105,7 +105,7 @@ export function sceneIdOf(described) {
 function need(bytes, size, what, offset, chunk) {
   if (bytes.length >= size) return;
   const end = offset + bytes.length;
-  const message = `${end} bytes end inside ${what}, which needs ${offset + size}`;
+  const message = `truncated in ${what}: ${end} bytes, expected ${offset + size}`;
   throw new DecodeError("Truncated", message, { offset: end, chunk, needs: offset + size });
 }
 

@@ -128,7 +128,7 @@ export class SceneSource {
           this.cuts++;
           if (++failures >= this._attempts) {
             // browsers do not tell the two apart
-            const why = error instanceof Cut ? error.message : "no connection, or a server that other sites may not read";
+            const why = error instanceof Cut ? error.message : "no connection, or no CORS permission of the server";
             throw new FetchError(`${this.url}: ${why} (${this.received} bytes received)`);
           }
           if (failures > 1) await sleep(1000 * Math.min(this._pause * 2 ** (failures - 2), until - now()));
@@ -289,7 +289,7 @@ export class SceneSource {
     if (status === 206) {
       const part = /^bytes (\d{1,15})-\d{1,15}\/(\d{1,15})$/.exec(headers.get("Content-Range") ?? "");
       if (!resumes || !part || Number(part[1]) !== this.received) {
-        throw new Cut("the response is another part than requested");
+        throw new Cut("the response holds other bytes than requested");
       }
       const total = Number(part[2]);
       if ((validator ?? this._validator) !== this._validator || (this.total ?? total) !== total) return this._restart();

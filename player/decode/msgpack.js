@@ -49,7 +49,7 @@ class Reader {
 
   /** The next `size` bytes. @param {number} size */
   take(size) {
-    if (size > this.bytes.length - this.at) throw this.fault("the value is cut");
+    if (size > this.bytes.length - this.at) throw this.fault("the value is truncated");
     return this.bytes.subarray(this.at, (this.at += size));
   }
 

@@ -80,7 +80,7 @@ export function readParameters(payload, kind, before, later) {
   const length = new DataView(payload.buffer, payload.byteOffset).getUint32(0, true);
   if (length > MAX_FIELDS) throw limitExceeded(`${where}: parameters of ${length} bytes, limit ${MAX_FIELDS}`);
   if (length > payload.length - 4) {
-    throw malformed(`${where}: parameters of ${length} bytes in a payload of ${payload.length}`);
+    throw malformed(`${where}: parameters of ${length} bytes, expected at most ${payload.length - 4}`);
   }
   const fields = new Fields(unpack(payload.subarray(4, 4 + length), where).value, where, KEYS);
   const rows = asInteger(fields.get(1), 0, MAX_ROWS - before.rows, `${where}: own rows`);
@@ -110,8 +110,8 @@ export function readParameters(payload, kind, before, later) {
   const counts = [rows, rises + rows, rows * perRow, cells, weights, 0];
   SECTIONS.forEach((name, i) => {
     if (name in sections !== counts[i] > 0) {
-      const found = name in sections ? "there" : "missing";
-      throw malformed(`${where}: section ${name} is ${found}, with ${counts[i]} symbols to code`);
+      const found = name in sections ? "present" : "missing";
+      throw malformed(`${where}: section ${name} is ${found} for ${counts[i]} symbols`);
     }
   });
   return { rows, steps, planes, networks, key, sections, declared };
@@ -140,7 +140,7 @@ function cutSections(payload, at, lengths, where) {
 
 /** Key 3. @param {Fields} fields @param {LayerKind} kind @param {string} where @param {boolean} expected */
 function readSteps(fields, kind, where, expected) {
-  if (fields.has(3) !== expected) throw malformed(`${where}: steps ${expected ? "missing" : "without networks"}`);
+  if (fields.has(3) !== expected) throw malformed(`${where}: steps ${expected ? "are missing" : "without networks"}`);
   if (!expected) return [];
   return fields.reals(3, kind.classes.length, "steps").map((step) => checkStep(step, `${where}: step`));
 }
@@ -148,7 +148,7 @@ function readSteps(fields, kind, where, expected) {
 /** Key 6. @param {Fields} fields @param {LayerKind} kind @param {string} where @param {boolean} deformed */
 function readKey(fields, kind, where, deformed) {
   if (!fields.has(6)) return null;
-  if (!deformed || kind.layer === 0) throw malformed(`${where}: a key instant, expected none`);
+  if (!deformed || kind.layer === 0) throw malformed(`${where}: a key instant, expected only in a deformation`);
   return Math.fround(asInteger(fields.get(6), 0, INSTANTS, `${where}: key instant`) / INSTANTS);
 }
 

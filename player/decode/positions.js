@@ -62,7 +62,7 @@ function readLevels(reader, depth, rows) {
     levels.push({ nodes, single });
     nodes = next;
   }
-  if (nodes !== rows) throw malformed(`${nodes} nodes after ${depth} levels, ${rows} anchors declared`);
+  if (nodes !== rows) throw malformed(`${nodes} nodes after ${depth} levels, expected ${rows}`);
   return levels;
 }
 
@@ -72,7 +72,7 @@ function readPatternCounts(reader, levels) {
   for (let k = 2; k < ALL; k++) counts.push(reader.varint(MAX_COUNT, `the number of nodes with ${k} children`));
   const stated = counts.reduce((sum, count) => sum + count, 0);
   const several = levels.reduce((sum, { nodes, single }) => sum + nodes - single, 0);
-  if (stated > several) throw malformed(`${stated} nodes with 2 to 7 children, ${several} with more than one`);
+  if (stated > several) throw malformed(`${stated} nodes with 2 to 7 children, expected at most ${several}`);
   return counts;
 }
 
@@ -154,13 +154,13 @@ function placed(offsets, minimum, depth) {
       largest = Math.max(largest, along[i]);
       voxels[3 * i + axis] = minimum[axis] + along[i];
     }
-    if (least !== 0) throw malformed(`offsets from ${least} on along an axis, expected 0`);
+    if (least !== 0) throw malformed(`voxel offsets begin at ${least} on an axis, expected 0`);
     if (minimum[axis] + largest > MAX_VOXEL) {
       throw malformed(`a voxel index of ${minimum[axis] + largest}, limit ${MAX_VOXEL}`);
     }
     largestOfAll = Math.max(largestOfAll, largest);
   }
   const bits = 32 - Math.clz32(largestOfAll);
-  if (bits !== depth) throw malformed(`offsets of up to ${bits} bits in an octree of depth ${depth}`);
+  if (bits !== depth) throw malformed(`voxel offsets of ${bits} bits, expected the octree's depth ${depth}`);
   return voxels;
 }

@@ -163,7 +163,7 @@ export class LayerReader {
     const flagged = (/** @type {string} */ reason) => new DecodeError("Malformed", reason, { offset: 2 });
     if (number !== expected) throw flagged(`slice ${number}, expected ${expected}`);
     if (next !== null && more !== (next === layer)) {
-      throw flagged(`layer ${layer} has ${more ? "further slices" : "no further slice"}, and layer ${next} follows`);
+      throw flagged(`layer ${layer} ${more ? "announces a further slice" : "ends"}, but layer ${next} follows`);
     }
     const continuation = later ? latest.continuation : new Continuation();
     const symbols = decodeLayer(payload, layerKind(layer, header), this._declared, continuation, later);

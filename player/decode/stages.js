@@ -27,7 +27,7 @@ export function readStages(reader, count) {
     sum += length;
   }
   const rest = reader.rest();
-  if (sum > rest.length) throw malformed(`stages of ${sum} bytes where ${rest.length} are left`);
+  if (sum > rest.length) throw malformed(`stages of ${sum} bytes or more, ${rest.length} bytes are left`);
   let at = 0;
   const stages = lengths.map((length) => rest.subarray(at, (at += length)));
   return [...stages, rest.subarray(at)];

@@ -254,4 +254,4 @@ def test_scarce_data_are_noted(cli, dataset, tmp_path):
     result = cli("train", dataset, "-o", tmp_path / "m.pt", "--preset", "tiny", "--iterations", 2, "-j", 1)
     assert result.code == 0
     notes = [line for line in result.error_lines if line.startswith("note: ")]
-    assert len(notes) == 2 and "one instant" in notes[0] and "one place" in notes[1]
+    assert len(notes) == 2 and "one instant" in notes[0] and "one viewpoint" in notes[1]

@@ -22,8 +22,8 @@ def test_one_frame(blender):
     dataset = load(blender(n=1))
     assert len(dataset.train) == 1 and dataset.train[0].time == 0.0 and dataset.time_range == (0.0, 1.0)
     assert [remark.split(":")[0] for remark in dataset.remarks()] == [
-        "all training views are of one instant",
-        "all training views are from one place",
+        "all training views show one instant",
+        "all training views are from one viewpoint",
     ]
 
 

@@ -39,7 +39,7 @@ def test_never_inflates_beyond_the_declared_counts():
     with pytest.raises(LimitExceeded):
         decode_channels_lzma(bomb, [10**11])
     wide = encode_channels_lzma([np.array([-K_MAX, K_MAX], np.int32)] * 9, effort=1)
-    with pytest.raises(LimitExceeded, match="under LZMA"):
+    with pytest.raises(LimitExceeded, match="bytes uncompressed, limit"):
         decode_channels_lzma(wide, [1 << 26] * 9)
 
 
@@ -55,5 +55,5 @@ def test_the_encoder_refuses_what_it_cannot_write(monkeypatch):
     with pytest.raises(EncodeError, match="effort is 10"):
         encode_channels_lzma([], effort=10)
     monkeypatch.setattr(lzma_mode, "MAX_RAW", 11)
-    with pytest.raises(EncodeError, match="12 bytes before LZMA, limit 11"):
+    with pytest.raises(EncodeError, match="12 bytes uncompressed, limit 11"):
         encode_channels_lzma([np.zeros(12, np.int32)])

@@ -132,7 +132,7 @@ def test_the_first_slice_with_the_header_takes_what_was_asked():
 
 
 def test_slices_that_cannot_be_are_refused(monkeypatch):
-    with pytest.raises(EncodeError, match="slices of 5 bytes, expected 0 or 1000 and more"):
+    with pytest.raises(EncodeError, match="slices of 5 bytes, expected 0 or at least 1000"):
         encode(scene(), slices=5)
     with pytest.raises(EncodeError, match="slices in mode lzma"):
         encode(scene(), slices=5000, mode="lzma")

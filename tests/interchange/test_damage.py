@@ -125,7 +125,7 @@ def test_a_few_bytes_that_stand_for_many_numbers_are_refused(tmp_path):
     path = tmp_path / "a.4dgs"
     path.write_bytes(fourdgs_bytes([(0.0, many, np.arange(len(many.means)))], 1.0))
     assert path.stat().st_size < 2000
-    with pytest.raises(DataError, match="a.4dgs: holds more than 1,0.* numbers in "):
+    with pytest.raises(DataError, match="a.4dgs: more than 1,0.* numbers in "):
         read_model(str(path), 30)
 
 

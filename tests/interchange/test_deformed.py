@@ -163,7 +163,7 @@ def test_broken_networks_are_one_line(tmp_path, kind, file, change, message):
     [
         ("cfg_args", None, "cfg_args: no_ds is missing, expected True or False"),
         ("cfg_args", b"Namespace(no_ds=maybe, no_dr=True)", "no_ds is maybe, expected True or False"),
-        ("cfg_args", b"Namespace(grid_pe=2, no_ds=True)", "has grid_pe=2, expected a model without"),
+        ("cfg_args", b"Namespace(grid_pe=2, no_ds=True)", "has grid_pe=2, expected 0 or False"),
         ("cfg_args", b"Namespace(empty_voxel=True)", "has empty_voxel=True"),
         ("cfg_args", OFF + b", static_mlp=True)", "has no tensor deformation_net.static_mlp.1.weight"),
         ("cfg_args", OFF + b", no_dshs=False)", r"shs_deform.3.weight has shape \(48, 32\), expected \(12, 32\)"),
@@ -196,7 +196,7 @@ def test_import_says_how_to_learn_from_them(tmp_path, cli, kind):
     run = kind(make_splats()).save(tmp_path / "run", make_splats())
     result = cli("import_model", run, "-o", tmp_path / "model.pt")
     assert result.code == 1 and len(result.error_lines) == 1 and not (tmp_path / "model.pt").exists()
-    assert f"pd4dgs-train teacher:{run} learns from it" in result.err
+    assert f"train with pd4dgs-train teacher:{run}" in result.err
 
 
 def test_teaching(tmp_path, cli, monkeypatch):

@@ -106,7 +106,7 @@ def test_gaussforge_reads_the_spz_back(capfdbinary):
 
 def test_spz_refuses_positions_out_of_range():
     pytest.importorskip("gaussforge")
-    with pytest.raises(DataError, match="a Gaussian lies .* units from 0, SPZ holds 2048 at most"):
+    with pytest.raises(DataError, match="a Gaussian lies .* units from 0, expected less than 2048"):
         spz_bytes(make_splats().scaled(1e4))
 
 

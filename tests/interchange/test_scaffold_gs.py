@@ -179,7 +179,7 @@ def test_unsupported_models_are_refused(tmp_path, cli):
 
 def test_an_appearance_has_to_be_chosen(tmp_path, cli):
     Checkpoint(appearance=True).write(tmp_path / "run")
-    assert "choose the appearance of one of 5 with --appearance 0..4" in _fails(tmp_path, cli)
+    assert "choose one of 5 pictures with --appearance 0..4" in _fails(tmp_path, cli)
     assert "--appearance 0..4" in _fails(tmp_path, cli, "--appearance", 5)
 
 

@@ -228,12 +228,12 @@ def _header(version: int, count: int, streams: int = 0) -> bytes:
 @pytest.mark.parametrize(
     "data, message",
     [
-        (b"", "is no SPZ file, expected one that begins with NGSP"),
-        (b"junk" * 20, "is no SPZ file"),
-        (gzip.compress(b"abc"), "is no SPZ file, expected one that begins with NGSP"),
-        (gzip.compress(_header(3, 5) + bytes(1 << 24)), "bytes, for 5 Gaussians in"),
-        (gzip.compress(_header(3, 2**32 - 1) + bytes(99)), "says it has 4,294,967,295 Gaussians, expected 10,000,000"),
-        (_header(4, 5, 1) + struct.pack("<IIQQQ", 32, 0, 0, 9, 1 << 40), "bytes, for 5 Gaussians in"),
+        (b"", "is not an SPZ file, expected it to begin with NGSP"),
+        (b"junk" * 20, "is not an SPZ file"),
+        (gzip.compress(b"abc"), "is not an SPZ file, expected it to begin with NGSP"),
+        (gzip.compress(_header(3, 5) + bytes(1 << 24)), "unpacks to more bytes than 5 Gaussians need"),
+        (gzip.compress(_header(3, 2**32 - 1) + bytes(99)), "declares 4,294,967,295 Gaussians, expected 10,000,000"),
+        (_header(4, 5, 1) + struct.pack("<IIQQQ", 32, 0, 0, 9, 1 << 40), "unpacks to more bytes than 5 Gaussians need"),
         (gzip.compress(_header(3, 5)), "gaussforge cannot read it"),
     ],
     ids=["empty", "junk", "other bytes", "a bomb", "a count", "a bomb of version 4", "no Gaussians"],

@@ -681,7 +681,7 @@ def test_every_control_has_a_name_and_is_reached_by_key(page, server):
     assert names == ["Dynamic scene", "Play", "Time", "Highest level", "Reset the view", "Full screen"]
     status = player.locator("[part=status]").inner_text()
     assert status.startswith("level 2 of 2 · ")
-    assert status.endswith(" · no GPU: the CPU draws, fewer pixels while the picture moves")
+    assert status.endswith(" · no GPU: drawn by the CPU, with fewer pixels in motion")
 
 
 #: Of the headset of test-browser/headset.js: the head, then of each eye metres to the right and tangents of its sides.

@@ -92,7 +92,7 @@ def test_bad_urls_and_missing_files_are_one_line(cli, scene_bytes, verb):
     assert done.code == 1 and "begins with 3c 68 74 6d 6c 3e" in done.err
     with FaultyServer(b"") as server:
         done = cli(verb, server.url)
-    assert done.code == 1 and f"{server.url}: 0 bytes end inside the preamble" in done.err
+    assert done.code == 1 and f"{server.url}: truncated in the preamble: 0 bytes" in done.err
 
 
 def test_the_header_is_found_where_it_ends(scene_bytes):
