@@ -111,8 +111,8 @@ class ErrorBound:
 def rounding_bounds(symbols: SceneSymbols) -> dict[str, float]:
     """Returns the largest error of rounding to the nearest symbol, rounded up to binary32, by field of Steps that the
     symbols use. The symbol farthest from 0 has the largest bound."""
-    # They hold in every step class c: an error is at most Q/2 2^c plus half a unit in the last place, less than 2^c
-    # times the bound.
+    # They hold in every step class c: an error is at most 2^c Q/2 plus half a unit in the last place, and 2^c times the
+    # bound is no less.
     farthest: dict[str, int] = {}
     for layer in symbols.layers:
         found = list(symbols.grid.farthest(layer.attributes, layer.classes).items())

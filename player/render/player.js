@@ -299,7 +299,7 @@ export class Player extends Clip {
       powerPreference: "high-performance",
     });
     if (!gl) {
-      setTimeout(() => this._fail(new Error("this browser has no WebGL2, which the player draws with")));
+      setTimeout(() => this._fail(new Error("this browser has no WebGL2, which the player needs")));
       return;
     }
     if (gl.isContextLost()) return;
