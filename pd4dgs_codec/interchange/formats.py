@@ -60,7 +60,7 @@ def checked(
     good = finite_rows(parts)
     good &= (np.linalg.norm(quats, axis=1) > 0) & (scales >= 0).all(axis=1) & (opacities >= 0) & (opacities <= 1)
     if not good.any():
-        raise DataError(f"{where}: none of {n} Gaussians is valid (finite, quaternion not 0), expected one at least")
+        raise DataError(f"{where}: none of {n} Gaussians is finite with a quaternion other than 0, expected one")
     kept = {name: np.ascontiguousarray(array[good], np.float32) for name, array in parts.items()}
     return Splats(**kept | {"quats": unit(kept["quats"])})
 

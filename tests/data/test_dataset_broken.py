@@ -167,7 +167,7 @@ CASES: list[tuple[str, str, Any, str]] = [
     ("blender", "points.ply", ply("ascii", b"1 2 3\n"), "1 vertex lines, expected 2"),
     ("blender", "points.ply", ply("ascii", b"1 2 3\n1 2\n"), "vertex lines are not 3 numbers"),
     ("blender", "points.ply", ply("ascii", b"1\n2\n", "property float x\n"), "expected x, y, z once each"),
-    ("blender", "points.ply", ply("ascii", b"", "property list uchar int i\n"), "not a scalar"),
+    ("blender", "points.ply", ply("ascii", b"", "property list uchar int i\n"), "expected a scalar"),
     ("blender", "points.ply", ply("ascii").replace(b"2\n", b"99999999999\n", 1), "0 vertex lines"),
     ("iphone", CAMERA, {"focal_length": NAN}, "0_00000.json: focal_length is nan"),
     ("iphone", CAMERA, {"focal_length": None}, "0_00000.json: focal_length is None"),
@@ -217,7 +217,7 @@ CASES: list[tuple[str, str, Any, str]] = [
     ("record3d", "metadata", {"w": 8}, "expected 8x"),
     ("record3d", "rgbd/3.png", None, "image is missing"),
     ("panoptic", "train_meta.json", lambda m: m | {"k": m["k"][:1]}, "lists of equal length"),
-    ("panoptic", "train_meta.json", lambda m: m | {"fn": [row[:1] for row in m["fn"]]}, "instant 0: expected k, w2c"),
+    ("panoptic", "train_meta.json", lambda m: m | {"fn": [row[:1] for row in m["fn"]]}, "instant 0: expected lists"),
     ("panoptic", "train_meta.json", {"fn": [["../x.png"] * CAMERAS] * INSTANTS}, "../x.png' is not the name"),
     ("panoptic", "train_meta.json", {"fn": [["9/a.png"] * CAMERAS] * INSTANTS}, "image is missing"),
     (
