@@ -234,7 +234,7 @@ CASES: list[tuple[str, str, Any, str]] = [
     ("panoptic", "init_pt_cld.npz", bomb(zipfile.ZIP_LZMA), "data is compressed by method 14, expected deflate"),
     ("panoptic", "init_pt_cld.npz", bomb()[:-30], "not an archive of numpy"),
     ("panoptic", "init_pt_cld.npz", b"no archive", "not an archive of numpy"),
-    ("neu3d", "poses_bounds.npy", lambda poses: poses[:2], "2 poses in poses_bounds.npy and 3 videos"),
+    ("neu3d", "poses_bounds.npy", lambda poses: poses[:2], "3 videos cam*.mp4, expected 2 as in poses"),
     ("neu3d", "poses_bounds.npy", lambda poses: poses[:, :16], "rows of 17"),
     ("neu3d", "poses_bounds.npy", times(COLUMN * NAN), "expected finite numbers"),
     ("neu3d", "poses_bounds.npy", times(np.where(COLUMN < 3, 1.5, 1)), "is not a rotation"),

@@ -30,7 +30,7 @@ def test_one_frame(blender):
 def test_one_place_and_one_instant_are_remarked(blender):
     folder = blender()
     change_frames(folder, lambda i: {"transform_matrix": pose(0.3)})
-    assert ["one place" in r for r in load(folder).remarks()] == [True]
+    assert ["one viewpoint" in r for r in load(folder).remarks()] == [True]
     change_frames(folder, lambda i: {"transform_matrix": pose(0.2 * i), "time": 7.5})
     dataset = load(folder)
     assert ["one instant" in r for r in dataset.remarks()] == [True] and dataset.time_range == (0.0, 1.0)
