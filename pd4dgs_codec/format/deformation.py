@@ -98,8 +98,8 @@ def check_tensors(tensors: Deformation, kind: LayerKind, widths: Widths, below: 
     expect(not unknown, f"{own}: networks {unknown}, expected some of {list(kind.network_ids)}")
     missing = [name for name in required if name not in tensors.networks]
     expect(not missing, f"{own} networks {missing} are missing")
-    scales, wanted = len(tensors.planes), "at least one" if kind.layer else "none"
-    expect(bool(scales) == bool(kind.layer), f"{own}: {scales} scales of planes, expected {wanted}")
+    scales, some = len(tensors.planes), "at least one" if kind.layer else "none"
+    expect(bool(scales) == bool(kind.layer), f"{own}: {scales} scales of planes, expected {some}")
     expect(not below or len(below.networks) > 1, f"{LAYER_KINDS[1].name} has no head, expected one below {own}")
     channels_below = len(below.planes[0]["xy"]) if below else 0
     for s, planes in enumerate(tensors.planes):
