@@ -250,7 +250,7 @@ CASES: list[tuple[str, str, Any, str]] = [
     ("neu3d", "poses_bounds.npy", header("{'descr': [('a', 'f8')], 'fortran_order': False, 'shape': ()}"), "expected"),
     ("neu3d", "poses_bounds.npy", b"PK\x03\x04", "not a .npy file of numbers"),
     ("neu3d", "cam1.mp4", b"no video", "cam1.mp4: cannot be decoded"),
-    ("neu3d", "cam1.mp4", None, "3 poses in poses_bounds.npy and 2 videos"),
+    ("neu3d", "cam1.mp4", None, "2 videos cam*.mp4, expected 3 as in poses"),
     ("colmap", MODEL + "cameras.bin", lambda data: data[:4], "cameras.bin: ends at byte 4"),
     ("colmap", MODEL + "images.bin", lambda data: data[:-1], "images.bin: ends at byte"),
     ("colmap", MODEL + "points3D.bin", lambda data: data[:100], "points3D.bin: ends at byte 100"),
