@@ -74,7 +74,7 @@ FAULTY = {
     "too long": (bytes((1 << 18) + 1), LimitExceeded, "262145 bytes compressed"),
     "not canonical": (frame(b"\xda\x00\x01a"), Malformed, "shortest form"),
     "a list": (frame(canonical.pack([1])), Malformed, "list, expected a map"),
-    "an unknown key": (frame(canonical.pack({9: 1})), UnsupportedFeature, "unknown key 9"),
+    "an unknown key": (frame(canonical.pack({9: 1})), UnsupportedFeature, "unknown critical key 9"),
     "a title of bytes": (frame(canonical.pack({1: b"a"})), Malformed, "title, expected one line"),
     "an empty title": (frame(canonical.pack({1: ""})), Malformed, "title, expected one line"),
     "quality in a list": (frame(canonical.pack({5: [1.0]})), Malformed, "by level"),

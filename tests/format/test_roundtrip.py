@@ -121,7 +121,9 @@ FAULTS = {
         "anchor_q", lambda a: np.zeros_like(a), mask=tuple(np.full(6, 9, np.uint8) for _ in range(3))
     ),
     "layer 1: a code below 3, expected 0 or 3..255": broken("mask", lambda m: (m[0], np.full_like(m[1], 2), m[2])),
-    "mask of layer 2 falls": broken("mask", lambda m: (np.full_like(m[0], 9),) * 2 + (np.full_like(m[0], 8),)),
+    "mask of layer 2 is below the mask of the layer before": broken(
+        "mask", lambda m: (np.full_like(m[0], 9),) * 2 + (np.full_like(m[0], 8),)
+    ),
     "scaffold networks .'color'. are missing": broken("networks", lambda n: {k: n[k] for k in n if k != "color"}),
     "layers": broken("layers", lambda _: (0, 2, 1)),
     "step of feature": broken("steps", lambda s: replace(s, feature=0.0)),

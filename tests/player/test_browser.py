@@ -476,7 +476,7 @@ def element(page: Any, server: Server, attributes: str, code: Server | None = No
 
 FAULTS: dict[str, tuple[Any, int | None, str]] = {
     "damaged in layer 1": (lambda data, ends: flipped(data, ends[1] - 50, 4), 0, "CRC-32"),
-    "cut in layer 2": (lambda data, ends: data[: ends[2] - 20], 1, "needs"),
+    "cut in layer 2": (lambda data, ends: data[: ends[2] - 20], 1, "truncated"),
     "damaged in layer 0": (lambda data, ends: flipped(data, ends[0] - 50, 4), None, "CRC-32"),
     "foreign": (lambda *_: b"<!doctype html><p>no such scene" * 20, None, "pd4"),
     "absent": (lambda *_: None, None, "404"),
