@@ -25,7 +25,7 @@ from pd4dgs_codec.train.phases.opening import OpenTime, few_instants
 from pd4dgs_codec.train.phases.prefixes import Prefixes
 from pd4dgs_codec.train.phases.prune import Prune
 from pd4dgs_codec.train.phases.quantisation import FitQuantisation
-from pd4dgs_codec.train.rollout import draw_levels, next_view, view_for_level
+from pd4dgs_codec.train.rollout import draw_levels, next_view, without_motion
 from pd4dgs_codec.train.schedule import PRUNING_ROUNDS, Schedule, updated_rho
 from pd4dgs_codec.train.ssim import image_loss
 from pd4dgs_codec.train.state import TrainState
@@ -193,10 +193,12 @@ class Learner(TrainState):
 
         only: bool [N], the anchors to render, if not all. Raises NotFinite if the model has diverged.
         """
-        config, shown = self.config, view_for_level(self, self.picture(index), level)
+        config, shown = self.config, self.picture(index)
         picture = render(self.model, level, shown.view.time, shown.view.camera, self.rounding(), only)
         if picture.meta["means2d"].requires_grad:
             picture.meta["means2d"].retain_grad()
+        if level == 0:
+            shown = without_motion(self, shown, picture.image)
         part = shown.content(picture.alpha)
         l1, dissimilarity = image_loss(picture.image, shown.pixels[part].float() / 255, shown.weights[part], part)
         terms = {"l1": l1, "dssim": dissimilarity}

@@ -3,7 +3,7 @@
 With a key instant t*, level 0 is the scene at t*, and higher levels add F(x, t) - F(x, t*). The levels then agree, so
 most steps train the highest level, from views whose times spread from t* (`phases.opening`). The first steps have no
 deformation yet and see only views near t*: with views of all times, moving objects would fade. Later a share of the
-steps trains level 0, from views near t* or from any view in the pixels that motion does not change, so that level 0
+steps trains level 0, from views near t* or from any view, without the pixels that motion has changed, so that level 0
 shows static content completely.
 
 The paper's rollouts have no key instant: level 0 learns the mean over time.
@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from pd4dgs_codec.model.picture import render
 from pd4dgs_codec.train.phases.levels import held_back_views
@@ -26,7 +27,7 @@ from pd4dgs_codec.train.state import TrainingView, TrainState
 STILL_ODDS, NEAR_ODDS = 0.15, 1 / 3
 #: The views near the key instant: a share of all, and the fewest.
 NEAR_SHARE, NEAR_VIEWS = 1 / 12, 4
-#: Motion changes a pixel if a colour differs by at least this between level 0 and the highest level.
+#: Motion has changed a pixel if a colour differs by at least this between level 0 and the training image.
 STILL_CONTRAST = 0.15
 #: Share of the steps that train level 1 where there is a level 2.
 GLOBAL_ODDS = 0.1
@@ -93,18 +94,20 @@ def near_key(state: TrainState, among: list[int]) -> list[int]:
     return nearest[: max(NEAR_VIEWS, round(len(among) * NEAR_SHARE))]
 
 
+@torch.no_grad()
 def views_by_level(state: TrainState, views: Sequence[TrainingView]) -> dict[int, list[TrainingView]]:
-    """By trained level, the views with the pixel weights of `view_for_level`."""
-    return {level: [view_for_level(state, view, level) for view in views] for level in state.trained_levels()}
+    """By trained level, the views with the pixel weights that train it."""
+    found, rounding = {level: list(views) for level in state.trained_levels()}, state.rounding(noisy=False)
+    if 0 in found:
+        images = (render(state.model, 0, view.view.time, view.view.camera, rounding).image for view in views)
+        found[0] = [without_motion(state, *pair) for pair in zip(views, images, strict=True)]
+    return found
 
 
-def view_for_level(state: TrainState, shown: TrainingView, level: int) -> TrainingView:
-    """The view with its pixel weights for training `level`. At level 0 of a scene with a key instant, pixels that
-    motion changes have weight 0."""
-    if level > 0 or state.key is None or state.practising or state.position < state.schedule.coarse_end:
+def without_motion(state: TrainState, shown: TrainingView, image: Tensor) -> TrainingView:
+    """The view with the pixel weights that train level 0, of which `image` [H, W, 3] is its picture. In a scene with a
+    key instant, pixels that motion has changed have weight 0."""
+    if state.key is None or state.practising or state.position < state.schedule.coarse_end:
         return shown
-    with torch.no_grad():
-        viewpoint = shown.view.time, shown.view.camera, state.rounding(noisy=False)
-        still, moved = (render(state.model, drawn, *viewpoint).image for drawn in (0, state.model.level))
-    same = (still - moved).abs().amax(-1) < STILL_CONTRAST
+    same = (image.detach() - shown.image).abs().amax(-1) < STILL_CONTRAST
     return replace(shown, weights=shown.weights * same)
