@@ -24,7 +24,8 @@ FIRST, TRIAL = 1 / 12, 1 / 6
 FEW_INSTANTS = ((0.3, 3), (0.5, 5), (0.7, 9), (1.0, 17))
 #: Steps of the trial: a share of the run, and the fewest.
 TRIAL_SHARE, MIN_TRIAL = 1 / 15, 75
-#: Motion predicts if it gains MIN_GAIN dB over the static level 0 in whole pictures, so that missed motion counts, ...
+#: Motion predicts if it gains MIN_GAIN dB over the static level 0 in whole pictures, so that missed motion counts, and
+#: half as much half way through the trial, ...
 MIN_GAIN = 4.2
 #: ... over at most VIEWS views whose distance from the key instant is BEYOND, from and to, times the window.
 VIEWS, BEYOND = 12, (1.5, 2.0)
@@ -44,11 +45,14 @@ class OpenTime(phases.Phase):
         """Sets `TrainState.opened` if the highest level does not predict motion in a trial, and undoes the trial."""
         before = state.snapshot()
         try:
-            self._practise(state.model.level, max(MIN_TRIAL, state.steps_in(TRIAL_SHARE)))
-            record["predicted_gain"] = gain = workers.alike(lambda: _predicted(state))
+            for needed in (MIN_GAIN / 2, MIN_GAIN):
+                self._practise(state.model.level, max(MIN_TRIAL, state.steps_in(TRIAL_SHARE)) // 2)
+                record["predicted_gain"] = gain = workers.alike(lambda: _predicted(state))
+                state.opened = gain < needed
+                if state.opened:
+                    break
         finally:
             state.return_to(before)
-        state.opened = gain < MIN_GAIN
 
 
 def window(state: TrainState) -> float:
