@@ -55,8 +55,8 @@ def _add_views(p: options.Parser, views: int) -> None:
 
 def _complete_views(args: argparse.Namespace, views: int, rendered: bool = True) -> None:
     """Sets the defaults of `_add_views`. Raises UsageError for an option that needs images or a dataset without one."""
-    options.conditional(args, rendered, CHECKPOINT, data=None, views=views, downscale=1)
-    options.conditional(args, args.data, "needs --data SOURCE", holdout=8)
+    options.conditional(args, rendered, CHECKPOINT, data=None, views=views, downscale=options.READING["downscale"])
+    options.conditional(args, args.data, "needs --data SOURCE", holdout=options.READING["holdout"])
 
 
 def _frames(args: argparse.Namespace, info: SceneInfo) -> list[Frame]:

@@ -88,8 +88,9 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
         raise UsageError("-o - and --json both write to stdout, expected -o FILE")
     fits, gains = args.slices or args.target_size, args.layers == "auto"
     options.conditional(args, fits or gains, "needs --layers auto, --slices or --target-size", data=None)
-    options.conditional(args, args.data or fits, "needs --data, --slices or --target-size", downscale=1)
-    options.conditional(args, args.data, "needs --data SOURCE", holdout=8, views=16)
+    downscale, holdout = options.READING["downscale"], options.READING["holdout"]
+    options.conditional(args, args.data or fits, "needs --data, --slices or --target-size", downscale=downscale)
+    options.conditional(args, args.data, "needs --data SOURCE", holdout=holdout, views=16)
     needs = "needs --data SOURCE and --layers auto"
     options.conditional(args, args.data and gains, needs, min_gain=ENCODE_MIN_DB_PER_MEGABYTE)
     common.check_output(args.output, args.overwrite)

@@ -109,7 +109,7 @@ def _check_usage(args: argparse.Namespace) -> str:
         raise UsageError(f"found -o {args.output}, expected images such as out/%04d.png, or a .gif or .mp4")
     if args.data and args.orbit:
         raise UsageError("found --orbit and --data, expected one of them")
-    options.conditional(args, args.data, "needs --data SOURCE", split="test", holdout=8)
+    options.conditional(args, args.data, "needs --data SOURCE", split="test", holdout=options.READING["holdout"])
     options.conditional(args, kind in VIDEOS, "needs a .gif or .mp4 as -o", fps=20.0)
     if kind not in VIDEOS and "%" in args.output:
         name = Path(args.output).name

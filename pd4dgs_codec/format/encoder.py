@@ -203,8 +203,9 @@ def _write_slices(layer: LayerSymbols, options: EncodeOptions, size: float, util
         least = 1 if found or layer.kind.layer == 0 else 0
         if found:
             fixed, room = 0, LATER * options.slices - CHUNK_OVERHEAD
-            number = math.ceil((costs[-1] - costs[done]) * scale / (room * SLACK))
-            room = room if number == 1 else (costs[-1] - costs[done]) * scale / number / SLACK
+            left = (costs[-1] - costs[done]) * scale
+            number = math.ceil(left / (room * SLACK))
+            room = room if number == 1 else left / number / SLACK
         elif least:
             room = max(room, 2 * fixed)
         tries: list[tuple[bool, int, _Slice, Past[Fitted]]] = []  # fits, anchors, slice, state for the next slice

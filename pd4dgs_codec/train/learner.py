@@ -219,7 +219,7 @@ class Learner(TrainState):
         if measured:
             record["active"] = self.active_anchors()
         if self.share is not None:
-            record["place"] = self.position
+            record["position"] = self.position
         self._before = self.position
         self.iteration += 1
 

@@ -124,14 +124,14 @@ def test_a_time_limit_is_kept_and_the_schedule_completes(dataset, tmp_path, monk
     assert trainer.seconds == pytest.approx(clock.now - begun) == pytest.approx(LIMIT, rel=0.03)
     assert trainer.finished and turns == list(range(PRUNING_ROUNDS))
     schedule, stored = trainer.learner.schedule, checkpoint.load(tmp_path / "m.pt")[1]
-    place = trainer.learner.position
-    assert place == schedule.iterations and schedule.phases_not_reached(place) == []
+    position = trainer.learner.position
+    assert position == schedule.iterations and schedule.phases_not_reached(position) == []
     assert json.loads(stored["config"])["iterations"] is None
     records = read_log(tmp_path / "log.jsonl")
     coarse = [r["seconds"] for r in records if r["level"] == 0 and "rate" not in r]
     assert {r["level"] for r in records} == {0, 1, 2} and any("grown" in r for r in records)
     assert max(coarse) < (0.5 if machine == "stopped" else 0.4) * LIMIT  # the rate term begins at a third
-    assert schedule.progress(records[-1]["place"]) > 0.8  # the cooldown, ten steps long, went on to its end
+    assert schedule.progress(records[-1]["position"]) > 0.8  # the cooldown, ten steps long, went on to its end
     assert len(trainer.curve) >= 0.75 * loop.CURVE_POINTS  # a pause passes some over
 
 
@@ -156,8 +156,8 @@ def test_a_resumed_timed_run_spends_what_is_left(dataset, tmp_path, monkeypatch,
     second.run(tmp_path / "n.pt", log=tmp_path / "log.jsonl")
     assert second.finished and second.seconds == pytest.approx(limit, rel=0.03)
     assert second.seconds - first.seconds == pytest.approx(clock.now - begun)
-    places = [r["place"] for r in read_log(tmp_path / "log.jsonl")]
-    assert places == sorted(places) and places[0] == first.learner.position
+    positions = [r["position"] for r in read_log(tmp_path / "log.jsonl")]
+    assert positions == sorted(positions) and positions[0] == first.learner.position
 
 
 def test_a_pause_beyond_the_limit_leaves_a_cut_run_that_says_so(dataset, tmp_path, monkeypatch, clock):
