@@ -11,13 +11,11 @@ The paper's rollouts have no key instant: level 0 learns the mean over time.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.model.picture import render
 from pd4dgs_codec.train.phases.levels import held_back_views
 from pd4dgs_codec.train.phases.opening import window, within
 from pd4dgs_codec.train.schedule import CAPACITY_WEIGHTED, LOWEST, TOP, UNIFORM, Probabilities, rollout_probabilities
@@ -92,16 +90,6 @@ def near_key(state: TrainState, among: list[int]) -> list[int]:
     key, views = state.key or 0.0, state.views.views
     nearest = sorted(among, key=lambda index: abs(views[index].time - key))
     return nearest[: max(NEAR_VIEWS, round(len(among) * NEAR_SHARE))]
-
-
-@torch.no_grad()
-def views_by_level(state: TrainState, views: Sequence[TrainingView]) -> dict[int, list[TrainingView]]:
-    """By trained level, the views with the pixel weights that train it."""
-    found, rounding = {level: list(views) for level in state.trained_levels()}, state.rounding(noisy=False)
-    if 0 in found:
-        images = (render(state.model, 0, view.view.time, view.view.camera, rounding).image for view in views)
-        found[0] = [without_motion(state, *pair) for pair in zip(views, images, strict=True)]
-    return found
 
 
 def without_motion(state: TrainState, shown: TrainingView, image: Tensor) -> TrainingView:

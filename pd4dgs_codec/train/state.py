@@ -189,9 +189,10 @@ class TrainState:
         progress = self.schedule.progress(self.position)
         return self.views.reduced(index, reduction(progress, self.config.small_pictures))
 
-    def trained_levels(self) -> range:
-        """The levels that the run trains."""
-        return range(self.model.level if self.config.rollout == "top" else 0, self.model.level + 1)
+    def measured_levels(self) -> list[int]:
+        """The levels in which phases measure errors, ascending: level 0, if the run trains it, and the highest. Level 1
+        below a level 2 needs no more than they do."""
+        return sorted({self.model.level if self.config.rollout == "top" else 0, self.model.level})
 
     # -- measures --------------------------------------------------------------------------------------------------
 

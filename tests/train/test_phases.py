@@ -223,7 +223,7 @@ def error_of(trainer, level: int) -> float:
 
 def test_the_added_error_is_about_that_of_leaving_an_anchor_out(trained, monkeypatch):
     monkeypatch.setattr(prune, "LEARNT", np.inf)
-    errors = added_error(trained.model, {1: trained.learner.views.spread(6)}, EXACT, prune.omission_error)[0].numpy()
+    errors = added_error(trained.model, [1], trained.learner.views.spread(6), EXACT, prune.omission_error)[0].numpy()
     pictures = pictures_of(trained, 1)
     near = np.flatnonzero(np.isfinite(errors) & (errors > 0))
     chosen = near[np.argsort(errors[near])][:: max(1, len(near) // 40)]
@@ -481,8 +481,7 @@ def test_whitened_channels_have_equal_errors_and_no_correlation():
 
 def whitened(trainer: Trainer) -> None:
     learner = trainer.learner
-    views = dict.fromkeys(range(learner.model.level + 1), learner.views.spread(2))
-    whiten(learner.model, learner.optimiser, views, EXACT)
+    whiten(learner.model, learner.optimiser, learner.measured_levels(), learner.views.spread(2), EXACT)
 
 
 def test_whitening_keeps_pictures_and_the_products_of_gradients_and_parameters(dataset):

@@ -8,7 +8,7 @@ anchors, scattered over the scene, and the rest is measured again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
@@ -21,7 +21,6 @@ from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train import workers
 from pd4dgs_codec.train.phases import Phase, long_enough
 from pd4dgs_codec.train.phases.levels import held_back_views
-from pd4dgs_codec.train.rollout import views_by_level
 from pd4dgs_codec.train.schedule import PRUNING_ROUNDS
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
@@ -41,9 +40,9 @@ ErrorOf = Callable[..., tuple[Tensor, Tensor, Tensor]]
 class Prune(Phase):
     """One of PRUNING_ROUNDS rounds, which concerns only the anchors whose `round_of` it is.
 
-    Removes anchors whose absence together adds at most a share of the squared error to any trained level, then removes
-    from level 0 anchors whose absence adds at most as much there. Anchors that no view shows stay. If none would be
-    left, all stay.
+    Removes anchors whose absence together adds at most a share of the squared error to level 0 and to the highest
+    level, then removes from level 0 anchors whose absence adds at most as much there. Anchors that no view shows stay.
+    If none would be left, all stay.
     """
 
     def __init__(self, turn: int):
@@ -56,13 +55,12 @@ class Prune(Phase):
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
         """Prunes, and logs how many anchors left the model and how many left layer 0."""
-        model, levels = state.model, state.trained_levels()
+        model, levels = state.model, state.measured_levels()
         share, before, held_back = state.config.prune / PRUNING_ROUNDS, len(model.anchor_q), held_back_views(state)
         order = [i for i in range(len(state.views)) if i not in held_back]
         stride = -(-len(order) // VIEWS)
         views = [state.views[i] for i in order[self.turn % stride :: stride]]
-        by_level = views_by_level(state, views)
-        errors = added_error(model, by_level, state.rounding(noisy=False), omission_error).to(state.device)
+        errors = added_error(model, levels, views, state.rounding(noisy=False), omission_error).to(state.device)
         errors[:, round_of(model.anchor_q) != self.turn] = torch.inf
         redundant = least(errors.amax(0), share)
         keep = (~redundant | redundant.all()).nonzero()[:, 0]
@@ -78,13 +76,13 @@ class Prune(Phase):
 
 
 def added_error(
-    model: Model, views: Mapping[int, Sequence[TrainingView]], rounding: Rounding, error_of: ErrorOf
+    model: Model, levels: Sequence[int], views: Sequence[TrainingView], rounding: Rounding, error_of: ErrorOf
 ) -> Tensor:
-    """float64 [levels, N], on the CPU and equal in all workers: the error of each anchor by `error_of`, summed over the
-    `views` of a level and relative to their present squared error. Infinite where no view shows the anchor."""
+    """float64 [levels, N], on the CPU and equal in all workers: the error of each anchor by `error_of` at these levels,
+    summed over the views and relative to their present squared error. Infinite where no view shows the anchor."""
 
     def measure() -> Tensor:
-        found = [relative_error(model, level, views[level], rounding, error_of) for level in views]
+        found = [relative_error(model, level, views, rounding, error_of) for level in levels]
         return torch.stack([torch.where(met, error, torch.inf).cpu() for error, met in found])
 
     return workers.alike(measure)

@@ -13,7 +13,7 @@ quadruples an anchor's squared error and saves the same bits for all anchors, fr
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -26,7 +26,6 @@ from pd4dgs_codec.scene import MASK_THRESHOLD, MAX_CLASS, SCAFFOLD_NETWORKS
 from pd4dgs_codec.train import phases, workers
 from pd4dgs_codec.train.optimiser import Optimiser
 from pd4dgs_codec.train.phases.prune import added_error, relative_error
-from pd4dgs_codec.train.rollout import views_by_level
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
 #: Training views in which the error of a step is measured.
@@ -47,14 +46,14 @@ class FitQuantisation(phases.Phase):
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
         """Grades and whitens, and logs how many anchors each step class has."""
         model, config, rounding = state.model, state.config, state.rounding(noisy=False)
-        views = views_by_level(state, state.views.spread(VIEWS))
+        levels, views = state.measured_levels(), state.views.spread(VIEWS)
         found: list[int] = []
         if config.grading:
-            found = grade(model, views, config.grading, rounding)
+            found = grade(model, levels, views, config.grading, rounding)
         if config.whitening:
-            whiten(model, state.optimiser, views, rounding)
+            whiten(model, state.optimiser, levels, views, rounding)
             if config.grading:  # the features' steps have changed
-                found = grade(model, views, config.grading, rounding)
+                found = grade(model, levels, views, config.grading, rounding)
         if found:
             record["step_classes"] = found
 
@@ -62,10 +61,12 @@ class FitQuantisation(phases.Phase):
 # -- step classes ------------------------------------------------------------------------------------------------------
 
 
-def grade(model: Model, views: Mapping[int, Sequence[TrainingView]], share: float, rounding: Rounding) -> list[int]:
+def grade(
+    model: Model, levels: Sequence[int], views: Sequence[TrainingView], share: float, rounding: Rounding
+) -> list[int]:
     """Sets the attributes' centres, and step classes whose quantisation adds at most `share` to the squared error of
-    `views`, by level, beyond that of class 0. Returns how many anchors each class has."""
-    errors = added_error(model, views, rounding, rounding_error)
+    the views at any of the levels, beyond that of class 0. Returns how many anchors each class has."""
+    errors = added_error(model, levels, views, rounding, rounding_error)
     met = errors.isfinite()
     worst = torch.where(met, errors, 0.0).amax(0)  # a level of large error must not set the budget of the others
     classes = classes_within(torch.where(met.any(0), worst, torch.inf), share)
@@ -109,17 +110,19 @@ def centre(model: Model) -> Tensor:
 # -- whitening ---------------------------------------------------------------------------------------------------------
 
 
-def whiten(model: Model, optimiser: Optimiser, views: Mapping[int, Sequence[TrainingView]], rounding: Rounding) -> None:
+def whiten(
+    model: Model, optimiser: Optimiser, levels: Sequence[int], views: Sequence[TrainingView], rounding: Rounding
+) -> None:
     """Transforms the features' channels in the anchors and in all layers that read or change them. Pictures stay the
     same up to rounding, and so does the error of a step, summed over the channels."""
-    transform = workers.alike(lambda: _measured(model, views, rounding))
+    transform = workers.alike(lambda: _measured(model, levels, views, rounding))
     if transform is not None:
         _apply(model, optimiser, transform.to(model.feature.device))
 
 
-def _measured(model: Model, views: Mapping[int, Sequence[TrainingView]], rounding: Rounding) -> Tensor | None:
+def _measured(model: Model, levels: Sequence[int], views: Sequence[TrainingView], rounding: Rounding) -> Tensor | None:
     """float64 [D, D]: the transform for the model; None if no picture depends on a feature."""
-    errors = torch.stack([relative_error(model, i, views[i], rounding, _feature_error)[0] for i in views]).sum(0)
+    errors = torch.stack([relative_error(model, level, views, rounding, _feature_error)[0] for level in levels]).sum(0)
     active = model.masks(2).detach() > MASK_THRESHOLD
     if not errors.trace() > 0 or int(active.sum()) < 2:
         return None
