@@ -37,7 +37,7 @@ from pd4dgs_codec.train.schedule import PRUNING_ROUNDS, Schedule
 def short_runs_have_phases(monkeypatch):
     monkeypatch.setattr(phases, "MIN_ITERATIONS", 10)
     monkeypatch.setattr(opening, "MIN_TRIAL", 6)
-    monkeypatch.setattr(levels, "MIN_PRACTICE", 3)
+    monkeypatch.setattr(levels, "MIN_PRACTICE", (3, 3))
 
 
 def trainer_of(dataset, iterations: int = 30, steps: int = 0, **options) -> Trainer:
@@ -284,7 +284,7 @@ def selected(dataset, monkeypatch, least):
     for name in ("MIN_GAIN_1", "MIN_GAIN_2"):
         monkeypatch.setattr(levels, name, least)
     monkeypatch.setattr(levels, "SHARE_2", min(least, 0.0))
-    monkeypatch.setattr(levels, "MIN_PRACTICE", 3)
+    monkeypatch.setattr(levels, "MIN_PRACTICE", (3, 3))
     learner = trainer_of(replace(dataset, train=dataset.train * 12)).learner
     with torch.no_grad():
         for field in learner.model.deformations.values():

@@ -31,8 +31,9 @@ MIN_VIEWS = 4
 MIN_GAIN_1, SHARE_2, MIN_GAIN_2 = 1.1, 0.15, 0.5
 #: A gain counts the pixels in which the level changes a colour by MIN_CONTRAST; if there are fewer than this, it is 0.
 MIN_CONTRAST, MIN_PIXELS = 0.02, 32
-#: Steps for which the level below is trained before: a share of the run, and the fewest.
-PRACTICE, MIN_PRACTICE = 1 / 10, 75
+#: Steps for which the level below is trained before: a share of the run, and the fewest for levels 0 and 1. In short
+#: runs level 0 needs more, or level 1 gains on static scenes too.
+PRACTICE, MIN_PRACTICE = 1 / 10, (150, 75)
 
 #: A timed run of fewer steps keeps its levels: fast motion is not learnt by then, and nobody asked for so few.
 MIN_TIMED = 1000
@@ -90,7 +91,7 @@ class SelectLevels(phases.Phase):
             logits[:, below] += softplus(logits[:, level])  # the anchors of the level, without its motion
         gain = math.inf
         try:
-            self._practise(below, max(MIN_PRACTICE, state.steps_in(PRACTICE)))
+            self._practise(below, max(MIN_PRACTICE[below], state.steps_in(PRACTICE)))
             gain = workers.alike(lambda: gain_over(below))
         finally:  # a picture that is not finite ends the phase, and the level stays
             if gain >= needed:
