@@ -28,7 +28,7 @@ EVERY = 16
 MIN_VIEWS = 4
 #: Level 1 stays if its gain and that of a removed level 2, which also shows motion, sum to MIN_GAIN_1 dB. Level 2 stays
 #: if it gains at least SHARE_2 of its gain over level 0, and MIN_GAIN_2 dB.
-MIN_GAIN_1, SHARE_2, MIN_GAIN_2 = 1.1, 0.15, 0.5
+MIN_GAIN_1, SHARE_2, MIN_GAIN_2 = 0.65, 0.15, 0.5
 #: A gain counts the pixels in which the level changes a colour by MIN_CONTRAST; if there are fewer than this, it is 0.
 MIN_CONTRAST, MIN_PIXELS = 0.02, 32
 #: Steps for which the level below is trained before: a share of the run, and the fewest for levels 0 and 1. In short
