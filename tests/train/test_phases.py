@@ -481,7 +481,7 @@ def test_whitened_channels_have_equal_errors_and_no_correlation():
 
 def whitened(trainer: Trainer) -> None:
     learner = trainer.learner
-    whiten(learner.model, learner.optimiser, learner.measured_levels(), learner.views.spread(2), EXACT)
+    whiten(learner.model, learner.optimiser, range(learner.model.level + 1), learner.views.spread(2), EXACT)
 
 
 def test_whitening_keeps_pictures_and_the_products_of_gradients_and_parameters(dataset):
