@@ -216,6 +216,11 @@ def _drawable(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -
 def rasterize_gsplat(given: Sequence[Tensor], camera: Camera, background: np.ndarray, near_plane: float) -> Drawn:
     """The gsplat backend of `rasterization`, which checks the arguments. float32, dense layout."""
     *shapes, colors = (t.to(torch.float32) for t in given)
+    behind = torch.from_numpy(background).to(colors.device)
+    if not len(colors):  # gsplat 1.5.3 ends the process with a division by zero
+        alpha = colors.new_zeros(camera.height, camera.width) + sum(t.sum() for t in (*shapes, colors))
+        pixels = shapes[0][None, :, :2]
+        return behind + alpha[..., None], alpha, {"means2d": pixels, "radii": pixels.to(torch.int32)}
     viewmat, K = (colors.new_tensor(np.array(a))[None] for a in (camera.viewmat, camera.K))
     images, alphas, meta = _gsplat().rasterization(
         *_drawable(*shapes),
@@ -227,7 +232,7 @@ def rasterize_gsplat(given: Sequence[Tensor], camera: Camera, background: np.nda
         near_plane=near_plane,
         far_plane=FAR,
         eps2d=EPS2D,
-        backgrounds=torch.from_numpy(background)[None].to(colors.device),
+        backgrounds=behind[None],
         rasterize_mode="classic",
         packed=False,
     )

@@ -151,8 +151,8 @@ class _Regularisers(torch.autograd.Function):
 
 
 def regularisers(grid: Tensor, layout: PlaneLayout) -> dict[str, Tensor]:
-    """Returns the three regularisers of the planes grid [cells, C], by name."""
-    if grid.device.type == "cpu" and grid.shape[1] % LANES == 0:
+    """Returns the three regularisers of the planes grid [cells, C], on the CPU, by name."""
+    if grid.shape[1] % LANES == 0:
         values = _Regularisers.apply(grid, layout.lines)  # type: ignore[no-untyped-call]
         return dict(zip(TERMS, values, strict=True))
     return regularisers_reference(grid, layout)
@@ -310,8 +310,9 @@ def _tables(layout: PlaneLayout) -> tuple[Array, Array]:
 
 
 def proxy_bits(grid: Tensor, layout: PlaneLayout, step: float) -> Tensor:
-    """Returns the proxy, in bits, of planes grid [cells, C] at a quantisation step; its gradient reaches all values."""
-    if grid.device.type == "cpu" and grid.shape[1] % LANES == 0:
+    """Returns the proxy, in bits, of planes grid [cells, C], on the CPU, at a quantisation step. Its gradient reaches
+    all values."""
+    if grid.shape[1] % LANES == 0:
         bits: Tensor = _Proxy.apply(grid, layout, step)  # type: ignore[no-untyped-call]
         return bits
     return proxy_bits_reference(grid, layout, step)

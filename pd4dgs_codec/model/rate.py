@@ -276,14 +276,13 @@ def _sums(values: Array, classes: Array, centre: Array, power: int) -> Array:
 def row_bits(parts: Sequence[tuple[Tensor, float]], classes: Tensor, rows: Tensor) -> Tensor:
     """Returns [n], differentiable: R summed over each of `rows` (int64 [n], active, none twice) of all parts.
 
-    parts: values [N, c] and their step. classes: int8 [N], the step class of each active row, -1 of others. A scalar's
-    step is step * 2^class. Its prior has the mean and standard deviation of its column over the class's active rows.
+    All on the CPU. parts: values [N, c] and their step. classes: int8 [N], the step class of each active row, -1 of
+    others. A scalar's step is step * 2^class. Its prior has the mean and standard deviation of its column over the
+    class's active rows.
     """
-    if classes.device.type == "cpu":
-        values, steps = zip(*parts, strict=True)
-        bits: Tensor = _RowBits.apply(classes, rows, steps, *values)  # type: ignore[no-untyped-call]
-        return bits
-    return row_bits_reference(parts, classes, rows)
+    values, steps = zip(*parts, strict=True)
+    bits: Tensor = _RowBits.apply(classes, rows, steps, *values)  # type: ignore[no-untyped-call]
+    return bits
 
 
 def row_bits_reference(parts: Sequence[tuple[Tensor, float]], classes: Tensor, rows: Tensor) -> Tensor:

@@ -169,7 +169,7 @@ class Learner(TrainState):
         for parameter, gradient in rest.gradients:
             if parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
-            parameter.grad.add_(gradient, alpha=share)
+            parameter.grad.add_(gradient.to(parameter.device), alpha=share)
         record["loss"] = float(loss.detach()) + rest.loss
         record |= {name: float(value.detach()) for name, value in terms.items()} | rest.terms
         return picture

@@ -1,8 +1,9 @@
 """The terms of the loss that need no picture, with their gradients: planes, rate, temporal mask consistency.
 
-A step computes them on a second thread while it renders, which makes steps of levels 1 and 2 a tenth faster. Their
-graph has leaves of its own: torch (2.13) holds a leaf's lock while it waits for the interpreter's, so two threads whose
-graphs share a leaf can deadlock.
+The CPU computes them on a second thread while the step renders, which makes steps of levels 1 and 2 a tenth faster. On
+a GPU they would be most of a step's operations, each too small to be worth its start. Their graph has leaves of its
+own: torch (2.13) holds a leaf's lock while it waits for the interpreter's, so two threads whose graphs share a leaf can
+deadlock.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ class ModelLoss:
         fields = {layer: field for layer, field in model.deformations.items() if layer <= level}
         parameters = [getattr(model, name) for name in PER_ANCHOR]
         parameters += [feature for field in fields.values() for feature in field.features]
-        leaves = {parameter: parameter.detach().requires_grad_() for parameter in parameters}
+        leaves = {parameter: parameter.detach().cpu().requires_grad_() for parameter in parameters}
 
         def find() -> Terms:
             found: list[Weighted] = []
@@ -67,7 +68,7 @@ class ModelLoss:
             gradients = [(p, g) for p, g in zip(leaves, by_leaf, strict=True) if g is not None]
             return Terms(float(loss.detach()), {name: float(value.detach()) for name, _, value in found}, gradients)
 
-        return aside(find) if model.feature.device.type == "cpu" else find  # CUDA runs in one queue anyway
+        return aside(find)
 
     def _field_terms(
         self, layer: int, field: DeformationField, features: list[Tensor], step: float, pressure: float
@@ -100,8 +101,8 @@ def anchor_bits(model: Model, anchors: Mapping[str, Tensor], rows: Tensor, activ
     """Rbar [n]: the mean bits R per scalar of each anchor in `rows` (int64 [n], distinct, all in `active`). The priors
     are moments over the anchors in `active` (int64) of the same step class. anchors: attributes by name, in the model's
     shapes."""
-    classes = torch.full_like(model.step_class, -1, dtype=torch.int8)
-    classes[active] = model.step_class[active].to(torch.int8)
+    classes = torch.full((len(model.step_class),), -1, dtype=torch.int8)
+    classes[active] = model.step_class.cpu()[active].to(torch.int8)
     parts = [(anchors[name].flatten(1), getattr(model.steps, name)) for name in ATTRIBUTES]
     return row_bits(parts, classes, rows) / model.widths.channels
 
@@ -156,6 +157,5 @@ def smooth_term(mask: Tensor, neighbours: Neighbours, away: Tensor) -> Tensor:
     first = (torch.arange(len(order)) + away < len(order)).nonzero()[:, 0]
     if not len(first):
         return mask.sum() * 0.0
-    ends = (order[first].to(mask.device), order[first + away[first]].to(mask.device))
-    jump = mask.index_select(0, ends[0]) - mask.index_select(0, ends[1])
+    jump = mask.index_select(0, order[first]) - mask.index_select(0, order[first + away[first]])
     return (weights[first, away[first] - 1].to(mask) * jump.abs()).mean()

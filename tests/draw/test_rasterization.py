@@ -346,6 +346,15 @@ def test_arguments_that_gsplat_gets(monkeypatch):
     assert meta["means2d"].grad is not None and torch.isfinite(tensors[0].grad).all()
 
 
+def test_gsplat_is_not_asked_to_draw_nothing(monkeypatch):
+    """gsplat 1.5.3 divides by the number of Gaussians and ends the process."""
+    calls, tensors = install(monkeypatch, "1.5.3"), scene(0)
+    image, alpha, meta = rasterize_gsplat(tensors, camera(8, 6), np.full(3, 0.5, np.float32), NEAR)
+    assert not calls and (image == 0.5).all() and image.shape == (6, 8, 3) and not alpha.any()
+    assert meta["means2d"].shape == meta["radii"].shape == (1, 0, 2)
+    image.sum().backward()
+
+
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
 def test_gsplat_draws_what_the_cpu_draws():
     pytest.importorskip("gsplat")

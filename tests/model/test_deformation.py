@@ -58,6 +58,15 @@ def test_kernel_equals_reference(shape, t):
     assert fast[2].abs().sum() > 0
 
 
+@pytest.mark.parametrize("channels", [8, 5])
+def test_no_points_have_no_features(channels):
+    plane = plane_of(channels=channels)
+    found = plane(points_in(0), 0.5)
+    assert found.shape == (0, 2 * channels)
+    found.sum().backward()
+    assert not plane.grid.grad.any()
+
+
 def test_gradcheck():
     plane = plane_of((3, 2, 3, 3), 8, (1,))
     points = points_in(4, spread=0.9)

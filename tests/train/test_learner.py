@@ -126,6 +126,16 @@ def test_a_step_gathers_the_gradients_of_all_its_terms(dataset, level):
             torch.testing.assert_close(gradient, expected, rtol=1e-4, atol=1e-9)
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_a_gpu_learns_what_the_cpu_learns(dataset, device="cuda"):
+    pytest.importorskip("gsplat")
+    losses = []
+    for where in ("cpu", device):
+        steps = Learner(TrainConfig(preset="tiny"), dataset, Schedule(30), torch.device(where))
+        losses.append([steps.step()["loss"] for _ in range(30)])
+    assert losses[1] == pytest.approx(losses[0], rel=0.05)
+
+
 def test_the_graph_beside_the_picture_s_shares_no_leaf_with_it(dataset, monkeypatch):
     """Two threads whose graphs share one can wait for each other for ever."""
     steps, leaves, grad = learner(dataset, 3), [], torch.autograd.grad
