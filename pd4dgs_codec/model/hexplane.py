@@ -73,7 +73,7 @@ def sample_reference(grid: Tensor, layout: PlaneLayout, box: Tensor, points: Ten
     All planes of all scales in one lookup: a GPU takes longer to start an operation than to perform it.
     """
     if not len(points):  # embedding_bag refuses them
-        return grid[:0].repeat(1, len(layout.reso))
+        return torch.cat([points[:, :0], grid[:0].repeat(1, len(layout.reso))], 1)
     sides, first, corners, axes = _tables(layout, grid.device)
     unit = torch.cat([(points - box[0]) / (box[1] - box[0]), points.new_full((len(points), 1), t)], 1)
     unit = torch.nan_to_num(unit, nan=0.0, posinf=1.0, neginf=0.0).clamp(0, 1)
