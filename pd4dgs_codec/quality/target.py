@@ -67,13 +67,15 @@ def least_loss(
 ) -> dict[str, float]:
     """Returns the setting of least loss found with final_size <= target, if possible at most SLACK below it.
 
-    grids: by parameter the values to try, ascending from the given one. size: a fast estimate of final_size, up to a
-    factor. Raises Unreachable.
+    grids: by parameter the values to try, from the given one to that of the smallest size. size: a fast estimate of
+    final_size, up to a factor. Raises Unreachable, before any loss is measured, if the last values take more.
     """
-    start = {name: grid[0] for name, grid in grids.items()}
+    start, smallest = ({name: grid[i] for name, grid in grids.items()} for i in (0, -1))
     if final_size(start) <= target:
         return start
-    return _walk(_path(grids, size, loss), start, size, final_size, target)
+    if final_size(smallest) > target:
+        raise Unreachable(final_size(smallest))
+    return _walk(_path(grids, size, loss), start, size, final_size, target) or smallest
 
 
 def _path(
@@ -116,8 +118,8 @@ def _walk(
     size: Callable[[Setting], int],
     final_size: Callable[[Setting], int],
     target: int,
-) -> dict[str, float]:
-    """Returns the first setting found along the path with final_size <= target. Raises Unreachable."""
+) -> dict[str, float] | None:
+    """Returns the first setting found along the path with final_size <= target, None if there is none."""
 
     def at(position: float) -> dict[str, float]:
         whole = min(math.floor(position), len(path) - 1)
@@ -141,12 +143,7 @@ def _walk(
         else:
             low = position
         ratio = got / size(at(position))
-    if met is not None:
-        return at(met)
-    smallest = at(float(len(path))) if path else dict(start)
-    if final_size(smallest) > target:
-        raise Unreachable(final_size(smallest))
-    return smallest
+    return None if met is None else at(met)
 
 
 def _first(holds: Callable[[float], bool], low: float, high: float) -> float:

@@ -59,6 +59,23 @@ def test_a_size_that_is_met_already_changes_nothing_and_one_out_of_reach_is_name
     assert error.value.smallest == 2_000
 
 
+def test_a_size_out_of_reach_is_refused_after_the_given_and_the_smallest_setting():
+    size, loss = rate_distortion({"a": 8_000, "b": 8_000}, {"a": 1.0, "b": 1.0})
+    tried = []
+
+    def final(setting):
+        tried.append(tuple(setting.values()))
+        return size(setting)
+
+    def never(setting):
+        raise AssertionError(f"{setting} was measured")
+
+    with pytest.raises(Unreachable):
+        least_loss({"a": GRID, "b": GRID}, never, never, final, 3_999)
+    assert {*tried} == {(0.0, 0.0), (4.0, 4.0)}
+    assert size(least_loss({"a": GRID, "b": GRID}, size, loss, size, 4_000)) == 4_000, "one byte more is reached"
+
+
 def test_the_estimate_may_be_off_by_a_factor_that_drifts():
     size, loss = rate_distortion({"a": 9_000, "b": 80_000}, {"a": 1.0, "b": 1.0})
 
