@@ -23,7 +23,7 @@ A .pd4 file holds layer 0 (static scene), layer 1 (global motion) and layer 2 (l
 that ends with a layer can be shown. Parts without visible effect are omitted and listed with reasons in the report.
 
 --target-size fits layers to a link with the least loss of quality: 425k for layer 0 takes 1.7 s at 2 Mbps. Fitting
-takes a minute or more, on renderings from --data or else the file's own camera. --slices adds a few per cent.
+takes a minute or more, on renderings from --data or else the file's own camera, and longer with --slices.
 
 --slices 50k lets the first frame appear after 50 kB and improve with each further slice. The anchors that matter most
 in renderings come first; without target sizes others pass to a higher layer, so that motion need not wait for them. It

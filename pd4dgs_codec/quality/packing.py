@@ -8,9 +8,10 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
+from pd4dgs_codec.format.container import CHUNK_OVERHEAD
 from pd4dgs_codec.format.decoder import every_prefix
 from pd4dgs_codec.format.encoder import Report, encode_with_report, with_metadata
-from pd4dgs_codec.format.metadata import Metadata
+from pd4dgs_codec.format.metadata import Metadata, write_metadata
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.plan import LeftOut, plan
 from pd4dgs_codec.quality import ENCODE_MIN_DB_PER_MEGABYTE
@@ -109,20 +110,21 @@ def pack(
             scene, left_out = leave_out_low_gain(
                 scene, pictures.held_out, min_gain=min_gain, options=options, step=step
             )
-    target = None
-    if target_sizes:
-        scene, more, target = pictures.fit(scene, options, target_sizes)
-        left_out += more
-    if options.slices:
-        data, report, slices = pictures.in_slices(scene, options, left_out, metadata, passing=target is None)
-    else:
-        slices = None
-        data, report = encode_with_report(scene, options, left_out=left_out, metadata=metadata)
-    if target is not None:
-        added = report.added_bytes()
+    if not target_sizes:
+        data, report, slices = pictures.write(scene, options, left_out, metadata, passing=True)
+        return Packed(data, scene, report, None, slices)
+    growth = dict.fromkeys(target_sizes, 1.0)
+    while True:
+        fitted, more, target = pictures.fit(scene, options, target_sizes, growth)
+        data, report, slices = pictures.write(fitted, options, left_out + more, metadata, passing=False)
+        added, met = report.added_bytes(), True
         for row in target["layers"]:
-            row["bytes"] = added.get(row["layer"], 0)
-    return Packed(data, scene, report, target, slices)
+            layer, expected = row["layer"], row["bytes"]
+            row["bytes"] = added.get(layer, 0)
+            if row["bytes"] > row["target"]:  # slices in another order than measured: fit again
+                met, growth[layer] = False, growth[layer] * row["bytes"] / expected
+        if met:
+            return Packed(data, fitted, report, target, slices)
 
 
 @dataclass(frozen=True)
@@ -147,7 +149,7 @@ class _Pictures:
         return dataset_frames(self.views.fitting)
 
     def fit(
-        self, scene: Scene, options: EncodeOptions, target_sizes: Mapping[int, int]
+        self, scene: Scene, options: EncodeOptions, target_sizes: Mapping[int, int], growth: Mapping[int, float]
     ) -> tuple[Scene, list[LeftOut], dict[str, Any]]:
         """Returns the scene whose layers meet the sizes, the parts left out, and the target of the report."""
         from pd4dgs_codec.quality.measure import RenderedLoss, true_psnr
@@ -158,7 +160,7 @@ class _Pictures:
         frames = self.frames(scene)
         with self.progress("fitting sizes") as step:
             loss = RenderedLoss(scene, frames, step)
-            fitted, dropped, fits = fit(scene, target_sizes, loss.mean_mse, loss.omission_error, options)
+            fitted, dropped, fits = fit(scene, target_sizes, loss.mean_mse, loss.omission_error, options, growth)
             packed = plan(fitted, replace(options, omit="nothing")).symbols.scene()
             errors = loss.mse(packed)
             before, after = (true_psnr(s, self.held_out, step) if self.held_out else {} for s in (scene, packed))
@@ -170,7 +172,7 @@ class _Pictures:
         report = {"cameras": self.cameras, "pictures": len(frames), "layers": layers, "levels": levels}
         return fitted, left_out + dropped, report
 
-    def in_slices(
+    def write(
         self,
         scene: Scene,
         options: EncodeOptions,
@@ -178,8 +180,11 @@ class _Pictures:
         metadata: Metadata | None,
         *,
         passing: bool,
-    ) -> tuple[bytes, Report, dict[str, Any]]:
-        """Returns (sliced file, report, slices of the report). passing: whether anchors may pass to later layers."""
+    ) -> tuple[bytes, Report, dict[str, Any] | None]:
+        """Returns (file, report, slices of the report if it has slices). passing: whether anchors may then pass to
+        later layers."""
+        if not options.slices:
+            return *encode_with_report(scene, options, left_out=left_out, metadata=metadata), None
         from pd4dgs_codec.quality.measure import true_psnr
         from pd4dgs_codec.quality.slicing import in_order
 
@@ -205,6 +210,6 @@ class _Pictures:
                 ]
             metadata = replace(metadata or Metadata(), slices=tuple(about["psnr"]))
         if metadata is not None:
-            plain, data = len(data), with_metadata(data, metadata)
-            report = replace(report, bytes=len(data), metadata_bytes=len(data) - plain)
+            data, about_bytes = with_metadata(data, metadata), CHUNK_OVERHEAD + len(write_metadata(metadata))
+            report = replace(report, bytes=len(data), metadata_bytes=about_bytes)
         return data, report, about

@@ -18,7 +18,7 @@ import numpy as np
 
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.container import write_chunk
-from pd4dgs_codec.format.encoder import encode
+from pd4dgs_codec.format.encoder import encode, encode_with_report
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.payload import write_layer
@@ -183,20 +183,22 @@ def fit(
     loss: Callable[[Scene], float],
     omission_error: Callable[[Scene, int], np.ndarray],
     options: EncodeOptions = DEFAULTS,
+    growth: Mapping[int, float] | None = None,
 ) -> tuple[Scene, list[LeftOut], list[Fit]]:
     """Fits a planned scene to targets. Returns the scene, the dropped anchors, and how each layer met its target.
 
     targets: most bytes by layer; an absent layer meets any. loss: of a decoded scene, to be minimised. omission_error:
     float64 [N], the error of omitting each anchor of the scene at a level; anchors of least error move to the next
-    layer first, or are dropped from the highest. options: of the file to be written. Raises EncodeError naming the
-    layer and its smallest size.
+    layer first, or are dropped from the highest. options: of the file to be written. growth: by layer, a
+    factor on its bytes, 1 if absent; for slices, which are measured with the largest anchors first. Raises EncodeError
+    naming the layer and its smallest size.
     """
     fits, dropped = [], 0
     for layer, target in sorted(targets.items()):
         if layer not in scene.layers:
             fits.append(Fit(layer, target))
             continue
-        fitted = _Layer(scene, layer, loss, omission_error, options)
+        fitted = _Layer(scene, layer, loss, omission_error, options, (growth or {}).get(layer, 1.0))
         try:
             found = least_loss(fitted.grids, fitted.size, fitted.loss, fitted.final_size, target)
         except Unreachable as error:
@@ -225,8 +227,9 @@ class _Layer:
         loss: Callable[[Scene], float],
         omission_error: Callable[[Scene, int], np.ndarray],
         options: EncodeOptions,
+        growth: float,
     ):
-        self.scene, self.layer, self.index = scene, layer, scene.layers.index(layer)
+        self.scene, self.layer, self.index, self.growth = scene, layer, scene.layers.index(layer), growth
         self.of_scene = loss
         self.options = replace(options, omit="nothing")  # planning has made unread cells cheap already
         steps = list(scene.attributes) if layer == 0 else []
@@ -258,12 +261,17 @@ class _Layer:
         """Returns the bytes that the layer adds to the file, 0 if the plan leaves it out."""
         key = effort, frozenset(setting.items())
         if key not in self._sizes:
-            planned = self._planned(setting)
-            self._sizes[key] = 0
-            for symbols in (layer for layer in planned.symbols.layers if layer.kind.layer == self.layer):
-                payload, _ = write_layer(symbols, replace(self.options, effort=effort))
-                self._sizes[key] = self.header + len(write_chunk(symbols.kind.layer, 0, bytes(8), payload))
+            self._sizes[key] = math.ceil(self.growth * self._added_bytes(setting, effort))
         return self._sizes[key]
+
+    def _added_bytes(self, setting: Setting, effort: int) -> int:
+        if self.options.slices and effort == self.options.effort:
+            report = encode_with_report(self.apply(setting), self.options, verify=False)[1]
+            return report.added_bytes().get(self.layer, 0)
+        for symbols in (layer for layer in self._planned(setting).symbols.layers if layer.kind.layer == self.layer):
+            payload, _ = write_layer(symbols, replace(self.options, effort=effort))
+            return self.header + len(write_chunk(symbols.kind.layer, 0, bytes(8), payload))
+        return 0
 
     def final_size(self, setting: Setting) -> int:
         """`size` at the effort of the file."""
