@@ -90,6 +90,16 @@ class Widths:
         """Output width of each residual head of a deformation."""
         return {name: head.outputs(self) for name, head in HEADS.items()}
 
+    @property
+    def head_columns(self) -> dict[str, slice]:
+        """The columns of an anchor's row to which each residual head adds: one run per `Head.unit`, in the order in
+        which HEADS first names them."""
+        columns, end = dict[str, slice](), 0
+        for head in HEADS.values():
+            if head.unit not in columns:
+                columns[head.unit] = slice(end, end := end + head.outputs(self))
+        return {name: columns[head.unit] for name, head in HEADS.items()}
+
 
 #: The widths of Scaffold-GS.
 DEFAULT_WIDTHS = Widths()

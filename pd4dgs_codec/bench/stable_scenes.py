@@ -135,7 +135,7 @@ def _field(name: str, plane: np.ndarray) -> Deformation:
 
 def _residual_error(field: Deformation, times: Sequence[float]) -> Found:
     points = INSIDE * np.float32(1.4)
-    module, player, worst = DeformationField.from_arrays(field, BOX), Field(field, BOX, {"position": 3}), 0.0
+    module, player, worst = DeformationField.from_arrays(field, BOX), Field(field, BOX, {"position": slice(3)}), 0.0
     ((head, _),), ((trunk, _),) = (field.networks[name] for name in ("position", "trunk"))
     scale = max(float(np.abs(plane).max()) for plane in field.planes[0].values())
     for t in times:
@@ -143,7 +143,7 @@ def _residual_error(field: Deformation, times: Sequence[float]) -> Found:
         expected = hidden @ head.T.astype(np.float64) * float(deformation_unit(BOX))
         tensor = torch.from_numpy(points)
         still = tensor.new_zeros(len(tensor), 3)
-        moved = module.moved(still, lambda time: module.planes(tensor, time), {"position": 3}, t)  # noqa: B023
+        moved = module.moved(still, lambda time: module.planes(tensor, time), {"position": slice(3)}, t)  # noqa: B023
         played = np.zeros_like(points)
         player.move(played, points, t)
         for found in (moved.detach().numpy(), played):

@@ -3,8 +3,6 @@
 Another kind of deformation needs only another `Field` with the same two methods.
 """
 
-from itertools import accumulate
-
 import numpy as np
 
 from pd4dgs_codec.draw import hexplane
@@ -15,10 +13,10 @@ from pd4dgs_codec.scene import LENGTH_HEADS, PLANES, TRUNK, Deformation, Network
 
 
 class Field:
-    """Adds a deformation's residuals to rows of anchors, whose columns are all heads of the registry."""
+    """Adds a deformation's residuals to rows of anchors, whose columns are those of all heads of the registry."""
 
-    def __init__(self, deformation: Deformation, box: np.ndarray, widths: dict[str, int]):
-        """box: float32 [2, 3], see SceneInfo. widths: the width of each head of the registry, in column order."""
+    def __init__(self, deformation: Deformation, box: np.ndarray, columns: dict[str, slice]):
+        """box: float32 [2, 3], see SceneInfo. columns: see `Widths.head_columns`."""
         self._box = np.ascontiguousarray(box, np.float32)
         self._layout = PlaneLayout.build([plane_sides(scale) for scale in deformation.planes])
         channels = deformation.planes[0]["xy"].shape[0]
@@ -31,14 +29,15 @@ class Field:
         trunk = _with_padded_inputs(deformation.networks[TRUNK], channels, self._channels)
         self._key = deformation.key
         unit, networks = deformation_unit(box), deformation.networks
-        heads = {n: _scaled(networks[n], unit if n in LENGTH_HEADS else np.float32(1)) for n in widths if n in networks}
+        heads = {
+            n: _scaled(networks[n], unit if n in LENGTH_HEADS else np.float32(1)) for n in columns if n in networks
+        }
         self._trunk: Layers | None = None
         if all(len(network) == 1 for network in heads.values()):  # one product for all heads
-            self._heads = [(slice(None), Layers((*trunk, _side_by_side(heads, widths, len(trunk[-1][1])))))]
+            self._heads = [(slice(None), Layers((*trunk, _joined(heads, columns, len(trunk[-1][1])))))]
         else:
             self._trunk = Layers(trunk, relu_last=True)
-            ends = dict(zip(widths, accumulate(widths.values()), strict=True))
-            self._heads = [(slice(ends[n] - widths[n], ends[n]), Layers(network)) for n, network in heads.items()]
+            self._heads = [(columns[n], Layers(network)) for n, network in heads.items()]
 
     def rest(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
         """Returns values - F(x, t*) if there is a key instant t*, else `values`: the rows to which `move` adds F(x, t)
@@ -51,7 +50,7 @@ class Field:
         return moved
 
     def move(self, values: np.ndarray, points: np.ndarray, t: float) -> None:
-        """Adds F(x, t) at points x float32 [n, 3] and normalised time t to values float32 [n, sum of widths],
+        """Adds F(x, t) at points x float32 [n, 3] and normalised time t to values float32 [n, columns],
         C-contiguous; lengths in scene units."""
         layout = self._layout
         tables = layout.reso, layout.start, layout.rows
@@ -67,8 +66,8 @@ class Field:
             together.add(values, features)
             return
         hidden = self._trunk(features)
-        for columns, head in self._heads:
-            values[:, columns] += head(hidden)
+        for own, head in self._heads:
+            values[:, own] += head(hidden)
 
 
 def _with_padded_inputs(network: Network, channels: int, padded: int) -> Network:
@@ -80,14 +79,13 @@ def _with_padded_inputs(network: Network, channels: int, padded: int) -> Network
     return ((wide.reshape(len(weight), -1), bias), *rest)
 
 
-def _side_by_side(heads: dict[str, Network], widths: dict[str, int], inputs: int) -> tuple[np.ndarray, np.ndarray]:
-    """Joins heads of one layer each into one layer; the outputs of absent heads are 0."""
-    weight, bias = np.zeros((sum(widths.values()), inputs), np.float32), np.zeros(sum(widths.values()), np.float32)
-    first = 0
-    for name, width in widths.items():
-        if name in heads:
-            ((weight[first : first + width], bias[first : first + width]),) = heads[name]
-        first += width
+def _joined(heads: dict[str, Network], columns: dict[str, slice], inputs: int) -> tuple[np.ndarray, np.ndarray]:
+    """Joins heads of one layer each into one layer whose outputs are all columns; those without a head are 0."""
+    outputs = max(own.stop for own in columns.values())
+    weight, bias = np.zeros((outputs, inputs), np.float32), np.zeros(outputs, np.float32)
+    for name, ((of_head, shift),) in heads.items():
+        weight[columns[name]] += of_head
+        bias[columns[name]] += shift
     return weight, bias
 
 

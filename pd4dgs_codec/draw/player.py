@@ -47,7 +47,7 @@ class Player:
         extent = np.exp(scene.scaling_log)
         self._radius = OFFSET_REACH * extent[:, :3].max(axis=1) + SIGMA_REACH * extent[:, 3:].max(axis=1)
         motion = scene.motion(scene.level)
-        self._field = None if motion is None else Field(motion, scene.info.box, scene.widths.heads)
+        self._field = None if motion is None else Field(motion, scene.info.box, scene.widths.head_columns)
         widths = scene.widths
         self._decoders = Decoders([scene.networks[name] for name in SCAFFOLD_NETWORKS], widths.feature)
         self.shapes_are_blind = widths.shapes_are_blind  #: whether only colours depend on the eye

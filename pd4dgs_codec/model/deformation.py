@@ -7,7 +7,6 @@ one network per residual head. Another kind of deformation needs only another `D
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from itertools import accumulate
 from typing import Any, cast
 
 import numpy as np
@@ -134,38 +133,39 @@ class DeformationField(nn.Module):
         self,
         rows: Tensor,
         features: Callable[[float], Tensor],
-        widths: Mapping[str, int],
+        columns: Mapping[str, slice],
         t: float,
         weight_step: float | None = None,
         kernels: bool = False,
     ) -> Tensor:
-        """Returns rows [n, sum of widths] plus the residuals at time t in 0..1, lengths in scene units.
+        """Returns rows [n, columns] plus the residuals at time t in 0..1, lengths in scene units.
 
-        features: time -> inputs of the trunk [n, inputs]. widths: of all heads of the registry, in column order; the
-        columns of absent heads stay. weight_step: the step of the weights, if they are rounded, straight through.
+        features: time -> inputs of the trunk [n, inputs]. columns: see `Widths.head_columns`; those of absent heads
+        stay. weight_step: the step of the weights, if they are rounded, straight through.
         kernels: whether the kernels evaluate the field, which must be `fusible`; else plain torch does.
         """
         if not self.heads:
             return rows
         add = self._added if kernels else self._added_reference
         for time, sign in self._signed(t):
-            rows = add(rows, features(time), widths, sign, weight_step)
+            rows = add(rows, features(time), columns, sign, weight_step)
         return rows
 
     def _added_reference(
-        self, rows: Tensor, features: Tensor, widths: Mapping[str, int], sign: float, step: float | None
+        self, rows: Tensor, features: Tensor, columns: Mapping[str, slice], sign: float, step: float | None
     ) -> Tensor:
         hidden = F.relu(self.trunk(features, step))
-        found = {name: head(hidden, step) * (sign * self._unit_of(name)) for name, head in self._named_heads()}
-        parts = [found[n] if n in found else rows.new_zeros(len(rows), width) for n, width in widths.items()]
-        return rows + torch.cat(parts, dim=1)
+        residuals = torch.zeros_like(rows)
+        for name, head in self._named_heads():
+            residuals[:, columns[name]] += head(hidden, step) * (sign * self._unit_of(name))
+        return rows + residuals
 
     def _added(
-        self, rows: Tensor, features: Tensor, widths: Mapping[str, int], sign: float, step: float | None
+        self, rows: Tensor, features: Tensor, columns: Mapping[str, slice], sign: float, step: float | None
     ) -> Tensor:
         """`_added_reference` by the kernels."""
-        ends, heads = dict(zip(widths, accumulate(widths.values()), strict=True)), self._named_heads()
-        own = [(slice(ends[name] - widths[name], ends[name]), sign * self._unit_of(name)) for name, _ in heads]
+        heads = self._named_heads()
+        own = [(columns[name], sign * self._unit_of(name)) for name, _ in heads]
         networks = [self.trunk, *(head for _, head in heads)]
         parameters = [p for network in networks for layer in network.layers for p in (layer.weight, layer.bias)]
         settings = own, 2 * len(self.trunk.layers), step
@@ -193,8 +193,8 @@ class _AddNetworks(torch.autograd.Function):
         used = [rounded(p, step) for p in parameters]
         weight, bias = rows.new_zeros(rows.shape[1], used[trunk].shape[1]), rows.new_zeros(rows.shape[1])
         for (own, unit), w, b in zip(columns, used[trunk::2], used[trunk + 1 :: 2], strict=True):
-            torch.mul(w, unit, out=weight[own])
-            torch.mul(b, unit, out=bias[own])
+            weight[own] += w * unit
+            bias[own] += b * unit
         pairs = [*zip(used[:trunk:2], used[1:trunk:2], strict=True), (weight, bias)]
         ctx.layers, ctx.columns = Layers([(w.numpy(), b.numpy()) for w, b in pairs]), columns
         out = rows.clone()

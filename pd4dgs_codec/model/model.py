@@ -177,7 +177,7 @@ class Model(nn.Module):
             return torch.cat(parts, dim=1)
 
         step = self.steps.weights(layers[-1]) if rounding.weights else None
-        return fields[-1].moved(rows, features, self.widths.heads, t, step, kernels)
+        return fields[-1].moved(rows, features, self.widths.head_columns, t, step, kernels)
 
     def _viewmat(self, camera: Camera) -> Tensor:
         """[4, 4] world to camera."""

@@ -24,7 +24,11 @@ from pd4dgs_codec.scene import (
     HEADS,
     MASK_STEP,
     MASK_THRESHOLD,
+    PLANES,
     Camera,
+    Deformation,
+    Head,
+    Network,
     SceneInfo,
     Steps,
 )
@@ -264,17 +268,46 @@ def test_playback_moves_anchors_as_the_model_does(channels):
     model = stir(small_model(channels=channels), 0.7)
     points = np.random.default_rng(4).uniform(-2, 2, (200, 3)).astype(np.float32)
     points[:2] = BOX
-    widths, scene = model.widths.heads, to_scene(model)
-    rows = torch.zeros(len(points), sum(widths.values()))
+    columns, scene = model.widths.head_columns, to_scene(model)
+    rows = torch.zeros(len(points), columns["scaling"].stop)
     rows[:, :3] = torch.from_numpy(points)
     for level in (1, 2):
         for t in (-0.5, 0.0, 0.123, 0.5, 1.0, 2.0):
             with torch.no_grad():
                 moved = model._moved(level, rows, t, EXACT, channels == 8) - rows
             got = np.zeros(rows.shape, np.float32)
-            Field(scene.motion(level), BOX, widths).move(got, points, t)
+            Field(scene.motion(level), BOX, columns).move(got, points, t)
             np.testing.assert_allclose(got, moved.numpy(), rtol=0, atol=1e-5)
             assert np.abs(got).max(axis=0).min() > 0.01
+
+
+@pytest.mark.parametrize("deep,kernels", [(False, True), (False, False), (True, False)])
+def test_heads_of_one_quantity_add_to_the_same_columns(monkeypatch, deep, kernels):
+    before = DEFAULT_WIDTHS.head_columns
+    monkeypatch.setitem(HEADS, "tint", Head(lambda widths: widths.feature, "feature"))
+    columns = DEFAULT_WIDTHS.head_columns
+    assert columns == before | {"tint": before["feature"]}
+    rng, networks = np.random.default_rng(0), dict[str, Network]()
+    for name, width in {"trunk": 8, "feature": 32, "tint": 32}.items():
+        last = (rng.normal(size=(width, 8)).astype(np.float32), rng.normal(size=width).astype(np.float32))
+        networks[name] = ((np.eye(8, dtype=np.float32), np.zeros(8, np.float32)), last) if deep else (last,)
+    planes = ({name: rng.normal(size=(8, 3, 3)).astype(np.float32) for name, _, _ in PLANES},)
+    points, t = rng.uniform(-1, 1, (20, 3)).astype(np.float32), 0.3
+
+    def residuals(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+        given = Deformation(planes, {name: networks[name] for name in ("trunk", *names)})
+        field, played = DeformationField.from_arrays(given, BOX), np.zeros((20, columns["scaling"].stop), np.float32)
+        Field(given, BOX, columns).move(played, points, t)
+        still, at = torch.zeros(played.shape), torch.from_numpy(points)
+        return played, field.moved(
+            still, lambda time: field.planes(at, time), columns, t, None, kernels
+        ).detach().numpy()
+
+    feature, tint, both = (residuals(names) for names in (("feature",), ("tint",), ("feature", "tint")))
+    for one, other, together in zip(feature, tint, both, strict=True):
+        assert np.abs(one).max() > 0.1 and np.abs(other).max() > 0.1
+        np.testing.assert_allclose(together, one + other, atol=1e-4)
+    np.testing.assert_allclose(*both, atol=1e-4)
 
 
 MIXED = np.sort(np.random.default_rng(9).choice(np.array([0, 3, 4, 90, 255]), (80, 3)), axis=1)
