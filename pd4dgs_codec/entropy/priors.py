@@ -252,16 +252,21 @@ def _batches(priors: Sequence[AnyPrior]) -> Iterator[list[AnyPrior]]:
 
 
 def normal_tables(priors: Sequence[Prior]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns (concatenated tables int64, their sizes int64 [m]); for histograms, the tables of their heights."""
+    """Returns (concatenated tables int64, their sizes int64 [m]); for histograms, the tables of their heights.
+
+    Raises TypeError for a prior of another class, which has to define `cum` itself."""
     rows = list[tuple[int, Normal, int]]()
     for prior in priors:
-        if isinstance(prior, Hist):
+        if isinstance(prior, Gauss):
+            rows.append((prior.window.n, prior.normal, prior.floor))
+        elif isinstance(prior, Mixture):
+            rows.append((prior.window.n, prior.first, prior.floor))
+        elif isinstance(prior, Hist):
             rows.append((*prior.height_normal, 1))
         elif isinstance(prior, Const):
             rows.append((1, Normal(0, 0), 1))
         else:
-            normal = prior.first if isinstance(prior, Mixture) else prior.normal
-            rows.append((prior.window.n, normal, prior.floor))
+            raise TypeError(f"{type(prior).__name__}: its table is not one of Gaussians")
     sizes, floors = (np.array([row[i] for row in rows], dtype=np.int64) for i in (0, 2))
     cdf = norm_cdf28_of_each(sizes, *_columns([normal for _, normal, _ in rows]))
     if mixtures := [prior for prior in priors if isinstance(prior, Mixture)]:

@@ -20,6 +20,7 @@ from pd4dgs_codec.entropy.priors import (
     Mixture,
     Normal,
     Window,
+    _Tabled,
     make_models,
     normal_tables,
     top_limit,
@@ -125,6 +126,14 @@ def test_tables_made_together_are_those_made_alone():
         np.testing.assert_array_equal(found, expected)
     make_models(priors)
     assert all({"model", "height_model"} & {*prior.__dict__} for prior in priors[1:])
+
+
+def test_priors_of_another_class_are_not_taken_for_gaussians():
+    class Laplace(_Tabled):
+        window, normal, floor = Window(0, 9), Normal(0, 0), 1
+
+    with pytest.raises(TypeError, match="^Laplace: "):
+        Laplace().cum  # noqa: B018
 
 
 def test_histograms_completed_together_are_those_made_alone():
