@@ -146,6 +146,12 @@ def same_file(path: str, other: str) -> bool:
     return STDIO not in (path, other) and os.path.realpath(path) == os.path.realpath(other)
 
 
+def check_other_file(path: str, output: str) -> None:
+    """Raises UsageError if the output of -o is the input `path`, which would be lost."""
+    if same_file(path, output):
+        raise UsageError(f"-o names the input {path}, expected another file")
+
+
 def named_input(path: str) -> str | bytes:
     """Returns the path, or all bytes of stdin for `-`, for readers that take either."""
     return read_bytes(path) if path == STDIO else path

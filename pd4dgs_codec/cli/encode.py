@@ -132,8 +132,7 @@ def _load(args: argparse.Namespace) -> tuple[Scene, Metadata | None]:
         from pd4dgs_codec.format.info import metadata_of
 
         return decode(data), _metadata(args, metadata_of(data))
-    if common.same_file(args.input, args.output):
-        raise UsageError(f"-o names the input checkpoint {args.input}, expected another file")
+    common.check_other_file(args.input, args.output)
     return common.checkpoint_scene(args.input, data), _metadata(args, None)
 
 

@@ -5,7 +5,7 @@ import contextlib
 from urllib.parse import quote
 
 from pd4dgs_codec.cli import options
-from pd4dgs_codec.cli.common import OK, Console, UsageError, checkpoint_scene, command, is_pd4, read_bytes, same_file
+from pd4dgs_codec.cli.common import OK, Console, check_other_file, checkpoint_scene, command, is_pd4, read_bytes
 from pd4dgs_codec.cli.serve import add_link, set_by_signals
 from pd4dgs_codec.io import check_output, temporary_folder, write_bytes
 
@@ -51,8 +51,7 @@ def _view(args: argparse.Namespace, console: Console) -> int:
 
     options.conditional(args, not args.output, "has no effect with -o", port=0, rate=None, latency=0.0)
     if args.output:
-        if same_file(args.input, args.output):
-            raise UsageError(f"-o names the input {args.input}, expected another file")
+        check_other_file(args.input, args.output)
         check_output(args.output, args.overwrite)
         content = args.input if is_url(args.input) else _packed(args.input, console)
         write_bytes(args.output, page(content).encode(), args.overwrite)

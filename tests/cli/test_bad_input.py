@@ -128,7 +128,7 @@ CASES = [
         )
     ),
     (1, "encode cut.pt -o s.pd4", "cut.pt"),
-    (2, "encode cut.pt -o ./cut.pt -f", "-o names the input checkpoint cut.pt"),
+    (2, "encode cut.pt -o ./cut.pt -f", "-o names the input cut.pt, expected another file"),
     (1, "encode nan.pt -o s.pd4", "feature"),
     (1, "encode inf.pt -o s.pd4", "feature"),
     (1, "encode huge.pt -o s.pd4", "feature"),

@@ -69,7 +69,7 @@ def test_one_html_file_instead_of_a_server(cli, scene_pd4, tmp_path):
         assert done.code == 1 and done.out == b"" and says in done.err and len(done.error_lines) == 1
     before = scene_pd4.read_bytes()
     done = cli("view", scene_pd4, "-o", scene_pd4, "-f")
-    assert done.code == 2 and "names the input" in done.err and scene_pd4.read_bytes() == before
+    assert done.code == 2 and "-o names the input" in done.err and scene_pd4.read_bytes() == before
 
 
 @pytest.mark.parametrize(
