@@ -139,11 +139,12 @@ def _batch(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.batch.run import Settings
     from pd4dgs_codec.batch.run import run as run_jobs
 
-    takes = import_module(f"pd4dgs_codec.cli.{args.op}").parser()
+    module = import_module(f"pd4dgs_codec.cli.{args.op}")
+    takes, check_usage = module.parser(), getattr(module, "check_usage", lambda args: None)
 
     def check(options: dict[str, Any]) -> None:
         try:
-            takes.parse_args(arguments(args.op, "source", "output", options))
+            check_usage(takes.parse_args(arguments(args.op, "source", "output", options)))
         except UsageError as error:
             raise DataError(str(error)) from None
 

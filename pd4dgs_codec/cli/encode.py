@@ -83,7 +83,8 @@ def parser() -> options.Parser:
     return p
 
 
-def _encode(args: argparse.Namespace, console: Console) -> int:
+def check_usage(args: argparse.Namespace) -> None:
+    """Sets conditional defaults. Raises UsageError for options that do not fit together."""
     if args.output == STDIO and args.json:
         raise UsageError("-o - and --json both write to stdout, expected -o FILE")
     fits, gains = args.slices or args.target_size, args.layers == "auto"
@@ -93,6 +94,10 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
     options.conditional(args, args.data, "needs --data SOURCE", holdout=holdout, views=16)
     needs = "needs --data SOURCE and --layers auto"
     options.conditional(args, args.data and gains, needs, min_gain=ENCODE_MIN_DB_PER_MEGABYTE)
+
+
+def _encode(args: argparse.Namespace, console: Console) -> int:
+    check_usage(args)
     common.check_output(args.output, args.overwrite)
     chosen = _options(args)
     scene, metadata = _load(args)

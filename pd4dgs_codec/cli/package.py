@@ -58,10 +58,15 @@ def parser() -> options.Parser:
     return p
 
 
+def check_usage(args: argparse.Namespace) -> None:
+    """Sets conditional defaults of a package. Raises UsageError for options that do not fit together."""
+    options.conditional(args, not args.no_video, "has no effect with --no-video", fps=20.0)
+
+
 def _package(args: argparse.Namespace, console: Console) -> int:
     if args.input != STDIO and Path(args.input).is_dir():
         return _library(args, console)
-    options.conditional(args, not args.no_video, "has no effect with --no-video", fps=20.0)
+    check_usage(args)
     data = read_bytes(args.input)
     from pd4dgs_codec.web.package import package
 

@@ -96,7 +96,7 @@ def _add_fields(p: options.Parser) -> None:
 
 
 def _train(args: argparse.Namespace, console: Console) -> int:
-    _check_usage(args)
+    check_usage(args)
     in_place = args.resume is not None and common.same_file(args.resume, args.output)
     check_output(args.output, args.overwrite or in_place)
     if args.log:
@@ -141,7 +141,8 @@ def _train(args: argparse.Namespace, console: Console) -> int:
 main = command(parser, _train)
 
 
-def _check_usage(args: argparse.Namespace) -> None:
+def check_usage(args: argparse.Namespace) -> None:
+    """Raises UsageError for options that do not fit together."""
     options.conditional(args, args.rollout in (None, "key"), "needs --rollout key", key_instant=None)
     if args.rate_scale and "rate" in args.without:
         raise UsageError(f"found --rate-scale {args.rate_scale:g} and --without rate, expected one of them")

@@ -59,6 +59,21 @@ def test_lines_that_fail_are_named_with_their_logs_and_the_others_go_on(cli, tmp
     assert not (tmp_path / "out" / "b.pd4").exists()
 
 
+@pytest.mark.parametrize(
+    "op,options,message",
+    [
+        ("encode", {"views": 4}, "--views needs --data SOURCE"),
+        ("package", {"no-video": True, "fps": 10}, "--fps has no effect with --no-video"),
+        ("train", {"rollout": "all", "key-instant": 0.5}, "--key-instant needs --rollout key"),
+    ],
+)
+def test_options_without_effect_are_named_before_any_job(cli, tmp_path, manifest, op, options, message):
+    lines = manifest({"source": "missing", "options": options})
+    done = cli("batch", lines, "--op", op, "-o", "out", "--workers", "0", "--json")
+    (row,) = done.json["failures"]
+    assert done.code == 1 and row == {"line": 1, "output": None, "message": message, "log": None}
+
+
 def test_evaluations_and_packages_of_many(cli, tmp_path, manifest, scene_pd4, shared_dataset):
     lines = manifest({"source": str(scene_pd4), "output": "x.json", "options": {"data": str(shared_dataset)}})
     done = cli("batch", lines, "--op", "eval", "-o", "scores", "--workers", "0")
