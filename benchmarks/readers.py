@@ -181,10 +181,10 @@ def read_film(path: Path) -> None:
 #: Name of the row -> (name of the file, its content, its reader).
 CASES: dict[str, tuple[str, Callable[[], bytes], Callable[[Path], object]]] = {
     ".pd4: symbols, the file that takes most memory": (
-        "x.pd4", (VECTORS / "dear" / "memory-0.pd4").read_bytes, read_scene
+        "x.pd4", (VECTORS / "worst-case" / "memory-0.pd4").read_bytes, read_scene
     ),
     ".pd4: symbols, the file that takes longest": (
-        "x.pd4", (VECTORS / "dear" / "seconds-0.pd4").read_bytes, read_scene
+        "x.pd4", (VECTORS / "worst-case" / "seconds-0.pd4").read_bytes, read_scene
     ),
     ".pd4 from a server: zeros": ("x.pd4", lambda: endless(64 * MEGABYTE), read_url),
     "checkpoint: empty dicts": ("m.pt", lambda: checkpoint_with(b"](" + b"}" * MEGABYTE + b"e"), checkpoint.load),

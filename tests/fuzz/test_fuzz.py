@@ -133,8 +133,8 @@ BIG = {
     "tables": most_tables,
     "anchors": partial(many_anchors, "ans"),
     "anchors, lzma": partial(many_anchors, "lzma"),
-    "dear in seconds": (VECTORS / "dear" / "seconds-0.pd4").read_bytes,
-    "dear in memory": (VECTORS / "dear" / "memory-0.pd4").read_bytes,
+    "worst case in seconds": (VECTORS / "worst-case" / "seconds-0.pd4").read_bytes,
+    "worst case in memory": (VECTORS / "worst-case" / "memory-0.pd4").read_bytes,
 }
 
 

@@ -23,7 +23,7 @@ MANIFEST = json.loads((VECTORS / "manifest.json").read_text(encoding="utf-8"))["
 FAULTY = [v for v in MANIFEST if "error" in v]
 ERRORS = re.findall(r"^\| (\w+) \| ", TEXT.split("## 15 ")[1].split("## 16 ")[0], flags=re.M)[1:]
 #: The reference decoder, which is plain Python, takes seconds for these.
-SLOW = {"valid/planes-products-over-2-53.pd4", *(v["file"] for v in MANIFEST if v["file"].startswith("dear/"))}
+SLOW = {"valid/planes-products-over-2-53.pd4", *(v["file"] for v in MANIFEST if v["file"].startswith("worst-case/"))}
 #: Functions of the reference decoder that check on behalf of their callers.
 HELPERS = {"need", "limited", "registered", "shortest", "check_finite", "fields", "a_list", "reals", "real", "a_step"}
 
@@ -167,7 +167,7 @@ def test_a_stream_yields_the_slices_before_a_fault():
         found = [scene.layers[-1] for scene in scenes], stream.slices, error
         return None if found == (sorted(set(slices(vector))), len(slices(vector)), vector.get("error")) else found
 
-    assert wrong([v for v in MANIFEST if not v["file"].startswith("dear/")], check) == {}
+    assert wrong([v for v in MANIFEST if not v["file"].startswith("worst-case/")], check) == {}
 
 
 def test_a_cut_file_gives_its_longest_prefix_if_asked():

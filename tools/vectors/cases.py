@@ -98,7 +98,7 @@ def vectors() -> Iterator[Vector]:
                 names[name] = eval(value, names)
                 continue
             if text.startswith("["):
-                folder, base, clauses, error = re.fullmatch(r"\[(\w+) (.+?) \| ([\d. ]*\d)(?: (\w+))?\]", text).groups()  # type: ignore[union-attr]
+                folder, base, clauses, error = re.fullmatch(r"\[(\S+) (.+?) \| ([\d. ]*\d)(?: (\w+))?\]", text).groups()  # type: ignore[union-attr]
                 group = folder, base, clauses, error
                 continue
             folder, base, clauses, error = group
