@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from common import QUICK, Benchmark, Row, Run, Scene, Training, number, table
 from quality import packed_levels
 
-from pd4dgs_codec.train.phases.levels import MIN_GAIN_1, MIN_GAIN_2, SHARE_2
+from pd4dgs_codec.train.phases.levels import LEARNT, MIN_GAIN_1, MIN_GAIN_2, SHARE_2
 
 MOTIONS, SEEDS = ("static", "global", "local", "fast"), range(5)
 #: Half of what other tiny scenes get: twenty trainings have to end.
@@ -51,7 +51,7 @@ def text(rows: Sequence[Row]) -> str:
         "*gain*: dB over the level below after its trial training, in the pixels that the level changes in views held "
         f"back from training. Level 2 stays if it gains at least {SHARE_2:.0%} of its gain over level 0 and "
         f"{MIN_GAIN_2:g} dB. If it is removed, level 1 is tested and stays if both gains sum to at least "
-        f"{MIN_GAIN_1:g} dB.\n\n{table(head, cells)}"
+        f"{MIN_GAIN_1 * min(1, STEPS / LEARNT):.2g} dB.\n\n{table(head, cells)}"
     )
 
 

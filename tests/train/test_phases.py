@@ -283,6 +283,7 @@ def selected(dataset, monkeypatch, least):
     """(a learner after selecting levels, which need a gain of `least`; its parameters and moments before)."""
     for name in ("MIN_GAIN_1", "MIN_GAIN_2"):
         monkeypatch.setattr(levels, name, least)
+    monkeypatch.setattr(levels, "LEARNT", 1)
     monkeypatch.setattr(levels, "SHARE_2", min(least, 0.0))
     monkeypatch.setattr(levels, "MIN_PRACTICE", (3, 3))
     learner = trainer_of(replace(dataset, train=dataset.train * 12)).learner
@@ -336,16 +337,21 @@ def test_levels_without_gain_go_from_the_top_and_leave_their_anchors(dataset, mo
 
 @pytest.mark.usefixtures("short_runs_have_phases")
 @pytest.mark.parametrize(
-    "gain_2, over_0, gain_1, kept",
-    [(0.6, 3.9, 0.0, 2), (0.6, 4.1, 0.1, 1), (0.6, 4.1, 0.0, 0)]
-    + [(0.4, 0.1, 0.3, 1), (0.4, 0.1, 0.2, 0), (-3.0, 9.0, 0.7, 1), (-3.0, 9.0, 0.6, 0)],
+    "gain_2, over_0, gain_1, kept, steps",
+    [(0.6, 3.9, 0.0, 2, 500), (0.6, 4.1, 0.1, 1, 500), (0.6, 4.1, 0.0, 0, 500)]
+    + [(0.4, 0.1, 0.3, 1, 500), (0.4, 0.1, 0.2, 0, 500), (-3.0, 9.0, 0.7, 1, 500), (-3.0, 9.0, 0.6, 0, 500)]
+    + [(0.4, 0.1, 0.8, 1, 3000), (0.4, 0.1, 0.6, 0, 3000), (-3.0, 9.0, 1.2, 1, 3000), (-3.0, 9.0, 0.8, 0, 3000)],
 )
-def test_level_2_needs_a_share_of_all_motion_and_counts_for_level_1(dataset, monkeypatch, gain_2, over_0, gain_1, kept):
-    """Both tell that something moves: quick motion shows in level 2, and hardly in the few instants of level 1."""
+def test_level_2_needs_a_share_of_all_motion_and_counts_for_level_1(
+    dataset, monkeypatch, gain_2, over_0, gain_1, kept, steps
+):
+    """Both tell that something moves: quick motion shows in level 2, and hardly in the few instants of level 1. Short
+    runs have learnt less of it."""
     told = iter([over_0, gain_2, gain_1])
     monkeypatch.setattr(levels, "gain_in", lambda *of: next(told))
     monkeypatch.setattr(levels, "MIN_PIXELS", 0)
     learner, record = trainer_of(replace(dataset, train=dataset.train * 12)).learner, {}
+    monkeypatch.setattr(learner, "steps_in", lambda share: round(share * steps))
     learner.levels.apply(learner, record)
     assert learner.model.level == kept and record["level_gains"] == [gain_2, gain_1][: 3 - max(kept, 1)]
 

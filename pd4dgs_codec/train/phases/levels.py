@@ -26,9 +26,10 @@ from pd4dgs_codec.train.state import TrainingView, TrainState
 #: One in EVERY training views is held back until levels are selected, if these are at least MIN_VIEWS.
 EVERY = 16
 MIN_VIEWS = 4
-#: Level 1 stays if its gain and that of a removed level 2, which also shows motion, sum to MIN_GAIN_1 dB. Level 2 stays
-#: if it gains at least SHARE_2 of its gain over level 0, and MIN_GAIN_2 dB.
-MIN_GAIN_1, SHARE_2, MIN_GAIN_2 = 0.65, 0.15, 0.5
+#: Level 1 stays if its gain and that of a removed level 2, which also shows motion, sum to MIN_GAIN_1 dB, or less in
+#: proportion in runs of fewer than LEARNT steps, which learn fast motion incompletely. Level 2 stays if it gains at
+#: least SHARE_2 of its gain over level 0, and MIN_GAIN_2 dB.
+MIN_GAIN_1, LEARNT, SHARE_2, MIN_GAIN_2 = 1.1, 850, 0.15, 0.5
 #: A gain counts the pixels in which the level changes a colour by MIN_CONTRAST; if there are fewer than this, it is 0.
 MIN_CONTRAST, MIN_PIXELS = 0.02, 32
 #: Steps for which the level below is trained before: a share of the run, and the fewest for levels 0 and 1. In short
@@ -80,7 +81,7 @@ class SelectLevels(phases.Phase):
         def gain_over(other: int) -> float:
             return gain_in(views, acts, [images(state, view, (other,))[0] for view in views], with_it)
 
-        needed = MIN_GAIN_1 - above
+        needed = MIN_GAIN_1 * min(1.0, state.steps_in(1.0) / LEARNT) - above
         if level == 2:
             needed = max(MIN_GAIN_2, SHARE_2 * workers.alike(lambda: gain_over(0)))
         if sum(int(mask.sum()) for mask in acts) < MIN_PIXELS:
