@@ -113,18 +113,7 @@ def pack(
     if not target_sizes:
         data, report, slices = pictures.write(scene, options, left_out, metadata, passing=True)
         return Packed(data, scene, report, None, slices)
-    growth = dict.fromkeys(target_sizes, 1.0)
-    while True:
-        fitted, more, target = pictures.fit(scene, options, target_sizes, growth)
-        data, report, slices = pictures.write(fitted, options, left_out + more, metadata, passing=False)
-        added, met = report.added_bytes(), True
-        for row in target["layers"]:
-            layer, expected = row["layer"], row["bytes"]
-            row["bytes"] = added.get(layer, 0)
-            if row["bytes"] > row["target"]:  # slices in another order than measured: fit again
-                met, growth[layer] = False, growth[layer] * row["bytes"] / expected
-        if met:
-            return Packed(data, fitted, report, target, slices)
+    return pictures.fit(scene, options, target_sizes, left_out, metadata)
 
 
 @dataclass(frozen=True)
@@ -149,18 +138,33 @@ class _Pictures:
         return dataset_frames(self.views.fitting)
 
     def fit(
-        self, scene: Scene, options: EncodeOptions, target_sizes: Mapping[int, int], growth: Mapping[int, float]
-    ) -> tuple[Scene, list[LeftOut], dict[str, Any]]:
-        """Returns the scene whose layers meet the sizes, the parts left out, and the target of the report."""
+        self,
+        scene: Scene,
+        options: EncodeOptions,
+        target_sizes: Mapping[int, int],
+        left_out: list[LeftOut],
+        metadata: Metadata | None,
+    ) -> Packed:
+        """Returns the file whose layers meet the sizes."""
         from pd4dgs_codec.quality.measure import RenderedLoss, true_psnr
         from pd4dgs_codec.quality.target import fit
 
         planned = plan(scene, options)
-        scene, left_out = planned.scene, planned.left_out
+        scene, left_out = planned.scene, left_out + planned.left_out
         frames = self.frames(scene)
         with self.progress("fitting sizes") as step:
             loss = RenderedLoss(scene, frames, step)
-            fitted, dropped, fits = fit(scene, target_sizes, loss.mean_mse, loss.omission_error, options, growth)
+            growth, measured = dict.fromkeys(target_sizes, 1.0), dict[Any, Any]()
+            met = False
+            while not met:
+                fitted, dropped, fits = fit(
+                    scene, target_sizes, loss.mean_mse, loss.omission_error, options, growth, measured
+                )
+                data, report, slices = self.write(fitted, options, left_out + dropped, metadata, passing=False)
+                added, met = report.added_bytes(), True
+                for row in fits:
+                    if (size := added.get(row.layer, 0)) > row.target:  # slices in another order than measured
+                        met, growth[row.layer] = False, growth[row.layer] * size / row.bytes
             packed = plan(fitted, replace(options, omit="nothing")).symbols.scene()
             errors = loss.mse(packed)
             before, after = (true_psnr(s, self.held_out, step) if self.held_out else {} for s in (scene, packed))
@@ -168,9 +172,9 @@ class _Pictures:
         for level, mse in errors.items():
             lost = {"lost_db": before[level] - after[level]} if before else {}
             levels.append({"level": level, "error_psnr": -10.0 * math.log10(mse) if mse else math.inf, **lost})
-        layers = [asdict(row) for row in fits]
-        report = {"cameras": self.cameras, "pictures": len(frames), "layers": layers, "levels": levels}
-        return fitted, left_out + dropped, report
+        layers = [asdict(row) | {"bytes": added.get(row.layer, 0)} for row in fits]
+        target = {"cameras": self.cameras, "pictures": len(frames), "layers": layers, "levels": levels}
+        return Packed(data, fitted, report, target, slices)
 
     def write(
         self,

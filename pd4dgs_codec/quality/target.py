@@ -13,6 +13,7 @@ The caller passes the loss and the error of omitted anchors as functions, so tha
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -70,12 +71,19 @@ def least_loss(
     grids: by parameter the values to try, from the given one to that of the smallest size. size: a fast estimate of
     final_size, up to a factor. Raises Unreachable, before any loss is measured, if the last values take more.
     """
+    start = {name: grid[0] for name, grid in grids.items()}
+    most = needed(grids, final_size, target)
+    return start if most == start else _walk(_path(grids, size, loss), start, size, final_size, target) or most
+
+
+def needed(grids: Mapping[str, Sequence[float]], final_size: Callable[[Setting], int], target: int) -> dict[str, float]:
+    """Returns the given setting if it takes at most `target`, else that of the smallest size, or raises Unreachable."""
     start, smallest = ({name: grid[i] for name, grid in grids.items()} for i in (0, -1))
     if final_size(start) <= target:
         return start
     if final_size(smallest) > target:
         raise Unreachable(final_size(smallest))
-    return _walk(_path(grids, size, loss), start, size, final_size, target) or smallest
+    return smallest
 
 
 def _path(
@@ -184,32 +192,51 @@ def fit(
     omission_error: Callable[[Scene, int], np.ndarray],
     options: EncodeOptions = DEFAULTS,
     growth: Mapping[int, float] | None = None,
+    measured: dict[Any, "_Layer"] | None = None,
 ) -> tuple[Scene, list[LeftOut], list[Fit]]:
     """Fits a planned scene to targets. Returns the scene, the dropped anchors, and how each layer met its target.
 
     targets: most bytes by layer; an absent layer meets any. loss: of a decoded scene, to be minimised. omission_error:
     float64 [N], the error of omitting each anchor of the scene at a level; anchors of least error move to the next
-    layer first, or are dropped from the highest. options: of the file to be written. growth: by layer, a
-    factor on its bytes, 1 if absent; for slices, which are measured with the largest anchors first. Raises EncodeError
-    naming the layer and its smallest size.
+    layer first, or are dropped from the highest. options: of the file to be written. growth: by layer, a factor on its
+    bytes, 1 if absent; for slices, which are measured with the largest anchors first. measured: keeps measurements for
+    calls with another growth only. Raises EncodeError naming the layer and its smallest size, before any loss is
+    measured if no setting of earlier layers helps.
     """
     fits, dropped = [], 0
-    for layer, target in sorted(targets.items()):
-        if layer not in scene.layers:
-            fits.append(Fit(layer, target))
-            continue
-        fitted = _Layer(scene, layer, loss, omission_error, options, (growth or {}).get(layer, 1.0))
-        try:
-            found = least_loss(fitted.grids, fitted.size, fitted.loss, fitted.final_size, target)
-        except Unreachable as error:
-            raise EncodeError(
-                f"target size: layer {layer} takes at least {error.smallest:,} bytes "
-                f"(steps up to x{2 ** OCTAVES[-1]:g}, {SHARES[-1]:.0%} of its anchors moved out), "
-                f"expected at most {target:,}"
-            ) from None
-        fits.append(fitted.describe(found, target))
-        dropped += fits[-1].moved if fits[-1].to_layer is None else 0
-        scene = fitted.apply(found)
+    measured = {} if measured is None else measured
+
+    def layer_of(scene: Scene, layer: int, *found: Setting) -> _Layer:
+        """Returns the layer of a scene with these settings of its earlier layers."""
+        key = layer, *(tuple(setting.items()) for setting in found)
+        if key not in measured:
+            measured[key] = _Layer(scene, layer, loss, omission_error, options)
+        measured[key].growth = (growth or {}).get(layer, 1.0)
+        return measured[key]
+
+    settings, least = list[Setting](), scene
+    try:
+        for layer in sorted(layer for layer in targets if layer in scene.layers):  # refuses sizes before any search
+            fitted = layer_of(least, layer, *settings)
+            # anchors that leave make later layers larger
+            settings.append({**needed(fitted.grids, fitted.final_size, targets[layer]), ANCHORS: 0.0})
+            least = fitted.apply(settings[-1])
+        settings = []
+        for layer, target in sorted(targets.items()):
+            if layer not in scene.layers:
+                fits.append(Fit(layer, target))
+                continue
+            fitted = layer_of(scene, layer, *settings)
+            settings.append(least_loss(fitted.grids, fitted.size, fitted.loss, fitted.final_size, target))
+            fits.append(fitted.describe(settings[-1], target))
+            dropped += fits[-1].moved if fits[-1].to_layer is None else 0
+            scene = fitted.apply(settings[-1])
+    except Unreachable as error:
+        raise EncodeError(
+            f"target size: layer {layer} takes at least {error.smallest:,} bytes "
+            f"(steps up to x{2 ** OCTAVES[-1]:g}, {SHARES[-1]:.0%} of its anchors moved out), "
+            f"expected at most {targets[layer]:,}"
+        ) from None
     if not dropped:
         return scene, [], fits
     scene, _ = in_file_order(scene, scene.layers)  # removes dropped anchors, else a plan would report them too
@@ -227,9 +254,8 @@ class _Layer:
         loss: Callable[[Scene], float],
         omission_error: Callable[[Scene, int], np.ndarray],
         options: EncodeOptions,
-        growth: float,
     ):
-        self.scene, self.layer, self.index, self.growth = scene, layer, scene.layers.index(layer), growth
+        self.scene, self.layer, self.index, self.growth = scene, layer, scene.layers.index(layer), 1.0
         self.of_scene = loss
         self.options = replace(options, omit="nothing")  # planning has made unread cells cheap already
         steps = list(scene.attributes) if layer == 0 else []
@@ -261,8 +287,8 @@ class _Layer:
         """Returns the bytes that the layer adds to the file, 0 if the plan leaves it out."""
         key = effort, frozenset(setting.items())
         if key not in self._sizes:
-            self._sizes[key] = math.ceil(self.growth * self._added_bytes(setting, effort))
-        return self._sizes[key]
+            self._sizes[key] = self._added_bytes(setting, effort)
+        return math.ceil(self.growth * self._sizes[key])
 
     def _added_bytes(self, setting: Setting, effort: int) -> int:
         if self.options.slices and effort == self.options.effort:

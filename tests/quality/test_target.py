@@ -191,3 +191,28 @@ def test_a_layer_that_is_not_there_meets_any_target(scene):
     alone = plan(scene, EncodeOptions(layers=0)).scene
     fitted, left_out, (row,) = fit(alone, {2: 1}, coarseness(alone), error, EncodeOptions(**FAST))
     assert fitted is alone and not left_out and (row.bytes, row.moved, row.factors) == (0, 0, {})
+
+
+def test_a_later_target_out_of_reach_is_refused_before_any_search(scene):
+    def never(decoded):
+        raise AssertionError("a loss was measured")
+
+    with pytest.raises(EncodeError, match=r"layer 2 takes at least [\d,]+ bytes .* expected at most 100$"):
+        fit(scene, {0: 4000, 2: 100}, never, error, EncodeOptions(**FAST))
+
+
+def test_measurements_are_kept_for_another_growth(scene):
+    options, measured, losses = EncodeOptions(**FAST), {}, []
+    loss = coarseness(scene)
+
+    def counted(decoded):
+        losses.append(decoded)
+        return loss(decoded)
+
+    whole = added(encode(scene, **FAST))
+    targets, grown = {layer: round(0.9 * whole[layer]) for layer in (0, 1)}, {1: 1.03}
+    fits = [fit(scene, targets, counted, error, options, growth, measured)[2] for growth in (None, grown)]
+    once = len(losses)
+    assert fits[0][0] == fits[1][0] and fits[0][1] != fits[1][1]
+    assert fit(scene, targets, counted, error, options, grown)[2] == fits[1]
+    assert len(losses) == 2 * once
