@@ -244,7 +244,7 @@ CASES: dict[str, tuple[str, Callable[[], bytes], Callable[[Path], object]]] = {
     "manifest: broken lines": (
         "m.jsonl",
         lambda: b"{}\n" * (MEGABYTE // 12),
-        lambda path: Manifest(str(path), OPS["encode"], lambda options: None),
+        lambda path: Manifest(str(path), OPS["encode"], lambda source, options: None),
     ),
 }  # fmt: skip
 

@@ -26,6 +26,7 @@ LOG_BYTES = 1 << 16  #: limit of a command's log, whose end is kept
 DONE, ALREADY, FAILED = "done", "already", "failed"
 #: Runs a command: (verb, argv) -> (exit code, its stdout, its stderr).
 Command = Callable[[str, list[str]], tuple[int, str, str]]
+Check = Callable[[str, dict[str, Any]], None]  #: of a source with its options
 
 # -- manifests ---------------------------------------------------------------------------------------------------------
 
@@ -70,10 +71,10 @@ class Manifest:
     """Reads the valid lines of a manifest, and the faults of the others as (number, message). Raises OSError or
     DataError if it cannot be read or is empty.
 
-    check: raises DataError for options that the command does not take.
+    check: raises DataError for a source and options that the command does not take.
     """
 
-    def __init__(self, place: str, op: Op, check: Callable[[dict[str, Any]], None]):
+    def __init__(self, place: str, op: Op, check: Check):
         self.lines: list[Line] = []
         self.faults: list[tuple[int, str]] = []
         first: dict[str, int] = {}
@@ -94,7 +95,7 @@ class Manifest:
             raise DataError(f"{place}: is empty, expected one JSON object per scene")
 
 
-def _line(number: int, raw: bytes, op: Op, check: Callable[[dict[str, Any]], None]) -> Line:
+def _line(number: int, raw: bytes, op: Op, check: Check) -> Line:
     try:
         content = json.loads(raw.decode("utf-8-sig").rstrip())
     except json.JSONDecodeError as error:
@@ -113,9 +114,10 @@ def _line(number: int, raw: bytes, op: Op, check: Callable[[dict[str, Any]], Non
     plain = isinstance(output, str) and output.isprintable() and "\\" not in output
     if not plain or {"", ".", ".."} & set(output.split("/")) or output.endswith(store.RECORD):
         raise DataError(f"found output {output!r}, expected a path relative to -o without the suffix {store.RECORD}")
-    check(options)
+    source = _absolute(source)
+    check(source, options)
     inputs = {name: _absolute(options[name]) for name in op.inputs if name in options}
-    return Line(number, _absolute(source), output, options | inputs)
+    return Line(number, source, output, options | inputs)
 
 
 def _absolute(place: Any) -> str:

@@ -142,9 +142,9 @@ def _batch(args: argparse.Namespace, console: Console) -> int:
     module = import_module(f"pd4dgs_codec.cli.{args.op}")
     takes, check_usage = module.parser(), getattr(module, "check_usage", lambda args: None)
 
-    def check(options: dict[str, Any]) -> None:
+    def check(source: str, options: dict[str, Any]) -> None:
         try:
-            check_usage(takes.parse_args(arguments(args.op, "source", "output", options)))
+            check_usage(takes.parse_args(arguments(args.op, source, "output", options)))
         except UsageError as error:
             raise DataError(str(error)) from None
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pd4dgs_codec.cli import common, options
 from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError, number, shown_name, table
 from pd4dgs_codec.cli.progress import progress_bar
+from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.options import CHOICES, DEFAULTS, EncodeOptions
 from pd4dgs_codec.quality import ENCODE_MIN_DB_PER_MEGABYTE
 
@@ -94,19 +95,22 @@ def check_usage(args: argparse.Namespace) -> None:
     options.conditional(args, args.data, "needs --data SOURCE", holdout=holdout, views=16)
     needs = "needs --data SOURCE and --layers auto"
     options.conditional(args, args.data and gains, needs, min_gain=ENCODE_MIN_DB_PER_MEGABYTE)
+    try:
+        args.options = _options(args)
+    except EncodeError as error:
+        raise UsageError(str(error)) from None
 
 
 def _encode(args: argparse.Namespace, console: Console) -> int:
     check_usage(args)
     common.check_output(args.output, args.overwrite)
-    chosen = _options(args)
     scene, metadata = _load(args)
     console.detail(f"{args.input}: {len(scene.anchor_q)} anchors, layers {list(scene.layers)}, steps {scene.steps}")
     from pd4dgs_codec.quality.packing import pack
 
     packed = pack(
         scene,
-        chosen,
+        args.options,
         target_sizes=args.target_size,
         views=_views(args, scene.info, console),
         min_gain=args.min_gain,

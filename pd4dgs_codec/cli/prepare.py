@@ -39,10 +39,19 @@ def parser() -> options.Parser:
     return p
 
 
+def check_usage(args: argparse.Namespace) -> None:
+    """Sets conditional defaults. Raises UsageError for options that do not fit together."""
+    from pd4dgs_codec.data.colmap import VIDEOS
+
+    path = Path(args.input)
+    video = path.suffix.lower() in VIDEOS and not path.is_dir()  # a URI has no more than a name
+    options.conditional(args, not (video or path.is_file()), "needs a folder of frames", fps=30.0)
+
+
 def _prepare(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.prepare.stages import Choices, prepare
 
-    options.conditional(args, not Path(args.input).is_file(), "needs a folder of frames", fps=30.0)
+    check_usage(args)
     choices = Choices(args.frames, args.fps, args.downscale, args.camera, args.threads or -1)
     try:
         report = prepare(Path(args.input), Path(args.output), choices, progress_bar, args.overwrite, console.message)

@@ -32,7 +32,7 @@ class Library:
         """The lines so far."""
         path = self.folder / "m.jsonl"
         path.write_text("\n".join(self.lines) + "\n")
-        return Manifest(str(path), OPS["encode"], lambda options: None)
+        return Manifest(str(path), OPS["encode"], lambda source, options: None)
 
     def run(
         self, on: str = "local", root: str | None = None, retries: int = 2, overwrite: bool = False, **settings: Any

@@ -140,7 +140,7 @@ def test_a_place_that_no_store_has_is_a_failure_of_its_line_alone(library, place
 @pytest.mark.parametrize("place", STORES)
 def test_a_place_that_no_store_has_holds_no_manifest(place):
     with pytest.raises((DataError, OSError)):
-        Manifest(place, OPS["encode"], lambda options: None)
+        Manifest(place, OPS["encode"], lambda source, options: None)
 
 
 @pytest.mark.parametrize(
@@ -157,7 +157,7 @@ def test_a_place_that_no_store_has_takes_no_output(place, tmp_path, monkeypatch)
 
 
 def test_what_no_check_foresaw_is_a_failure_of_its_line_alone(library):
-    def check(options):
+    def check(source, options):
         if options:
             raise ZeroDivisionError("never\n\x1b[2J")
 
@@ -197,7 +197,7 @@ def test_a_source_for_which_a_reader_would_wait_is_named(library, kind):
     library.add("b.pt", "y")
     assert library.run()["done"] == 1
     with pytest.raises(DataError, match="is a device"):
-        Manifest("/dev/zero", OPS["encode"], lambda options: None)
+        Manifest("/dev/zero", OPS["encode"], lambda source, options: None)
     outcome, tries = library.outcomes["a.pd4"]
     assert tries == 1 and "a.pt: is a pipe or a device, expected a file" in outcome.message
 

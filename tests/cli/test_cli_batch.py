@@ -63,12 +63,14 @@ def test_lines_that_fail_are_named_with_their_logs_and_the_others_go_on(cli, tmp
     "op,options,message",
     [
         ("encode", {"views": 4}, "--views needs --data SOURCE"),
+        ("encode", {"slices": "50k", "mode": "lzma"}, "slices in mode lzma, expected mode ans or one slice per layer"),
+        ("prepare", {"fps": 10}, "--fps needs a folder of frames"),
         ("package", {"no-video": True, "fps": 10}, "--fps has no effect with --no-video"),
         ("train", {"rollout": "all", "key-instant": 0.5}, "--key-instant needs --rollout key"),
     ],
 )
 def test_options_without_effect_are_named_before_any_job(cli, tmp_path, manifest, op, options, message):
-    lines = manifest({"source": "missing", "options": options})
+    lines = manifest({"source": "s3://missing/missing.mp4", "options": options})
     done = cli("batch", lines, "--op", op, "-o", "out", "--workers", "0", "--json")
     (row,) = done.json["failures"]
     assert done.code == 1 and row == {"line": 1, "output": None, "message": message, "log": None}
