@@ -265,6 +265,8 @@ def _run(parser: argparse.ArgumentParser, action: Action, arguments: list[str]) 
     try:
         args = parser.parse_args(arguments)
         name = getattr(args, "input", "")
+        if empty := [what for what in ("input", "source", "output") if getattr(args, what, None) == ""]:
+            raise UsageError(f"found an empty name of the {empty[0]}, expected a file or folder")
         configure(getattr(args, "threads", None))  # before numpy, torch and numba are imported
         code = action(args, Console(args))
         with _naming_stdout():

@@ -189,7 +189,7 @@ def duration(text: str) -> float:
 
 def size(text: str, expected: str = "a size in bytes such as 50k") -> int:
     """Reads bytes with k, M for 1e3, 1e6: "50k" -> 50000."""
-    return int(_scaled(text, {"k": 1e3, "M": 1e6}, expected, low=1.0))
+    return int(_scaled(text, {"k": 1e3, "M": 1e6}, expected, low=1.0, high=2.0**63))
 
 
 def layer_sizes(text: str) -> dict[int, int]:
@@ -204,11 +204,13 @@ def layer_sizes(text: str) -> dict[int, int]:
     return sizes
 
 
-def _scaled(text: str, units: dict[str, float], expected: str, low: float = math.ulp(0.0)) -> float:
-    """Reads a number with one of the units; the product must be finite and at least `low`."""
+def _scaled(
+    text: str, units: dict[str, float], expected: str, low: float = math.ulp(0.0), high: float = math.inf
+) -> float:
+    """Reads a number with one of the units; the product must be at least `low` and below `high`."""
     unit = next((unit for unit in units if text.endswith(unit)), "")
     with contextlib.suppress(ValueError):
         value = float(text.removesuffix(unit)) * units.get(unit, 1.0)
-        if low <= value < math.inf:
+        if low <= value < high:
             return value
     raise argparse.ArgumentTypeError(f"found {text!r}, expected {expected}")

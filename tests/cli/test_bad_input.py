@@ -76,6 +76,11 @@ CASES = [
         (2, f"encode m.pt -o s.pd4 --target-size={text}", "expected sizes in bytes such as L0=425k")
         for text in ("425k", "L3=1k", "L0=1k,L0=2k", "L0=", "L0=-5", "L0=0.5", "L0=1k,")
     ),
+    (2, "encode m.pt -o s.pd4 --layers 1 --target-size L0=9k,L2=9k", "--target-size L2 has no effect with --layers 1"),
+    *((2, f"encode m.pt -o s.pd4 --slices {option}", "slices ") for option in ("999", "2k --mode lzma")),
+    (2, "encode m.pt -o s.pd4 --slices 1e30k", "a size in bytes"),
+    *((2, line, "found an empty name of the output") for line in ("encode m.pt -o ''", "render s.pd4 -o ''")),
+    *((2, line, "found an empty name of the input") for line in ("encode '' -o s.pd4", "info ''", "eval '' DATA")),
     (2, "decode s.pd4 -o s.txt", ".npz or .pt"),
     (2, "decode s.pd4 --symbols", "FILE.npz"),
     (2, "decode s.pd4 -o s.pt --symbols", "FILE.npz"),
