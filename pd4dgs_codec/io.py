@@ -29,7 +29,7 @@ _FOLDERS: set[Path] = set()
 
 
 def check_path(path: str | Path) -> None:
-    """Raises DataError if an output path looks like a URI."""
+    """Raises DataError if a path looks like a URI."""
     if URI.match(str(path)):
         raise DataError(f"{path}: looks like a URI, expected a path (./{path} is one)")
 
@@ -99,7 +99,9 @@ def whole_files(names: Sequence[str], overwrite: bool, told: str | None = None) 
 
 
 def check_source(path: str | Path) -> None:
-    """Raises DataError for a device, whose bytes may never end, and OSError if nothing is there."""
+    """Raises DataError for a URI or a device, whose bytes may never end, and OSError if nothing is there."""
+    if not os.path.exists(path):
+        check_path(path)
     mode = os.stat(path).st_mode
     if stat.S_ISCHR(mode) or stat.S_ISBLK(mode):
         raise DataError(f"{path}: is a device, expected a file")

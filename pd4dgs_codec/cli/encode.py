@@ -90,6 +90,8 @@ def check_usage(args: argparse.Namespace) -> None:
         raise UsageError("-o - and --json both write to stdout, expected -o FILE")
     if args.layers != "auto" and (gone := [layer for layer in args.target_size if layer > int(args.layers)]):
         raise UsageError(f"--target-size L{gone[0]} has no effect with --layers {args.layers}")
+    if args.mode == "lzma" and args.priors != DEFAULTS.priors:
+        raise UsageError("--priors has no effect with --mode lzma")
     fits, gains = args.slices or args.target_size, args.layers == "auto"
     options.conditional(args, fits or gains, "needs --layers auto, --slices or --target-size", data=None)
     downscale, holdout = options.READING["downscale"], options.READING["holdout"]

@@ -79,6 +79,11 @@ CASES = [
     (2, "encode m.pt -o s.pd4 --layers 1 --target-size L0=9k,L2=9k", "--target-size L2 has no effect with --layers 1"),
     *((2, f"encode m.pt -o s.pd4 --slices {option}", "slices ") for option in ("999", "2k --mode lzma")),
     (2, "encode m.pt -o s.pd4 --slices 1e30k", "a size in bytes"),
+    (2, "encode m.pt -o s.pd4 --mode lzma --priors gauss", "--priors has no effect with --mode lzma"),
+    *(
+        (1, f"{line} http://127.0.0.1:9/s.pd4 -o new{suffix}", "looks like a URI, expected a path")
+        for line, suffix in (("encode", ".pd4"), ("render", ".gif"), ("export --to ply", ""), ("package", ""))
+    ),
     *((2, line, "found an empty name of the output") for line in ("encode m.pt -o ''", "render s.pd4 -o ''")),
     *((2, line, "found an empty name of the input") for line in ("encode '' -o s.pd4", "info ''", "eval '' DATA")),
     (2, "decode s.pd4 -o s.txt", ".npz or .pt"),
