@@ -1,7 +1,4 @@
-"""Evaluates a decoded deformation without torch.
-
-Another kind of deformation needs only another `Field` with the same two methods.
-"""
+"""Evaluates a decoded deformation without torch. Another kind of deformation changes only `Field` here."""
 
 import numpy as np
 

@@ -1,7 +1,7 @@
 """The torch module of a deformation: residuals with gradients, start values, rate, regularisers, conversion to arrays.
 
 The rest of `model` and `train` use a deformation only through `DeformationField`: here a HexPlane, a shared trunk and
-one network per residual head. Another kind of deformation needs only another `DeformationField`.
+one network per residual head. The trunk of layer 2 reads the planes of both layers, so one class handles all kinds.
 """
 
 from __future__ import annotations
