@@ -335,7 +335,6 @@ def test_levels_without_gain_go_from_the_top_and_leave_their_anchors(dataset, mo
     assert learner.model.masks(0).mean() > torch.sigmoid(before[3][:, 0]).mean() + 0.2
 
 
-@pytest.mark.usefixtures("short_runs_have_phases")
 @pytest.mark.parametrize(
     "gain_2, over_0, gain_1, kept, steps",
     [(0.6, 3.9, 0.0, 2, 500), (0.6, 4.1, 0.1, 1, 500), (0.6, 4.1, 0.0, 0, 500)]
@@ -347,13 +346,14 @@ def test_level_2_needs_a_share_of_all_motion_and_counts_for_level_1(
 ):
     """Both tell that something moves: quick motion shows in level 2, and hardly in the few instants of level 1. Short
     runs have learnt less of it."""
-    told = iter([over_0, gain_2, gain_1])
+    told, practised = iter([over_0, gain_2, gain_1]), []
     monkeypatch.setattr(levels, "gain_in", lambda *of: next(told))
     monkeypatch.setattr(levels, "MIN_PIXELS", 0)
-    learner, record = trainer_of(replace(dataset, train=dataset.train * 12)).learner, {}
+    learner, record = trainer_of(replace(dataset, train=dataset.train * 12), 600).learner, {}
     monkeypatch.setattr(learner, "steps_in", lambda share: round(share * steps))
-    learner.levels.apply(learner, record)
+    levels.SelectLevels(lambda *asked: practised.append(asked)).apply(learner, record)
     assert learner.model.level == kept and record["level_gains"] == [gain_2, gain_1][: 3 - max(kept, 1)]
+    assert practised == [(1, max(75, steps // 10)), (0, max(150, steps // 10))][: len(record["level_gains"])]
 
 
 @pytest.mark.parametrize("share, steps, due", [(0.67, 660, False), (0.67, 680, True), (None, 400, True)])
