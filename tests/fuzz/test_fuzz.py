@@ -175,9 +175,10 @@ def test_inputs_are_named_by_their_numbers():
 def test_random_files_are_legal_and_of_every_sort():
     chunks = []
     for i in range(150):
-        file = legal.legal(random.Random(i))
-        assert hashes(file.data()) == file.hashes()
-        parts = mutate.take_apart(file.data())
+        file = legal.numbered(i)
+        data = file.data()
+        assert hashes(data) == file.hashes()
+        parts = mutate.take_apart(data)
         chunks += [(parts.header, chunk) for chunk in parts.chunks]
     sections = [(h, c.meta, n, data) for h, c in chunks for n, data in (c.sections or {}).items()]
     assert {n for _, _, n, _ in sections} == set(range(6))

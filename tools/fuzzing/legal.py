@@ -10,6 +10,7 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -66,7 +67,7 @@ def seeds(paths: Sequence[Path] = (), built: int = 60) -> list[Seed]:
     found = [file for path in paths for file in (sorted(path.rglob("*.pd4")) if path.is_dir() else [path])]
     vectors = [file for folder in ("valid", "uncommon") for file in sorted((VECTORS / folder).glob("*.pd4"))]
     found += [file for file in vectors if file.stat().st_size <= LARGEST_SEED]
-    random_files = [Seed(f"legal-{i}", legal(random.Random(i)).data()) for i in range(built)]
+    random_files = [Seed(f"legal-{i}", numbered(i).data()) for i in range(built)]
     return [*random_files, *(Seed(file.stem, file.read_bytes()) for file in found if decodes(file.read_bytes()))]
 
 
@@ -306,7 +307,7 @@ def _slice(choices: Choices, number: int, first: bool) -> Layer:
         "codes": [_near(rng, lowest, 255) for _ in cells],
         "classes": classes if choices.graded else None,
         "widths": choices.widths,
-        "mode": choices.mode,
+        "mode": None,
     }
     if not first:
         return make_layer(number, cells, networks={}, **fields)
@@ -392,6 +393,12 @@ def legal(rng: random.Random) -> File:
         whole = file.fields()[14]
         file = replace(file, chunks=file.chunks[: rng.randint(1, len(file.chunks))]).with_header({14: whole})
     return _with_what_is_ignored(rng, file)
+
+
+@cache
+def numbered(index: int) -> File:
+    """A random file of its own for each number."""
+    return legal(random.Random(index))
 
 
 def _header(choices: Choices, layers: Sequence[Layer]) -> dict[int, Any]:

@@ -120,7 +120,8 @@ def default_prior(symbols: np.ndarray) -> Prior:
     return gauss(min(max(low, -most), most - n + 1), n, si=64 * n.bit_length() - 128)
 
 
-Known = list[tuple[bytes, bytes]]  # definitions of priors, with the classes of histograms
+Key = tuple[bytes, bytes]  # definition of a prior, with the classes of a histogram
+Known = list[Key]
 
 
 def coded(
@@ -132,7 +133,8 @@ def coded(
     some channels, by their number. known: definitions of the slices before, to which those of this section are added.
     """
     block, defined = b"", [] if known is None else known
-    tables, parts = list[tuple[np.ndarray, np.ndarray]](), list[tuple[np.ndarray, Prior]]()
+    tables, parts = list[tuple[np.ndarray, np.ndarray]](), list[tuple[np.ndarray, Key]]()
+    used = dict[Key, Prior]()
     for number, channel in enumerate(channels):
         k = np.asarray(channel, np.int64)
         if not k.size:
@@ -152,8 +154,10 @@ def coded(
                 tables.append((prior.height_symbols, prior.height_cum))
         if not inside.all():
             block += _exceptions(k, inside, window)
-        parts.append((k[inside] - window.kmin, prior))
-    tables += zip([symbols for symbols, _ in parts], _tables([prior for _, prior in parts]), strict=True)
+        parts.append((k[inside] - window.kmin, key))
+        used[key] = prior
+    cums = dict(zip(used, _tables([*used.values()]), strict=True))
+    tables += [(symbols, cums[key]) for symbols, key in parts]
     return block + ans_encode([symbols for symbols, _ in tables], [cum for _, cum in tables])
 
 
@@ -490,7 +494,7 @@ def make_layer(
     scales: Sequence[Scale] = (),
     networks: Mapping[int, Sequence[int]] | dict[int, list[np.ndarray]] | None = None,
     steps: Sequence[float] | None = None,
-    mode: int = ANS,
+    mode: int | None = ANS,
     widths: Widths = DEFAULT_WIDTHS,
     classes: Sequence[int] | None = None,
 ) -> Layer:
@@ -498,7 +502,8 @@ def make_layer(
     below.
 
     Defaults: every rise 0, every code 77, attributes all 2; in layer 0 the networks without hidden layers, elsewhere a
-    trunk and the head 1 if there are `scales`. networks: outputs by id, or their weights and biases.
+    trunk and the head 1 if there are `scales`. networks: outputs by id, or their weights and biases. mode: None leaves
+    the sections to the caller.
     """
     n = len(cells)
     if networks is None:
@@ -532,7 +537,7 @@ def make_layer(
         weights=[w for own in networks.values() for w in own],  # type: ignore[misc]
         meta=meta,
     )
-    return layer.with_sections(_sections(layer, mode))
+    return layer if mode is None else layer.with_sections(_sections(layer, mode))
 
 
 def _sections(layer: Layer, mode: int) -> dict[int, bytes | None]:
