@@ -11,10 +11,12 @@ from pd4dgs_codec.quality.image import level_psnr
 from pd4dgs_codec.train import phases
 from pd4dgs_codec.train.config import TrainConfig, at_quality
 from pd4dgs_codec.train.loop import Trainer
+from pd4dgs_codec.train.phases import opening
 
 
 def test_bytes_rise_with_the_dial(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(phases, "MIN_ITERATIONS", 10)
+    monkeypatch.setattr(opening, "MIN_TRIAL", 6)
     files, sizes, psnr = [], [], []
     for quality in (0, 100):
         trainer = Trainer(TrainConfig(preset="tiny", iterations=60, **at_quality(quality)), dataset)
