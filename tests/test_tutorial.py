@@ -1,4 +1,4 @@
-"""The tutorial is run as its notebook, and the demo, with a smaller scene and fewer steps."""
+"""The tutorial is run as its notebook, and the demo, with a smaller scene, fewer pictures and steps."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from pathlib import Path
 from tiny import TINY
 
 from pd4dgs_codec.model.config import PRESETS
+from pd4dgs_codec.quality import packing
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT / "tools"))
@@ -34,6 +35,7 @@ def run_command(line: str, smaller: dict[str, str]) -> None:
 def test_the_tutorial_runs_from_the_first_cell_to_the_last(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(PRESETS, "tiny", TINY)
+    monkeypatch.setattr(packing, "OWN_PICTURES", 2)
     code = [source for kind, source in cells(PAGE) if kind == "code"]
     assert all(usual in "".join(code) for usual in SMALLER)
     shown: list[str] = []

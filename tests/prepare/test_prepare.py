@@ -118,7 +118,7 @@ with interruptible():
 
 def test_a_camera_that_stands_still_is_told(tmp_path, capsys):
     textures = [texture(seed) for seed in range(4)]
-    pictures = [picture(pose(0.5), textures, -0.9 + 0.2 * step) for step in range(10)]
+    pictures = [picture(pose(0.5), textures, -0.9 + 0.2 * step, (160, 120), FOCAL / 2) for step in range(10)]
     frames = write(tmp_path / "tripod", pictures)
     assert main([str(frames), "-o", str(tmp_path / "out"), "-j", "2"]) == 1
     told = capsys.readouterr().err.strip().splitlines()

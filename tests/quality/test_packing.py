@@ -86,7 +86,8 @@ def test_the_files_own_camera_decides(scene):
     assert metadata_of(packed.data) is None
 
 
-def test_slices_of_target_sizes_leave_anchors_in_their_layers(scene):
+def test_slices_of_target_sizes_leave_anchors_in_their_layers(scene, monkeypatch):
+    monkeypatch.setattr(packing, "OWN_PICTURES", 2)
     sizes = {0: 6000, 1: 3000}
     packed = pack(scene, SLICED, target_sizes=sizes)
     added = packed.report.added_bytes()
