@@ -3,7 +3,6 @@
 import { hex, sha256 } from "./digests.js";
 import { channelCount } from "./header.js";
 import { readAll } from "./reader.js";
-import { PLANES } from "./scene.js";
 import { mortonOrder } from "./slices.js";
 /** @import { LayerSymbols } from "./layer.js" */
 /** @import { Scene } from "./scene.js" */
@@ -77,6 +76,6 @@ function tensorsOf(scene, i) {
     const width = values.length / all;
     return values.subarray(width * (scene.rows[i - 1] ?? 0), width * scene.rows[i]);
   });
-  const planes = deformation?.planes.flatMap((scale) => PLANES.map((name) => scale[name].data)) ?? [];
+  const planes = deformation?.planes.flatMap((scale) => Object.values(scale).map(({ data }) => data)) ?? [];
   return [...rows, ...planes, ...Object.values(networks).flat().flatMap(({ weight, bias }) => [weight, bias])];
 }

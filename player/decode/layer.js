@@ -39,7 +39,7 @@ export const MOST_CODE = 255;
 export function decodeLayer(payload, kind, before, continuation, later) {
   const earlierRows = later ? 0 : before.rows;
   const parameters = readParameters(payload, kind, before, later);
-  const { rows, sections, planes: shapes, networks } = parameters;
+  const { rows, sections, scales, networks } = parameters;
   const { positions, masks, attributes: section, planes, weights } = sections;
   const known = continuation.definitions("positions");
   const voxels = positions ? decodePositions(positions, rows, known) : new Int32Array(0);
@@ -58,7 +58,7 @@ export function decodeLayer(payload, kind, before, continuation, later) {
     codes: codes.subarray(earlierRows),
     stepClasses,
     attributes,
-    planes: planes ? decodePlanes(planes, shapes) : [],
+    planes: planes ? decodePlanes(planes, scales.flat()) : [],
     weights: weights ? decodeWeights(weights, networks) : [],
   };
 }

@@ -49,14 +49,14 @@ const SECTIONS = /** @type {const} */ (["positions", "masks", "attributes", "pla
 /** The keys of a layer's parameters (6.1). */
 const KEYS = [1, 2, 3, 4, 5, 6];
 
-/** One plane of a scale. @typedef {{channels: number, height: number, width: number, predictor: number}} PlaneShape */
+/** @typedef {{name: string, channels: number, height: number, width: number, predictor: number}} PlaneShape */
 /** Layers from the input side. @typedef {{name: string, layers: {inputs: number, outputs: number}[]}} NetworkShape */
 
 /**
  * @typedef {object} Parameters
  * @property {number} rows
  * @property {number[]} steps of the weights in layer 0, else of planes and weights; empty without a deformation
- * @property {PlaneShape[]} planes six per scale
+ * @property {PlaneShape[][]} scales each with its planes
  * @property {NetworkShape[]} networks
  * @property {number | null} key instant of the deformation, normalised time, if there is one
  * @property {Partial<Record<(typeof SECTIONS)[number], Uint8Array>>} sections
@@ -114,7 +114,7 @@ export function readParameters(payload, kind, before, later) {
       throw malformed(`${where}: section ${name} is ${found} for ${counts[i]} symbols`);
     }
   });
-  return { rows, steps, planes, networks, key, sections, declared };
+  return { rows, steps, scales, networks, key, sections, declared };
 }
 
 /** Clause 6.5. @param {string} where @param {string} what @param {number} count @param {number} free
@@ -171,6 +171,7 @@ function readScales(fields, kind, where, below) {
     }
     const side = { x, y, z, t };
     return PLANES.map((name, i) => ({
+      name,
       channels,
       height: side[/** @type {keyof typeof side} */ (name[1])],
       width: side[/** @type {keyof typeof side} */ (name[0])],

@@ -6,13 +6,12 @@ import { DecodeError, limitExceeded, malformed, unsupported } from "./errors.js"
 import { LAYER_TYPES, readHeader } from "./header.js";
 import { MOST_CODE, decodeLayer, dequantise, transposed } from "./layer.js";
 import { layerKind } from "./parameters.js";
-import { PLANES } from "./scene.js";
 import { Continuation, mortonOrder } from "./slices.js";
 import { VoxelTable } from "./voxels.js";
 /** @import { Header } from "./header.js" */
 /** @import { LayerSymbols } from "./layer.js" */
 /** @import { Declared, NetworkShape, PlaneShape } from "./parameters.js" */
-/** @import { Deformation, Network, Plane, PlaneName, Scene, Steps } from "./scene.js" */
+/** @import { Deformation, Network, Scale, Scene, Steps } from "./scene.js" */
 
 /**
  * Reads a whole file, or its layers up to maxLayer; of a cut file, if allowPartial, the slices that are there, at least
@@ -177,7 +176,7 @@ export class LayerReader {
    * @param {LayerSymbols} symbols @param {Continuation} continuation @param {boolean} later @param {Header} header */
   _accept(symbols, continuation, later, header) {
     const { kind, parameters, voxels, rises } = symbols;
-    const { steps, planes, networks, key } = parameters;
+    const { steps, scales, networks, key } = parameters;
     const where = `layer ${kind.layer}`;
     const latest = this._layers[this._layers.length - 1];
     const before = rises.length ? latest.codes.values : rises; // of a whole layer, in order
@@ -203,7 +202,7 @@ export class LayerReader {
       const codes = new Column(Uint8Array, 1);
       codes.append(earlier, (growth * (earlier.length + symbols.codes.length)) / Math.max(1, earlier.length));
       const none = { slices: 0, first: this._columns.voxels.rows, sorted: true };
-      this._layers.push({ layer: kind.layer, ...none, steps, planes, networks, key, tensors, codes, continuation });
+      this._layers.push({ layer: kind.layer, ...none, steps, scales, networks, key, tensors, codes, continuation });
     }
     const layer = this._layers[this._layers.length - 1];
     layer.slices++;
@@ -298,7 +297,7 @@ export class LayerReader {
  * @property {number} layer
  * @property {number} slices read so far
  * @property {number[]} steps
- * @property {PlaneShape[]} planes
+ * @property {PlaneShape[][]} scales
  * @property {NetworkShape[]} networks
  * @property {number | null} key
  * @property {{planes: Float32Array[], weights: Float32Array[]}} tensors
@@ -331,15 +330,11 @@ function networksOf({ networks, tensors }) {
   return named;
 }
 
-/** @param {LayerParts} layer @returns {Record<PlaneName, Plane>[]} */
-function planesOf({ planes, tensors }) {
-  const scales = [];
-  for (let i = 0; i < planes.length; i += PLANES.length) {
-    const named = PLANES.map((name, p) => {
-      const { channels, height, width } = planes[i + p];
-      return [name, { data: tensors.planes[i + p], channels, height, width }];
-    });
-    scales.push(Object.fromEntries(named));
-  }
-  return scales;
+/** @param {LayerParts} layer */
+function planesOf({ scales, tensors }) {
+  let at = 0;
+  return scales.map((scale) => {
+    const planes = scale.map(({ name, predictor, ...sizes }) => [name, { data: tensors.planes[at++], ...sizes }]);
+    return /** @type {Scale} */ (Object.fromEntries(planes));
+  });
 }

@@ -6,21 +6,21 @@
  * @typedef {{weight: Float32Array, bias: Float32Array, inputs: number, outputs: number}[]} Network
  */
 
-/** @typedef {"xy" | "xz" | "xt" | "yz" | "yt" | "zt"} PlaneName */
-
 /**
  * A plane ab of a HexPlane, [channels, height, width]: rows follow b, columns a.
  *
  * @typedef {{data: Float32Array, channels: number, height: number, width: number}} Plane
  */
 
+/** Planes in the order of the file. @typedef {Record<(typeof PLANES)[number], Plane>} Scale */
+
 /**
- * planes: per scale its six planes. networks: `trunk`, which reads the planes of the layers below before these, and
- * those of the heads position, feature, offset, scaling that are there, in this order.
+ * networks: `trunk`, which reads the planes of the layers below before these, and those of the heads position, feature,
+ * offset, scaling that are there, in this order.
  *
  * key: the key instant t* in normalised time if the residuals are those at t minus those at t* (13.4), else null.
  *
- * @typedef {{planes: Record<PlaneName, Plane>[], networks: Record<string, Network>, key: number | null}} Deformation
+ * @typedef {{planes: Scale[], networks: Record<string, Network>, key: number | null}} Deformation
  */
 
 /**
@@ -80,5 +80,5 @@
  * @property {Deformation | null} localDeformation of layer 2, likewise
  */
 
-/** The planes of a scale in the order of the file. @type {PlaneName[]} */
-export const PLANES = ["xy", "xz", "xt", "yz", "yt", "zt"];
+/** The planes of a scale. */
+export const PLANES = /** @type {const} */ (["xy", "xz", "xt", "yz", "yt", "zt"]);

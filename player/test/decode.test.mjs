@@ -110,12 +110,13 @@ test("a scene has the arrays that scene.js describes", () => {
     assert.ok(deformation && deformation.networks.trunk);
     for (const scale of deformation.planes) {
       assert.deepEqual(Object.keys(scale), ["xy", "xz", "xt", "yz", "yt", "zt"]);
-      for (const { data, channels, height, width } of Object.values(scale)) {
+      /** @type {Record<string, number>} */
+      const sides = {};
+      for (const [[a, b], { data, channels, height, width }] of Object.entries(scale)) {
         assert.equal(data.length, channels * height * width);
+        assert.equal(width, (sides[a] ??= width));
+        assert.equal(height, (sides[b] ??= height));
       }
-      assert.equal(scale.xy.width, scale.xz.width);
-      assert.equal(scale.xy.height, scale.yz.width);
-      assert.equal(scale.zt.height, scale.xt.height);
     }
   }
   assert.equal(typeof scene.steps.planesLocal, "number");
