@@ -4,9 +4,9 @@
 import { Column } from "../decode/columns.js";
 import { anchorColumns, columnsOf, headsOf } from "../decode/heads.js";
 import { Arena } from "./kernel.js";
-import { deformationUnit, eachAttribute, GAUSSIAN_COLUMNS as COLUMNS, levelOf, MIN_OPACITY } from "./level.js";
-import { SPATIAL, sliceAt, TEMPORAL } from "./level.js";
-/** @import { Deformation, Network, Plane, PlaneName, Scene } from "../decode/scene.js" */
+import { cellsOf, deformationUnit, eachAttribute, GAUSSIAN_COLUMNS as COLUMNS, levelOf } from "./level.js";
+import { MIN_OPACITY, SPATIAL, sliceAt } from "./level.js";
+/** @import { Deformation, Network, Scale, Scene } from "../decode/scene.js" */
 
 /**
  * The visible Gaussians in ascending order of their slot, anchor · slots + i. records: [count, GAUSSIAN_COLUMNS], all
@@ -44,7 +44,7 @@ class Chain {
   }
 }
 
-/** A spatial plane, or a temporal one at a time, of height 1. data: [height, width, channels]. */
+/** A spatial plane, or a row at a time, of height 1. data: [height, width, channels]. */
 class Sampler {
   /** @param {Float32Array} data @param {number} width @param {number} height @param {number} channels */
   constructor(data, width, height, channels) {
@@ -90,7 +90,7 @@ class Sampler {
 /** Spatial planes with their channels last, by scale: levels share scales. @type {WeakMap<object, Sampler[]>} */
 const transposed = new WeakMap();
 
-/** @param {Record<PlaneName, Plane>} planes of a scale */
+/** @param {Scale} planes */
 function spatialPlanes(planes) {
   let samplers = transposed.get(planes);
   if (!samplers) {
@@ -134,12 +134,12 @@ class Field {
 
   /** @param {number} t 0..1 */
   setTime(t) {
+    const { _channels: channels } = this;
     this._temporal = this._deformation.planes.map((planes) =>
-      TEMPORAL.map(([name]) => {
-        const { channels, width } = planes[name];
-        const out = new Float32Array(width * channels);
-        sliceAt(planes[name], t, (c, i, value) => (out[i * channels + c] = value));
-        return new Sampler(out, width, 1, channels);
+      cellsOf(planes).map((cells, axis) => {
+        const out = new Float32Array(cells * channels);
+        sliceAt(planes, axis, t, (c, i, value) => (out[i * channels + c] = value));
+        return new Sampler(out, cells, 1, channels);
       }),
     );
   }
@@ -179,7 +179,7 @@ class Field {
         const [one, two, three] = this._temporal[s];
         for (let p = 0; p < 3; p++) {
           this._spatial[s][p].find(u[SPATIAL[p][1]], u[SPATIAL[p][2]]);
-          this._temporal[s][p].find(u[TEMPORAL[p][1]], 0);
+          this._temporal[s][p].find(u[p], 0);
         }
         // one loop over channels for all six: a loop for each would store and load the product six times
         for (let c = 0; c < C; c++) {

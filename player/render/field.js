@@ -2,8 +2,8 @@
 
 import { anchorColumns, columnsOf, headsOf } from "../decode/heads.js";
 import { blocksOf, Linear, repeat, targets, TooLarge } from "./layers.js";
-import { deformationUnit, sliceAt, SPATIAL, TEMPORAL } from "./level.js";
-/** @import { Deformation, Network, Scene } from "../decode/scene.js" */
+import { cellsOf, deformationUnit, sliceAt, SPATIAL } from "./level.js";
+/** @import { Deformation, Network, Scale, Scene } from "../decode/scene.js" */
 /** @import { Field, Gpu } from "./gl.js" */
 
 export class FieldPass {
@@ -28,7 +28,7 @@ export class FieldPass {
     /** What the outputs' field must have room for. */
     this.outputBlocks = this._linears[this._linears.length - 1].paddedBlocks;
     this._planes = deformation.planes.map((planes) => this._upload(planes));
-    this._cells = Math.max(...deformation.planes.flatMap((planes) => TEMPORAL.map(([name]) => planes[name].width)));
+    this._cells = Math.max(...deformation.planes.flatMap(cellsOf));
     if (this._cells > gpu.maxSide) throw new TooLarge(`${this._cells} cells`);
     this._rowData = new Float32Array(this._channelBlocks * 3 * this._scales * this._cells * 4);
     this._rows = gpu.field(this._cells, 3 * this._scales, this._channelBlocks);
@@ -38,7 +38,7 @@ export class FieldPass {
     this._scratch = [];
   }
 
-  /** The three spatial planes of a scale, block after block. @param {Deformation["planes"][number]} planes */
+  /** The three spatial planes of a scale, block after block. @param {Scale} planes */
   _upload(planes) {
     const gpu = this._gpu;
     const width = Math.max(...SPATIAL.map(([name]) => planes[name].width));
@@ -60,15 +60,15 @@ export class FieldPass {
     return gpu.field(width, height, layers, data);
   }
 
-  /** Brings the rows of the planes with time to time t. @param {number} t 0..1 */
+  /** Brings the rows to time t. @param {number} t 0..1 */
   _setTime(t) {
     if (t === this._time) return;
     this._time = t;
     const { _cells: cells, _scales: scales, _rowData: data } = this;
     this._deformation.planes.forEach((planes, s) =>
-      TEMPORAL.forEach(([name], p) =>
-        sliceAt(planes[name], t, (c, i, value) => {
-          data[(((c >> 2) * 3 * scales + 3 * s + p) * cells + i) * 4 + (c & 3)] = value;
+      [0, 1, 2].forEach((axis) =>
+        sliceAt(planes, axis, t, (c, i, value) => {
+          data[(((c >> 2) * 3 * scales + 3 * s + axis) * cells + i) * 4 + (c & 3)] = value;
         }),
       ),
     );
@@ -104,10 +104,9 @@ ${repeat(some, (i) => `out${i} = h${i};`)}}`,
     let from = this._room(0, points.width, rows);
     this._planes.forEach((planes, s) => {
       gpu.use(program, { points, planes, rows: this._rows });
-      const { xy, xz } = this._deformation.planes[s];
       gl.uniform3fv(program.uniform("low"), this._box[0]);
       gl.uniform3fv(program.uniform("high"), this._box[1]);
-      gl.uniform3f(program.uniform("cells"), xy.width, xy.height, xz.height);
+      gl.uniform3fv(program.uniform("cells"), cellsOf(this._deformation.planes[s]));
       gl.uniform1i(program.uniform("firstRow"), 3 * s);
       gl.uniform1i(program.uniform("shift"), row);
       for (let b = 0; b < B; b += some) {
@@ -164,11 +163,8 @@ ${repeat(blocks, (c) => {
     const ij = names[i] + names[j];
     return `plane(block + ${p * B + c}, a.${ij}, b.${ij}, f.${ij})`;
   });
-  const temporal = TEMPORAL.map(([, i], p) => {
-    const n = names[i];
-    return `row(firstRow + ${p}, a.${n}, b.${n}, f.${n}, block + ${c})`;
-  });
-  return `vec4 h${c} = ${[...spatial, ...temporal].join("\n  * ")};`;
+  const rows = names.map((n, p) => `row(firstRow + ${p}, a.${n}, b.${n}, f.${n}, block + ${c})`);
+  return `vec4 h${c} = ${[...spatial, ...rows].join("\n  * ")};`;
 })}`;
   }
 

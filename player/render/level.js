@@ -1,7 +1,7 @@
 // The parts of a scene that a level shows (clause 13.4), in the forms that both evaluators take.
 
 import { columnsOf, headsOf } from "../decode/heads.js";
-/** @import { Deformation, Plane, PlaneName, Scene } from "../decode/scene.js" */
+/** @import { Deformation, Scale, Scene } from "../decode/scene.js" */
 
 /**
  * One level of a scene: the highest layer that is there and at most the requested one. It has the first `rows` anchors.
@@ -60,27 +60,24 @@ export function eachAttribute(scene, put) {
   }
 }
 
-/** Planes without time, and their two axes. @type {[PlaneName, number, number][]} */
-export const SPATIAL = [
+/** Planes without time, and their two axes. */
+export const SPATIAL = /** @type {const} */ ([
   ["xy", 0, 1],
   ["xz", 0, 2],
   ["yz", 1, 2],
-];
+]);
 
-/** Planes with time, and their other axis. @type {[PlaneName, number][]} */
-export const TEMPORAL = [
-  ["xt", 0],
-  ["yt", 1],
-  ["zt", 2],
-];
+/** Cells of a scale along x, y and z. @param {Scale} scale */
+export const cellsOf = ({ xy, xz }) => [xy.width, xy.height, xz.height];
 
 /**
- * A plane with time at time t.
+ * What a scale's spatial planes are multiplied by at time t: a row of cells along each axis.
  *
- * @param {Plane} plane @param {number} t 0..1
+ * @param {Scale} scale @param {number} axis of the row, 0..2 @param {number} t 0..1
  * @param {(channel: number, cell: number, value: number) => void} put takes each sample
  */
-export function sliceAt({ data, channels, height, width }, t, put) {
+export function sliceAt(scale, axis, t, put) {
+  const { data, channels, height, width } = [scale.xt, scale.yt, scale.zt][axis];
   const at = t * (height - 1);
   const low = Math.floor(at);
   const high = Math.min(low + 1, height - 1);
