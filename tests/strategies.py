@@ -15,6 +15,7 @@ from functools import cache
 
 import numpy as np
 from hypothesis import strategies as st
+from vectors.blocks import plane_shapes
 
 from pd4dgs_codec import encode
 from pd4dgs_codec.entropy.tables import norm_cdf28_of_each, tables_of_each
@@ -23,7 +24,6 @@ from pd4dgs_codec.scene import (
     DEFAULT_WIDTHS,
     INSTANTS,
     MAX_CLASS,
-    PLANES,
     SCAFFOLD_NETWORKS,
     Camera,
     Deformation,
@@ -66,7 +66,7 @@ def deformation(
     steps: tuple[float, float],
     *,
     channels: int = 2,
-    sides: tuple[int, int, int, int] = (3, 2, 4, 5),
+    sides: tuple[int, ...] = (3, 2, 4, 5),
     scales: int = 1,
     width: int = 3,
     kind: str = "small",
@@ -77,10 +77,8 @@ def deformation(
     the planes of the layer below."""
     planes = []
     for s in range(scales):
-        reso = [side << s for side in sides[:3]] + [sides[3]]
-        planes.append(
-            {name: dequantise(symbols(rng, (channels, reso[b], reso[a]), kind), steps[0]) for name, a, b in PLANES}
-        )
+        shapes = plane_shapes(channels, [side << s for side in sides[:3]] + [*sides[3:]])
+        planes.append({name: dequantise(symbols(rng, shape, kind), steps[0]) for name, shape in shapes.items()})
     networks = {"trunk": network(rng, (below + channels * scales, width), steps[1], kind)}
     for name, outputs in heads.items():
         layers = network(rng, (width, outputs), steps[1], kind)

@@ -11,19 +11,11 @@ from pathlib import Path
 
 import numpy as np
 from strategies import make_scene
+from vectors.blocks import plane_shapes
 
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.model.config import DeformationConfig, ModelConfig
-from pd4dgs_codec.scene import (
-    PLANES,
-    Camera,
-    Deformation,
-    Network,
-    Scene,
-    SceneInfo,
-    Steps,
-    Widths,
-)
+from pd4dgs_codec.scene import Camera, Deformation, Network, Scene, SceneInfo, Steps, Widths
 
 #: The preset `tiny` with few anchors and cells.
 TINY = ModelConfig(
@@ -144,7 +136,7 @@ def random_network(rng: np.random.Generator, *widths: int, scale: float = 0.3) -
 def random_deformation(
     rng: np.random.Generator,
     heads: dict[str, int],
-    resolutions: Sequence[tuple[int, int, int, int]] = ((3, 4, 5, 6),) * 2,
+    resolutions: Sequence[tuple[int, ...]] = ((3, 4, 5, 6),) * 2,
     *,
     channels: int = 2,
     spread: float = 0.3,
@@ -154,8 +146,8 @@ def random_deformation(
 ) -> Deformation:
     """Planes of values around 1, and heads that move little. below: features of the planes of the layer below."""
     planes = tuple(
-        {name: rng.normal(1, spread, (channels, reso[b], reso[a])).astype(np.float32) for name, a, b in PLANES}
-        for reso in resolutions
+        {name: rng.normal(1, spread, s).astype(np.float32) for name, s in plane_shapes(channels, sides).items()}
+        for sides in resolutions
     )
     networks = {"trunk": random_network(rng, below + channels * len(resolutions), *trunk)}
     networks |= {name: random_network(rng, trunk[-1], width, scale=0.05) for name, width in heads.items()}

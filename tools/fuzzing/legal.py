@@ -35,6 +35,7 @@ from vectors.blocks import (
     make_file,
     make_layer,
     ordered,
+    plane_shapes,
     varint,
 )
 
@@ -44,7 +45,7 @@ from pd4dgs_codec.errors import DecodeError
 from pd4dgs_codec.format.info import hashes
 from pd4dgs_codec.format.planes import residual
 from pd4dgs_codec.morton import morton_order
-from pd4dgs_codec.scene import PLANES, SCAFFOLD_NETWORKS, Widths
+from pd4dgs_codec.scene import SCAFFOLD_NETWORKS, Widths
 
 VECTORS = Path(__file__).resolve().parents[2] / "spec" / "vectors"
 LARGEST_SEED = 6000  #: bytes of a vector: larger ones decode slowly
@@ -342,13 +343,10 @@ def _scales(rng: random.Random, channels: int) -> list[Scale]:
     made = list[Scale]()
     for _ in range(rng.choices((1, 2, 8), (9, 3, 0.3))[0]):
         sides = [rng.choices((1, 2, 3, 5, 40), (8, 8, 8, 4, 1))[0] for _ in range(4)]
-        samples = {n: symbols(rng, channels, sides[b], sides[a], most=rng.choice((M, 3))) for n, a, b in PLANES}
-        chosen = [rng.randrange(4) for _ in PLANES]
-        fits = [
-            abs(residual(p, samples[n]).astype(np.int64)).max() <= K
-            for p, (n, _, _) in zip(chosen, PLANES, strict=True)
-        ]
-        predictors = tuple(p if fit else 0 for p, fit in zip(chosen, fits, strict=True))
+        shapes = plane_shapes(channels, sides).items()
+        samples = {name: symbols(rng, *shape, most=rng.choice((M, 3))) for name, shape in shapes}
+        chosen = [(rng.randrange(4), plane) for plane in samples.values()]
+        predictors = tuple(p if abs(residual(p, k).astype(np.int64)).max() <= K else 0 for p, k in chosen)
         made.append(Scale(channels, tuple(sides), predictors, lambda n, shape, samples=samples: samples[n]))  # type: ignore
     return made
 

@@ -20,7 +20,10 @@ from pd4dgs_codec.entropy.varint import VARINT_MAX, ByteReader
 from pd4dgs_codec.errors import DecodeError, EncodeError
 from pd4dgs_codec.format import canonical
 from pd4dgs_codec.format.container import read_chunk, read_preamble, write_chunk, write_preamble
+from pd4dgs_codec.format.deformation import unpack_parameters
 from pd4dgs_codec.format.header import scene_id_of
+from pd4dgs_codec.format.registry import LAYER_KINDS
+from pd4dgs_codec.scene import Widths
 
 from .legal import Seed, legal
 
@@ -244,7 +247,9 @@ def stages_of(section: bytes, number: int, header: dict[int, Any], meta: dict[in
                 (split,) = numbers(1)
                 numbers((split > 0) + (split > 1))
     elif number == PLANES and form == 1:
-        count = max(1, (meta[4][0][0] - 1).bit_length())
+        fields, widths = canonical.Fields(meta, "layer", set(meta)), Widths(feature, slots)
+        shape, _ = unpack_parameters(fields, LAYER_KINDS[1], widths, (), False, "layer")
+        count = max(1, (shape.scales[0].channels - 1).bit_length())
         numbers(count - 1)
     else:
         return section, []

@@ -440,18 +440,23 @@ class Layer:
         return [self.rises, self.codes, *grades, *self.attributes, *self.flat, *(w.ravel() for w in self.weights)]
 
 
+def plane_shapes(channels: int, sides: Sequence[int]) -> dict[str, tuple[int, int, int]]:
+    """[C, H, W] of the planes of a scale by name, in the order of the format. sides: along x, y, z, t."""
+    return {name: (channels, sides[b], sides[a]) for name, a, b in PLANES}
+
+
 @dataclass(frozen=True)
 class Scale:
     """One scale of a HexPlane. fill: makes the symbols of one plane from its name and shape."""
 
     channels: int = 2
-    sides: tuple[int, int, int, int] = (3, 2, 4, 2)
+    sides: tuple[int, ...] = (3, 2, 4, 2)
     predictors: tuple[int, ...] = (0,) * 6
     fill: Callable[[str, tuple[int, ...]], np.ndarray] = lambda name, shape: pattern(*shape, seed=ord(name[0]))
 
     def planes(self) -> list[np.ndarray]:
         """int32 [C, H, W] each, in the order of the format."""
-        return [self.fill(n, (self.channels, self.sides[b], self.sides[a])) for n, a, b in PLANES]
+        return [self.fill(*plane) for plane in plane_shapes(self.channels, self.sides).items()]
 
 
 def constant(value: int) -> Callable[[str, tuple[int, ...]], np.ndarray]:
