@@ -24,7 +24,7 @@ from pd4dgs_codec.train import workers
 PROGRAM = """
 import sys
 from pathlib import Path
-sys.path.insert(0, {tests!r})
+sys.path[:0] = {folders!r}
 from tiny import TINY
 from pd4dgs_codec.model.config import PRESETS
 PRESETS["tiny"] = TINY
@@ -41,7 +41,7 @@ def program(once) -> Path:
     """In a folder with the views, and what one process makes of two views a step."""
 
     def make(folder: Path) -> None:
-        (folder / "train.py").write_text(PROGRAM.format(tests=str(Path(__file__).parents[1])))
+        (folder / "train.py").write_text(PROGRAM.format(folders=sys.path))
         write_views(folder / "set")
         options = ("--iterations", STEPS, "--views-per-step", 2, "--log", folder / "one.jsonl")
         assert _alone(folder / "train.py", "one.pt", *options) == 0
