@@ -160,7 +160,7 @@ def test_steps_while_time_opens_leave_planes_linear_between_few_instants(dataset
 
 @pytest.mark.usefixtures("short_runs_have_phases")
 def test_a_signal_ends_a_trial_which_comes_again(dataset, tmp_path, monkeypatch):
-    config = TrainConfig(preset="tiny", iterations=30, prune=0.0)
+    config = TrainConfig(preset="tiny", iterations=30)
     trainer, whole, resumed = (Trainer(config, dataset) for _ in range(3))
     update, updates = trainer.learner.optimiser.step, []
 
@@ -371,7 +371,7 @@ def test_a_removed_level_stays_away(dataset, tmp_path, monkeypatch):
         levels.SelectLevels, "_gain", lambda self, state, level, views, above: (0.0 if level == 2 else 9.0, 1.0)
     )
     views = replace(dataset, train=dataset.train * 12)
-    config = TrainConfig(preset="tiny", iterations=30, prune=0.0)
+    config = TrainConfig(preset="tiny", iterations=30)
     trainer = Trainer(config, views)
     held_back, seen, original = held_back_views(trainer.learner), [], learner.next_view
     monkeypatch.setattr(learner, "next_view", lambda *at: seen.append(original(*at)) or seen[-1])
