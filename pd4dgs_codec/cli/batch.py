@@ -122,7 +122,7 @@ def _scan(args: argparse.Namespace, console: Console) -> int:
 
     lines = [json.dumps(line) + "\n" for line in scan(args.input, args.op)]
     write_bytes(args.output, "".join(lines).encode(), args.overwrite)
-    console.result({"output": args.output, "scenes": len(lines)}, f"{len(lines)} scenes")
+    console.result({"output": args.output, "scenes": len(lines)}, f"{len(lines)} scene{'s' * (len(lines) != 1)}")
     return OK
 
 

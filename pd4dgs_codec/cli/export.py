@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.cli import common, options
-from pd4dgs_codec.cli.common import OK, Console
+from pd4dgs_codec.cli.common import OK, Console, UsageError
 from pd4dgs_codec.cli.progress import progress_bar
 from pd4dgs_codec.errors import DataError, required
 from pd4dgs_codec.io import check_path, whole_files
@@ -109,6 +109,9 @@ def _check_usage(args: argparse.Namespace) -> None:
     options.conditional(args, args.to not in SEQUENCES, "needs --to ply, spz or glb", time=0.0)
     options.conditional(args, args.to in SEQUENCES, "needs --to ply-seq or 4dgs", fps=FPS)
     options.conditional(args, args.data or args.compare, "needs --data or --compare", **options.READING)
+    suffix = Path(args.output).suffix.lower().removeprefix(".")
+    if suffix in KINDS and suffix != args.to:
+        raise UsageError(f"-o {args.output} ends in .{suffix}, but --to is {args.to}")
 
 
 def _check_folder(path: str, overwrite: bool) -> None:

@@ -19,8 +19,9 @@ examples:
   pd4dgs-info scene.pd4 --check --at 500k,2M,50M --json
   pd4dgs-info http://127.0.0.1:8000/scene.pd4"""
 
-#: Shown per layer with -v: quantisation steps, planes as [channels, x, y, z, t], widths of the networks' layers.
-DETAIL_KEYS = ("steps", "planes", "networks")
+#: Shown per layer with -v: quantisation steps, planes as [channels, x, y, z, t], widths of the networks' layers,
+#: the normalised time of a key instant.
+DETAIL_KEYS = ("steps", "planes", "networks", "key_instant")
 
 
 def parser() -> options.Parser:
@@ -54,7 +55,8 @@ def _info(args: argparse.Namespace, console: Console) -> int:
     if args.hashes:
         result["hashes"] = hashes(data)
     for row in result["layers"]:
-        console.detail(f"layer {row['layer']}: " + ", ".join(f"{key} {row.get(key)}" for key in DETAIL_KEYS))
+        found = [f"{key} {row[key]}" for key in DETAIL_KEYS if key in row]
+        console.detail(f"layer {row['layer']}: {', '.join(found) or 'incomplete'}")
     console.result(result, _text(result), on_stdout=True)
     return OK
 

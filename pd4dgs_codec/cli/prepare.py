@@ -32,7 +32,7 @@ def parser() -> options.Parser:
     add("-o", "--output", required=True, type=options.named, metavar="FOLDER", help="output folder")
     add("--frames", type=options.count, default=120, metavar="N", help="use at most N frames (default: 120; 0: all)")
     what = "frame rate of a folder of frames (default: 30)"
-    add("--fps", type=options.positive_float, metavar="F", help=what)
+    add("--fps", type=options.fps, metavar="F", help=what)
     add("--downscale", type=options.positive_int, default=1, metavar="K", help="downscale images by K (default: 1)")
     add("--camera", choices=CAMERAS, default=CAMERAS[0], help=f"COLMAP camera model (default: {CAMERAS[0]})")
     p.add_common()

@@ -26,7 +26,7 @@ def manifest(tmp_path, model_pt, monkeypatch):
 
 
 def test_a_folder_is_scanned_and_encoded(cli, tmp_path, manifest, model_pt):
-    assert cli("batch", "scan", "models", "-o", "m.jsonl").code == 0
+    assert cli("batch", "scan", "models", "-o", "m.jsonl").error_lines == ["2 scenes"]
     lines = [json.loads(line) for line in (tmp_path / "m.jsonl").read_text().splitlines()]
     assert lines == [{"source": f"models/{n}.pt", "output": f"{n}.pd4"} for n in "ab"]
     argv = ("batch", "m.jsonl", "--op", "encode", "-o", "out", "--workers", "0", "--json")

@@ -108,6 +108,11 @@ def test_info_states_layers_and_first_frame(cli, scene_pd4):
     assert report["first_frame_seconds"] == {"500k": 8 * end / 5e5, "2M": 8 * end / 2e6, "1e9": 8 * end / 1e9}
     text = cli("info", scene_pd4).out.decode()
     assert "first frame" in text and f"{size:,} bytes" in text
+    details = cli("info", scene_pd4, "-v").error_lines
+    for row, line in zip(report["layers"], details, strict=True):
+        facts = [f"{key} {row[key]}" for key in ("steps", "planes", "networks", "key_instant") if key in row]
+        assert line == f"layer {row['layer']}: {', '.join(facts)}"
+    assert "key_instant" in details[1]
 
 
 def test_info_tells_where_the_bytes_are(cli, scene_pd4):
