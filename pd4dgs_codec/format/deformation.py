@@ -35,7 +35,7 @@ from pd4dgs_codec.format.registry import LAYER_KINDS, LayerKind, Section
 from pd4dgs_codec.scene import INSTANTS, PLANES, TRUNK, Deformation, Planes, Steps, Widths, instant, plane_sides
 
 # Keys of the layer parameters.
-STEPS, SCALES, NETWORKS, KEY = 3, 4, 5, 6
+KEYS = STEPS, SCALES, NETWORKS, KEY = 3, 4, 5, 6
 
 # Limits (clause 14).
 MAX_PLANE_SIDE = 4096  #: cells; eight times the paper's finest plane
@@ -153,8 +153,9 @@ def without_unread(symbols: Deformation, unit: np.ndarray) -> tuple[Deformation,
     changes.
     """
     filled, free, cells, saved = [], 0, 0, 0.0
-    for scale, marks in zip(symbols.planes, cells_read(symbols.planes, unit), strict=True):
-        found = {name: fill_plane(scale[name], marks[name]) for name, _, _ in PLANES}
+    for scale in symbols.planes:
+        marks = {n: cells_read(scale[n].shape, unit[:, a], unit[:, b] if b < 3 else None) for n, a, b in PLANES}
+        found = {name: fill_plane(scale[name], mark) for name, mark in marks.items()}
         filled.append({name: samples for name, (samples, _) in found.items()})
         saved += sum(bits for _, bits in found.values())
         free += sum(int((~mark).sum()) for mark in marks.values())

@@ -87,7 +87,7 @@ def read_parameters(
         raise LimitExceeded(f"{where}: parameters of {length} bytes, limit {MAX_PARAMETERS}")
     if length > len(payload) - 4:
         raise Malformed(f"{where}: parameters of {length} bytes, expected at most {len(payload) - 4}")
-    fields = Fields(canonical.unpack(payload[4 : 4 + length]), where, set(range(ROWS, deformation.KEY + 1)))
+    fields = Fields(canonical.unpack(payload[4 : 4 + length]), where, {ROWS, SECTIONS, *deformation.KEYS})
     known = {int(section) for section in Section}
     sections = Fields(fields.get(SECTIONS), f"{where} sections", known)
     shape, steps = deformation.unpack_parameters(fields, kind, widths, before.scales, later, where)

@@ -1,4 +1,4 @@
-"""The planes of a HexPlane, for `deformation`: prediction, the coded section, and cells that no anchor reads.
+"""Planes, for `deformation`: prediction, the coded section, and cells that no anchor reads.
 
 A plane is int32 [C, H, W]. A sample at row i, column j of a channel is predicted from its neighbours W = k[i, j-1],
 N = k[i-1, j] and NW = k[i-1, j-1], and the residual k - prediction is coded. In row 0 N and NW are taken equal to W, in
@@ -31,7 +31,6 @@ from pd4dgs_codec.format.stages import (
     read_stages,
     smaller_form,
 )
-from pd4dgs_codec.scene import PLANES, Planes, plane_sides
 
 PlaneShape = tuple[int, int, int]  #: of a plane: channels, rows, columns
 Array = np.ndarray
@@ -192,19 +191,14 @@ def _estimated_bits(residuals: Array) -> float:
 # -- cells that nothing samples ----------------------------------------------------------------------------------------
 
 
-def cells_read(planes: Planes, unit: Array) -> list[dict[str, Array]]:
-    """Marks the cells that points read at any time: per scale, bool [H, W] by plane name. unit: float32 [n, 3], points
-    in 0..1 of the box."""
-    read = []
-    for scale in planes:
-        cells = [_cells(unit[:, axis], side) for axis, side in enumerate(plane_sides(scale)[:3])]
-        marks = {}
-        for name, a, b in PLANES:
-            marks[name] = np.zeros(scale[name].shape[1:], bool)
-            for i in cells[a]:
-                for j in cells[b] if b < 3 else [slice(None)]:
-                    marks[name][j, i] = True
-        read.append(marks)
+def cells_read(shape: PlaneShape, u: Array, v: Array | None) -> Array:
+    """Marks the cells of a plane that samples may read: bool [H, W]. u, v: float32 [n], 0..1, the samples' places in a
+    row and in a column; None if they may read whole columns, as on time planes."""
+    _, height, width = shape
+    read = np.zeros((height, width), bool)
+    for i in _cells(u, width):
+        for j in _cells(v, height) if v is not None else [slice(None)]:
+            read[j, i] = True
     return read
 
 

@@ -71,10 +71,11 @@ def test_nothing_that_matters_goes():
     unit, free = np.clip((untouched.anchor - low) / (high - low), 0, 1), 0
     for layer in (1, 2):
         both = untouched.deformation(layer).planes, planned.deformation(layer).planes
-        for marks, given, got in zip(cells_read(both[0], unit), *both, strict=True):
-            for name, _, _ in PLANES:
-                assert np.array_equal(given[name][:, marks[name]], got[name][:, marks[name]])
-                free += int((~marks[name]).sum())
+        for given, got in zip(*both, strict=True):
+            for name, a, b in PLANES:
+                read = cells_read(given[name].shape, unit[:, a], unit[:, b] if b < 3 else None)
+                assert np.array_equal(given[name][:, read], got[name][:, read])
+                free += int((~read).sum())
     assert free > 0
     without = [replace(s, global_deformation=None, local_deformation=None) for s in (planned, untouched)]
     assert_same_scene(*without)
