@@ -17,11 +17,12 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from test_dataset_broken import LAYOUTS
+from test_dataset_broken import LAYOUTS, VIDEOS
 
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.errors import DataError
 
+KINDS = [kind for kind in LAYOUTS if kind not in VIDEOS]
 VALUES: list[Any] = [
     *(None, True, False, 0, -1, 1, 2, 0.5, -0.0, 1e-300, 1e300, -1e300, 1e38, 3e38, float("nan"), float("inf")),
     *(65_536, 2**31, 10**40, "", "0", "\0", "r_000", "../r_000", "/dev/null", "é\ud800", "x" * 5000, "FISHEYE"),
@@ -129,9 +130,6 @@ class Folder:
         for x in numbers:
             assert (np.abs(np.asarray(x, np.float64)) <= BINARY32).all(), said + repr(x)
         return "read"
-
-
-KINDS = ["blender", "iphone", "record3d", "panoptic", "colmap", "text"]
 
 
 def check_cases(scene: object, tmp_path: Path, kind: str, seeds: range) -> dict[str, int]:

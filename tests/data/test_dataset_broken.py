@@ -70,6 +70,7 @@ LAYOUTS: dict[str, Callable[[Any, Path], Path]] = {
     "text": lambda scene, folder: folders.write_colmap(scene, folder, "text"),
     "videos": folders.write_synchronised,
 }
+VIDEOS = ("neu3d", "videos")  #: layouts with videos
 
 
 def frame(**keys: Any) -> Callable[[dict], dict]:
@@ -307,7 +308,7 @@ def changed(path: Path, change: Any) -> None:
 
 @pytest.fixture(params=LAYOUTS)
 def layout(request) -> str:
-    if request.param in ("neu3d", "videos"):
+    if request.param in VIDEOS:
         pytest.importorskip("imageio_ffmpeg")
     return request.param
 
