@@ -147,24 +147,22 @@ class _Pictures:
     ) -> Packed:
         """Returns the file whose layers meet the sizes."""
         from pd4dgs_codec.quality.measure import RenderedLoss, true_psnr
-        from pd4dgs_codec.quality.target import fit
+        from pd4dgs_codec.quality.target import Fitter
 
         planned = plan(scene, options)
         scene, left_out = planned.scene, left_out + planned.left_out
         frames = self.frames(scene)
         with self.progress("fitting sizes") as step:
             loss = RenderedLoss(scene, frames, step)
-            growth, measured = dict.fromkeys(target_sizes, 1.0), dict[Any, Any]()
+            fitter = Fitter(scene, target_sizes, loss.mean_mse, loss.omission_error, options)
             met = False
             while not met:
-                fitted, dropped, fits = fit(
-                    scene, target_sizes, loss.mean_mse, loss.omission_error, options, growth, measured
-                )
+                fitted, dropped, fits = fitter.fit()
                 data, report, slices = self.write(fitted, options, left_out + dropped, metadata, passing=False)
                 added, met = report.added_bytes(), True
                 for row in fits:
                     if (size := added.get(row.layer, 0)) > row.target:  # slices in another order than measured
-                        met, growth[row.layer] = False, growth[row.layer] * size / row.bytes
+                        met, fitter.growth[row.layer] = False, fitter.growth[row.layer] * size / row.bytes
             packed = plan(fitted, replace(options, omit="nothing")).symbols.scene()
             errors = loss.mse(packed)
             before, after = (true_psnr(s, self.held_out, step) if self.held_out else {} for s in (scene, packed))

@@ -11,6 +11,7 @@ The caller passes the loss and the error of omitted anchors as functions, so tha
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -185,79 +186,70 @@ class Fit:
     steps: dict[str, float] = field(default_factory=dict)
 
 
-def fit(
-    scene: Scene,
-    targets: Mapping[int, int],
-    loss: Callable[[Scene], float],
-    omission_error: Callable[[Scene, int], np.ndarray],
-    options: EncodeOptions = DEFAULTS,
-    growth: Mapping[int, float] | None = None,
-    measured: dict[Any, "_Layer"] | None = None,
-) -> tuple[Scene, list[LeftOut], list[Fit]]:
-    """Fits a planned scene to targets. Returns the scene, the dropped anchors, and how each layer met its target.
+@dataclass(frozen=True, eq=False)
+class Fitter:
+    """Fits a planned scene to targets, and keeps its measurements from one fit to the next.
 
     targets: most bytes by layer; an absent layer meets any. loss: of a decoded scene, to be minimised. omission_error:
     float64 [N], the error of omitting each anchor of the scene at a level; anchors of least error move to the next
     layer first, or are dropped from the highest. options: of the file to be written. growth: by layer, a factor on its
-    bytes, 1 if absent; for slices, which are measured with the largest anchors first. measured: keeps measurements for
-    calls with another growth only. Raises EncodeError naming the layer and its smallest size, before any loss is
-    measured if no setting of earlier layers helps.
+    bytes, for slices, which are measured with the largest anchors first; the caller may change it between fits.
     """
-    fits, dropped = [], 0
-    measured = {} if measured is None else measured
 
-    def layer_of(scene: Scene, layer: int, *found: Setting) -> _Layer:
-        """Returns the layer of a scene with these settings of its earlier layers."""
-        key = layer, *(tuple(setting.items()) for setting in found)
-        if key not in measured:
-            measured[key] = _Layer(scene, layer, loss, omission_error, options)
-        measured[key].growth = (growth or {}).get(layer, 1.0)
-        return measured[key]
+    scene: Scene
+    targets: Mapping[int, int]
+    loss: Callable[[Scene], float]
+    omission_error: Callable[[Scene, int], np.ndarray]
+    options: EncodeOptions = DEFAULTS
+    growth: defaultdict[int, float] = field(default_factory=lambda: defaultdict(lambda: 1.0))
+    _layers: dict[tuple[Any, ...], "_Layer"] = field(default_factory=dict)
 
-    settings, least = list[Setting](), scene
-    try:
-        for layer in sorted(layer for layer in targets if layer in scene.layers):  # refuses sizes before any search
-            fitted = layer_of(least, layer, *settings)
-            # anchors that leave make later layers larger
-            settings.append({**needed(fitted.grids, fitted.final_size, targets[layer]), ANCHORS: 0.0})
-            least = fitted.apply(settings[-1])
-        settings = []
-        for layer, target in sorted(targets.items()):
-            if layer not in scene.layers:
-                fits.append(Fit(layer, target))
-                continue
-            fitted = layer_of(scene, layer, *settings)
-            settings.append(least_loss(fitted.grids, fitted.size, fitted.loss, fitted.final_size, target))
-            fits.append(fitted.describe(settings[-1], target))
-            dropped += fits[-1].moved if fits[-1].to_layer is None else 0
-            scene = fitted.apply(settings[-1])
-    except Unreachable as error:
-        raise EncodeError(
-            f"target size: layer {layer} takes at least {error.smallest:,} bytes "
-            f"(steps up to x{2 ** OCTAVES[-1]:g}, {SHARES[-1]:.0%} of its anchors moved out), "
-            f"expected at most {targets[layer]:,}"
-        ) from None
-    if not dropped:
-        return scene, [], fits
-    scene, _ = in_file_order(scene, scene.layers)  # removes dropped anchors, else a plan would report them too
-    why = "least error in the pictures, left out to reach the target size"
-    return scene, [LeftOut(f"{dropped} anchors", why, anchors=dropped)], fits
+    def fit(self) -> tuple[Scene, list[LeftOut], list[Fit]]:
+        """Returns the scene, the dropped anchors, and how each layer met its target. Raises EncodeError naming the
+        layer and its smallest size, before any loss is measured if no setting of earlier layers helps."""
+        scene, targets, settings, fits = self.scene, self.targets, list[Setting](), list[Fit]()
+        try:
+            for layer in sorted(layer for layer in targets if layer in scene.layers):  # refuses sizes before any search
+                fitted = self._layer(scene, layer, settings)
+                # anchors that leave make later layers larger
+                settings.append({**needed(fitted.grids, fitted.final_size, targets[layer]), ANCHORS: 0.0})
+                scene = fitted.apply(settings[-1])
+            scene, settings = self.scene, []
+            for layer, target in sorted(targets.items()):
+                if layer not in scene.layers:
+                    fits.append(Fit(layer, target))
+                    continue
+                fitted = self._layer(scene, layer, settings)
+                settings.append(least_loss(fitted.grids, fitted.size, fitted.loss, fitted.final_size, target))
+                fits.append(fitted.describe(settings[-1], target))
+                scene = fitted.apply(settings[-1])
+        except Unreachable as error:
+            raise EncodeError(
+                f"target size: layer {layer} takes at least {error.smallest:,} bytes "
+                f"(steps up to x{2 ** OCTAVES[-1]:g}, {SHARES[-1]:.0%} of its anchors moved out), "
+                f"expected at most {targets[layer]:,}"
+            ) from None
+        dropped = sum(row.moved for row in fits if row.to_layer is None)
+        if not dropped:
+            return scene, [], fits
+        scene, _ = in_file_order(scene, scene.layers)  # removes dropped anchors, else a plan would report them too
+        why = "least error in the pictures, left out to reach the target size"
+        return scene, [LeftOut(f"{dropped} anchors", why, anchors=dropped)], fits
+
+    def _layer(self, scene: Scene, layer: int, settings: Sequence[Setting]) -> "_Layer":
+        """Returns the layer of a scene whose earlier layers have these settings."""
+        key = layer, *(tuple(setting.items()) for setting in settings)
+        if key not in self._layers:
+            self._layers[key] = _Layer(self, scene, layer)
+        return self._layers[key]
 
 
 class _Layer:
     """One layer's parameters, and the scenes, sizes and losses of their settings."""
 
-    def __init__(
-        self,
-        scene: Scene,
-        layer: int,
-        loss: Callable[[Scene], float],
-        omission_error: Callable[[Scene, int], np.ndarray],
-        options: EncodeOptions,
-    ):
-        self.scene, self.layer, self.index, self.growth = scene, layer, scene.layers.index(layer), 1.0
-        self.of_scene = loss
-        self.options = replace(options, omit="nothing")  # planning has made unread cells cheap already
+    def __init__(self, fitter: Fitter, scene: Scene, layer: int):
+        self.fitter, self.scene, self.layer, self.index = fitter, scene, layer, scene.layers.index(layer)
+        self.options = replace(fitter.options, omit="nothing")  # planning has made unread cells cheap already
         steps = list(scene.attributes) if layer == 0 else []
         if layer == 0 or scene.deformation(layer) is not None:
             steps += LAYER_KINDS[layer].step_names
@@ -266,7 +258,7 @@ class _Layer:
         if self.index:
             active &= masks[self.index - 1] == 0
         own = np.flatnonzero(active)
-        errors = omission_error(scene, layer)[own]
+        errors = fitter.omission_error(scene, layer)[own]
         order = np.argsort(errors, kind="stable")
         self.order, self.errors = own[order], errors[order]
         self.grids = {**{step: OCTAVES for step in steps}, **({ANCHORS: SHARES} if len(own) else {})}
@@ -288,7 +280,7 @@ class _Layer:
         key = effort, frozenset(setting.items())
         if key not in self._sizes:
             self._sizes[key] = self._added_bytes(setting, effort)
-        return math.ceil(self.growth * self._sizes[key])
+        return math.ceil(self.fitter.growth[self.layer] * self._sizes[key])
 
     def _added_bytes(self, setting: Setting, effort: int) -> int:
         if self.options.slices and effort == self.options.effort:
@@ -307,7 +299,7 @@ class _Layer:
         """Returns the loss of the decoded scene at a setting."""
         key = frozenset(setting.items())
         if key not in self._losses:
-            self._losses[key] = self.of_scene(self._planned(setting).symbols.scene())
+            self._losses[key] = self.fitter.loss(self._planned(setting).symbols.scene())
         return self._losses[key]
 
     def _planned(self, setting: Setting) -> Plan:

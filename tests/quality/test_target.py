@@ -15,7 +15,7 @@ from pd4dgs_codec.format.info import info
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.quality import target
-from pd4dgs_codec.quality.target import SLACK, Unreachable, convex_hull, fit, least_loss
+from pd4dgs_codec.quality.target import SLACK, Fitter, Unreachable, convex_hull, least_loss
 
 GRID = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)
 
@@ -150,7 +150,7 @@ def test_layers_meet_their_targets_and_the_loss_grows_as_they_shrink(scene):
     loss, whole, losses = coarseness(scene), added(encode(scene, **FAST)), []
     for share in (1.01, 0.95, 0.8):
         targets = {layer: round(share * whole[layer]) for layer in (0, 2)}
-        fitted, left_out, fits = fit(scene, targets, loss, error, EncodeOptions(**FAST))
+        fitted, left_out, fits = Fitter(scene, targets, loss, error, EncodeOptions(**FAST)).fit()
         data, report = encode_with_report(fitted, **FAST, left_out=left_out)
         whole_file = encode(fitted, **FAST, omit="nothing")  # at coarser steps more may be left out
         assert len(data) <= len(whole_file)
@@ -165,15 +165,15 @@ def test_layers_meet_their_targets_and_the_loss_grows_as_they_shrink(scene):
 
 def test_anchors_of_least_error_move_to_the_next_layer_and_out_of_the_highest(scene, monkeypatch):
     monkeypatch.setattr(target, "OCTAVES", (0.0,))
-    whole = added(encode(scene, **FAST))
-    fitted, left_out, (row,) = fit(scene, {0: round(0.8 * whole[0])}, lambda decoded: 0.0, error, EncodeOptions(**FAST))
+    targets = {0: round(0.8 * added(encode(scene, **FAST))[0])}
+    fitted, left_out, (row,) = Fitter(scene, targets, lambda decoded: 0.0, error, EncodeOptions(**FAST)).fit()
     moved, own = fitted.mask[0] == 0, np.arange(scene.rows[-1]) < scene.rows[0]
     assert row.moved == (moved & own).sum() > 0 and row.to_layer == 1 and not left_out
     assert error(scene, 0)[moved & own].max() == row.omission_error < error(scene, 0)[~moved & own].min()
     assert (fitted.mask[1] > 0).all(), "they are shown from there on"
 
     alone = plan(scene, EncodeOptions(layers=0)).scene
-    fitted, left_out, (row,) = fit(alone, {0: round(0.8 * whole[0])}, lambda decoded: 0.0, error, EncodeOptions(**FAST))
+    fitted, left_out, (row,) = Fitter(alone, targets, lambda decoded: 0.0, error, EncodeOptions(**FAST)).fit()
     assert row.to_layer is None and row.moved == len(alone.anchor_q) - len(fitted.anchor_q) > 0
     report = encode_with_report(fitted, **FAST, left_out=left_out)[1]
     assert [told["what"] for told in report.left_out] == [f"{row.moved} anchors"]
@@ -184,12 +184,12 @@ def test_a_target_out_of_reach_says_what_could_be_reached(scene):
     with pytest.raises(
         EncodeError, match=r"layer 2 takes at least [\d,]+ bytes \(steps up to x16.*expected at most 100$"
     ):
-        fit(scene, {2: 100}, coarseness(scene), error, EncodeOptions(**FAST))
+        Fitter(scene, {2: 100}, coarseness(scene), error, EncodeOptions(**FAST)).fit()
 
 
 def test_a_layer_that_is_not_there_meets_any_target(scene):
     alone = plan(scene, EncodeOptions(layers=0)).scene
-    fitted, left_out, (row,) = fit(alone, {2: 1}, coarseness(alone), error, EncodeOptions(**FAST))
+    fitted, left_out, (row,) = Fitter(alone, {2: 1}, coarseness(alone), error, EncodeOptions(**FAST)).fit()
     assert fitted is alone and not left_out and (row.bytes, row.moved, row.factors) == (0, 0, {})
 
 
@@ -198,21 +198,23 @@ def test_a_later_target_out_of_reach_is_refused_before_any_search(scene):
         raise AssertionError("a loss was measured")
 
     with pytest.raises(EncodeError, match=r"layer 2 takes at least [\d,]+ bytes .* expected at most 100$"):
-        fit(scene, {0: 4000, 2: 100}, never, error, EncodeOptions(**FAST))
+        Fitter(scene, {0: 4000, 2: 100}, never, error, EncodeOptions(**FAST)).fit()
 
 
 def test_measurements_are_kept_for_another_growth(scene):
-    options, measured, losses = EncodeOptions(**FAST), {}, []
-    loss = coarseness(scene)
+    loss, losses = coarseness(scene), []
 
     def counted(decoded):
         losses.append(decoded)
         return loss(decoded)
 
     whole = added(encode(scene, **FAST))
-    targets, grown = {layer: round(0.9 * whole[layer]) for layer in (0, 1)}, {1: 1.03}
-    fits = [fit(scene, targets, counted, error, options, growth, measured)[2] for growth in (None, grown)]
-    once = len(losses)
-    assert fits[0][0] == fits[1][0] and fits[0][1] != fits[1][1]
-    assert fit(scene, targets, counted, error, options, grown)[2] == fits[1]
+    targets = {layer: round(0.9 * whole[layer]) for layer in (0, 1)}
+    fitters = [Fitter(scene, targets, counted, error, EncodeOptions(**FAST)) for _ in range(2)]
+    given = fitters[0].fit()[2]
+    for fitter in fitters:
+        fitter.growth[1] = 1.03
+    grown, once = fitters[0].fit()[2], len(losses)
+    assert given[0] == grown[0] and given[1] != grown[1]
+    assert fitters[1].fit()[2] == grown
     assert len(losses) == 2 * once
