@@ -29,7 +29,7 @@ STEPS = Steps(planes_global=0.2, planes_local=1 / 3)
 @dataclass(frozen=True)
 class ModelConfig:
     """Sizes of a model. The deformations (None: absent) have equal channels and width. Training starts with
-    initial_anchors and keeps at most max_anchors.
+    initial_anchors and keeps at most max_anchors. iterations: of a run that is given neither a number nor a time limit.
 
     Layer 1 is coarse in time, layer 2 adds a finer scale: fast motion needs an instant for about every four pictures,
     but training does not find the motion with fine planes alone.
@@ -40,6 +40,7 @@ class ModelConfig:
     hidden: int = 32
     initial_anchors: int = 20_000
     max_anchors: int = 40_000
+    iterations: int = 10_000
     steps: Steps = STEPS
 
     @property
@@ -54,6 +55,7 @@ PRESETS: dict[str, ModelConfig] = {
         DeformationConfig(((32, 48),), 8, 32),
         initial_anchors=5_000,
         max_anchors=12_000,
+        iterations=3_000,
     ),
     "small": ModelConfig(DeformationConfig(((32, 24), (64, 24)), 16, 64), DeformationConfig(((64, 72),), 16, 64)),
     # the grids of the paper: 291,840 and 1,904,640 values; its networks are 128 wide, these 64
@@ -62,5 +64,6 @@ PRESETS: dict[str, ModelConfig] = {
         DeformationConfig(((64, 100), (128, 100)), 16, 64),
         initial_anchors=26_000,
         max_anchors=50_000,
+        iterations=15_000,
     ),
 }

@@ -12,10 +12,8 @@ from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
 from pd4dgs_codec.errors import TrainError
+from pd4dgs_codec.model.config import PRESETS
 from pd4dgs_codec.scene import MAX_FEATURE, MAX_SLOTS, Steps, Widths
-
-#: Iterations per preset when neither a count nor a time limit is given.
-DEFAULT_ITERATIONS = {"tiny": 3_000, "small": 10_000, "paper": 15_000}
 
 #: Which levels a step trains after the coarse phase. key: mostly the highest, see `rollout`. adaptive, uniform, fixed:
 #: a level drawn from pi(rho), from the uniform distribution or from the paper's fixed one. top: the highest level, as a
@@ -133,7 +131,7 @@ class PlaneWeights:
 class TrainConfig:
     """The configuration of a run, without its data. Raises TrainError for a value out of its option's range."""
 
-    preset: str = option("small", help="model size", choices=tuple(DEFAULT_ITERATIONS))
+    preset: str = option("small", help="model size", choices=tuple(PRESETS))
     source: str = ""  #: the source given to `data.load`, stored so that a resumed run reads the same data
     feature_width: int = option(
         32, help=f"feature channels per anchor, 1 to {MAX_FEATURE}", metavar="N", least=1, most=MAX_FEATURE

@@ -17,12 +17,12 @@ from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import DataError, TrainError, one_line
 from pd4dgs_codec.io import finite
 from pd4dgs_codec.model import checkpoint
-from pd4dgs_codec.model.config import ModelConfig
+from pd4dgs_codec.model.config import PRESETS, ModelConfig
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.signals import stop_request
 from pd4dgs_codec.threads import one_torch_thread
 from pd4dgs_codec.train import workers
-from pd4dgs_codec.train.config import DEFAULT_ITERATIONS, TrainConfig
+from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.learner import Learner
 from pd4dgs_codec.train.schedule import COARSE_SHARE, Schedule
 
@@ -69,7 +69,7 @@ class Trainer:
     def __init__(self, config: TrainConfig, dataset: Dataset, device: str = "cpu", size: ModelConfig | None = None):
         """size: the model's size; by default the preset's."""
         self.timed = config.max_seconds is not None and config.iterations is None
-        total = config.iterations or (None if self.timed else DEFAULT_ITERATIONS[config.preset])
+        total = config.iterations or (None if self.timed else PRESETS[config.preset].iterations)
         self.config, self.dataset = config, dataset
         self.learner = Learner(config, dataset, Schedule(total), torch.device(device), size)
         self.learner.share = 0.0 if self.timed else None
