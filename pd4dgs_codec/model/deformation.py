@@ -1,12 +1,12 @@
-"""The torch module of a deformation: residuals with gradients, start values, rate, regularisers, conversion to arrays.
+"""The torch module of a deformation: residuals with gradients, start values, conversion to arrays.
 
-The rest of `model` and `train` use a deformation only through `DeformationField`: here a HexPlane, a shared trunk and
-one network per residual head. The trunk of layer 2 reads the planes of both layers, so one class handles all kinds.
+A deformation has planes, a shared trunk and one network per residual head. The trunk of layer 2 reads the planes of
+both layers, so one class handles all kinds of planes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any, cast
 
 import numpy as np
@@ -17,8 +17,6 @@ from torch.nn import functional as F
 
 from pd4dgs_codec import scene
 from pd4dgs_codec.draw.layers import Layers
-from pd4dgs_codec.format.deformation import plane_rate_bits
-from pd4dgs_codec.model import plane_terms
 from pd4dgs_codec.model.config import DeformationConfig
 from pd4dgs_codec.model.hexplane import HexPlane
 from pd4dgs_codec.model.networks import MLP, rounded
@@ -43,8 +41,7 @@ class DeformationField(nn.Module):
     ) -> DeformationField:
         """Returns an untrained field with the heads of `config`. head_widths: their output widths. below: the number of
         features from the planes of the layer below, which the trunk reads too."""
-        planes = HexPlane(box, [(side, side, side, times) for side, times in config.scales], config.channels)
-        planes.start()
+        planes = HexPlane.fresh(config, box)  # first: the order of random draws decides the start values
         trunk = MLP((below + config.features, config.width, config.width))
         heads = {name: MLP((config.width, head_widths[name]), zero_last=True) for name in config.heads}
         return DeformationField(planes, trunk, heads, key)
@@ -63,20 +60,13 @@ class DeformationField(nn.Module):
 
     def shape(self) -> dict[str, Any]:
         """Returns the values that `arrays_of_state` needs besides the state dictionary."""
-        return {"resolutions": self.planes.layout.reso.tolist(), "key": self.key}
+        return {**self.planes.shape(), "key": self.key}
 
     @staticmethod
     def arrays_of_state(shape: dict[str, Any], state: Mapping[str, np.ndarray]) -> scene.Deformation:
         """Returns arrays of a field's shapes, planes all 0, from its `shape` and state dictionary. Raises ValueError if
         the two do not match."""
-        n_cells, channels = state["planes.grid"].shape
-        resolutions = shape["resolutions"]
-        needed = sum(r[a] * r[b] for r in resolutions for _, a, b in scene.PLANES)
-        if needed != n_cells:  # checked before planes of that size are allocated
-            raise ValueError(f"planes of {n_cells} cells, expected {needed} for the resolutions {resolutions}")
-        planes = tuple(
-            {plane: np.zeros((channels, r[b], r[a]), np.float32) for plane, a, b in scene.PLANES} for r in resolutions
-        )
+        planes = HexPlane.arrays_of_state(shape, state["planes.grid"])
         # the registry's order, not the dictionary's: optimiser states are matched to parameters by order
         present = {key.split(".")[1] for key in state if key.startswith("heads.")}
         heads = [head for head in scene.HEADS if head in present]
@@ -84,43 +74,16 @@ class DeformationField(nn.Module):
         networks = {name: MLP.arrays_of_state(state, key) for name, key in names.items()}
         return scene.Deformation(planes, networks, shape["key"])
 
-    # -- parameters, regularisers and rate -----------------------------------------------------------------------------
-
-    @property
-    def features(self) -> list[nn.Parameter]:
-        """The parameters quantised in the step of planes; `regularisers` and `rate` depend on them."""
-        return [self.planes.grid]
+    # -- parameters ----------------------------------------------------------------------------------------------------
 
     @property
     def weights(self) -> list[nn.Parameter]:
-        """The other parameters, quantised in the step of weights."""
+        """The parameters but the planes, quantised in the step of weights."""
         return [*self.trunk.parameters(), *self.heads.parameters()]
 
     def head_layer(self, head: str) -> nn.Linear | None:
         """Returns the linear layer whose output is the residual `head`, or None if the field lacks it."""
         return cast(MLP, self.heads[head]).layers[-1] if head in self.heads else None
-
-    def confine(self, instants: int) -> None:
-        """Makes the features linear in time between `instants` evenly spaced instants, by least squares."""
-        self.planes.confine(instants)
-
-    def spread_gradients(self, instants: int) -> None:
-        """Replaces the features' gradients, if any, by gradients of confined features: sums per instant, spread over
-        the cells between the neighbouring instants."""
-        self.planes.spread_gradients(instants)
-
-    def regularisers(self, features: Sequence[Tensor]) -> dict[str, Tensor]:
-        """Returns the regularisers, unweighted, by name. features: the field's, or others of the same shapes."""
-        return plane_terms.regularisers(features[0], self.planes.layout)
-
-    def rate(self, features: Sequence[Tensor], step: float) -> Tensor:
-        """Returns a differentiable proxy for the bits of `features`, as in `regularisers`, at a quantisation step."""
-        return plane_terms.proxy_bits(features[0], self.planes.layout, step)
-
-    def bits(self, step: float) -> float:
-        """Returns the sum of R(a) over the coded residuals of the features at a quantisation step, with one Gaussian
-        prior per channel of a plane, as with `--priors gauss`."""
-        return plane_rate_bits(self.planes.arrays(), step)
 
     # -- residuals -----------------------------------------------------------------------------------------------------
 

@@ -19,6 +19,9 @@ from torch.autograd.function import once_differentiable
 from pd4dgs_codec.draw import hexplane as kernels
 from pd4dgs_codec.draw.hexplane import TIME_AXIS, PlaneLayout
 from pd4dgs_codec.draw.simd import LANES
+from pd4dgs_codec.format.deformation import plane_rate_bits
+from pd4dgs_codec.model import plane_terms
+from pd4dgs_codec.model.config import DeformationConfig
 from pd4dgs_codec.model.networks import round_straight_through, rounded
 from pd4dgs_codec.scene import PLANES, Planes, plane_sides
 from pd4dgs_codec.threads import kernel_threads
@@ -116,6 +119,13 @@ class HexPlane(nn.Module):
         self.layout = PlaneLayout.build(resolutions)
         self.grid = nn.Parameter(torch.ones(self.layout.n_cells, channels))
 
+    @classmethod
+    def fresh(cls, config: DeformationConfig, box: np.ndarray) -> HexPlane:
+        """Returns untrained planes of the sizes in `config`, see `start`."""
+        planes = cls(box, [(side, side, side, times) for side, times in config.scales], config.channels)
+        planes.start()
+        return planes
+
     @torch.no_grad()
     def start(self, generator: torch.Generator | None = None) -> None:
         """Draws start values: time planes 1, spatial planes random in START.
@@ -167,6 +177,19 @@ class HexPlane(nn.Module):
                 mixture = _mixtures(len(plane), instants)[which].to(plane)
                 plane.copy_((mixture @ plane.flatten(1)).view_as(plane))
 
+    def regularisers(self, grid: Tensor) -> dict[str, Tensor]:
+        """Returns the regularisers, unweighted, by name. grid: the planes' own, or another of the same shape."""
+        return plane_terms.regularisers(grid, self.layout)
+
+    def rate(self, grid: Tensor, step: float) -> Tensor:
+        """Returns a differentiable proxy for the bits of `grid`, as in `regularisers`, at a quantisation step."""
+        return plane_terms.proxy_bits(grid, self.layout, step)
+
+    def bits(self, step: float) -> float:
+        """Returns the sum of R(a) over the planes' coded residuals at a quantisation step, with one Gaussian prior per
+        channel of a plane, as with `--priors gauss`."""
+        return plane_rate_bits(self.arrays(), step)
+
     @torch.no_grad()
     def arrays(self) -> Planes:
         """Returns per scale: plane name -> float32 [C, reso[b], reso[a]], as `scene.Deformation` holds them."""
@@ -182,6 +205,21 @@ class HexPlane(nn.Module):
             for name, view in views.items():
                 view.copy_(torch.from_numpy(np.array(scale[name], np.float32)).permute(1, 2, 0))
         return found
+
+    def shape(self) -> dict[str, Any]:
+        """Returns the values that `arrays_of_state` needs besides the grid."""
+        return {"resolutions": self.layout.reso.tolist()}
+
+    @staticmethod
+    def arrays_of_state(shape: dict[str, Any], grid: np.ndarray) -> Planes:
+        """Returns arrays of the shapes of planes, all 0, from their `shape` and grid [cells, C]. Raises ValueError if
+        the two do not match."""
+        n_cells, channels = grid.shape
+        resolutions = shape["resolutions"]
+        needed = sum(r[a] * r[b] for r in resolutions for _, a, b in PLANES)
+        if needed != n_cells:  # checked before planes of that size are allocated
+            raise ValueError(f"planes of {n_cells} cells, expected {needed} for the resolutions {resolutions}")
+        return tuple({p: np.zeros((channels, r[b], r[a]), np.float32) for p, a, b in PLANES} for r in resolutions)
 
 
 @lru_cache

@@ -193,7 +193,7 @@ class Model(nn.Module):
             values.copy_(centre + torch.round((values - centre) / step) * step)
         parts = [([*self.networks.parameters()], steps.weights_scaffold)]
         for layer, field in self.deformations.items():
-            parts += [(field.features, steps.planes(layer)), (field.weights, steps.weights(layer))]
+            parts += [([field.planes.grid], steps.planes(layer)), (field.weights, steps.weights(layer))]
         for parameters, step in parts:
             for parameter in parameters:
                 parameter.copy_(torch.round(parameter / step) * step)

@@ -122,12 +122,12 @@ class Learner(TrainState):
 
     def _update(self, instants: int | None) -> None:
         """Updates the parameters. With `instants`, the deformations' planes stay linear between so many instants."""
-        confined = [] if instants is None else [(field, instants) for field in self.model.deformations.values()]
-        for field, few in confined:
-            field.spread_gradients(few)
+        confined = [] if instants is None else [(f.planes, instants) for f in self.model.deformations.values()]
+        for planes, few in confined:
+            planes.spread_gradients(few)
         self.optimiser.step(self.schedule.progress(self.position), self.schedule.iterations)
-        for field, few in confined:
-            field.confine(few)
+        for planes, few in confined:
+            planes.confine(few)
 
     def _pictures(
         self, drawn: list[tuple[int, int]], record: dict[str, Any], only: Tensor | None

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from pd4dgs_codec.model.deformation import DeformationField
+from pd4dgs_codec.model.hexplane import HexPlane
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.networks import level_mask
 from pd4dgs_codec.model.rate import row_bits
@@ -48,16 +48,16 @@ class ModelLoss:
     def begin(self, model: Model, level: int, schedule: Schedule, position: int) -> Callable[[], Terms]:
         """Starts to compute the terms of a step at `position` and returns a function that waits for them. Until that
         function returns, nothing else may draw from the generator or change the model."""
-        fields = {layer: field for layer, field in model.deformations.items() if layer <= level}
+        planes = {layer: field.planes for layer, field in model.deformations.items() if layer <= level}
         parameters = [getattr(model, name) for name in PER_ANCHOR]
-        parameters += [feature for field in fields.values() for feature in field.features]
+        parameters += [own.grid for own in planes.values()]
         leaves = {parameter: parameter.detach().cpu().requires_grad_() for parameter in parameters}
 
         def find() -> Terms:
             found: list[Weighted] = []
-            for layer, field in fields.items():
-                features, step = [leaves[feature] for feature in field.features], model.steps.planes(layer)
-                found += self._field_terms(layer, field, features, step, schedule.pressure(position))
+            for layer, own in planes.items():
+                grid, step = leaves[own.grid], model.steps.planes(layer)
+                found += self._plane_terms(layer, own, grid, step, schedule.pressure(position))
             if position >= schedule.progressive:
                 anchors = {name: leaves[getattr(model, name)] for name in PER_ANCHOR}
                 found += self._mask_terms(model, level, anchors, schedule.separation(position))
@@ -70,15 +70,15 @@ class ModelLoss:
 
         return aside(find)
 
-    def _field_terms(
-        self, layer: int, field: DeformationField, features: list[Tensor], step: float, pressure: float
+    def _plane_terms(
+        self, layer: int, planes: HexPlane, grid: Tensor, step: float, pressure: float
     ) -> Iterator[Weighted]:
-        """Yields the regularisers and the rate of a layer's deformation."""
+        """Yields the regularisers and the rate of a layer's planes."""
         name = {1: "global", 2: "local"}[layer]
-        for term, value in field.regularisers(features).items():
+        for term, value in planes.regularisers(grid).items():
             yield f"{name}_{term}", getattr(self.config.planes, term), value
         if weight := self.config.plane_rate * pressure:
-            yield f"{name}_rate_proxy", weight, field.rate(features, step)
+            yield f"{name}_rate_proxy", weight, planes.rate(grid, step)
 
     def _mask_terms(
         self, model: Model, level: int, anchors: Mapping[str, Tensor], separation: float

@@ -34,7 +34,7 @@ class Optimiser:
         groups: dict[str, list[nn.Parameter]] = {name: [getattr(model, name)] for name in PER_ANCHOR}
         groups |= {name: list(net.parameters()) for name, net in model.networks.items()}
         fields = model.deformations.values()
-        groups["planes"] = [p for f in fields for p in f.features]
+        groups["planes"] = [f.planes.grid for f in fields]
         groups["deformation"] = [p for f in fields for p in f.weights]
         self.groups = {name: params for name, params in groups.items() if params}
         self.moments: dict[Tensor, dict[str, Tensor]] = {}

@@ -205,7 +205,7 @@ class TrainState:
         """The bits of the planes of layers 1 and 2 if coded now: sums of R(a) in the groups of `--priors gauss`; 0 for
         an absent layer."""
         steps = self.model.steps.scaled(1.0)
-        found = {i: f.bits(steps.planes(i)) for i, f in self.model.deformations.items()}
+        found = {i: f.planes.bits(steps.planes(i)) for i, f in self.model.deformations.items()}
         return [found.get(1, 0.0), found.get(2, 0.0)]
 
     def level_psnr(self, views: Sequence[View]) -> list[float]:

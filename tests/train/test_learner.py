@@ -113,8 +113,8 @@ def test_a_step_gathers_the_gradients_of_all_its_terms(dataset, level):
     own, place = {name: getattr(steps.model, name) for name in PER_ANCHOR}, steps.position
     terms = list(of_model._mask_terms(steps.model, level, own, steps.schedule.separation(place)))
     for layer in range(1, level + 1):
-        field, step = fields[layer], steps.model.steps.planes(layer)
-        terms += of_model._field_terms(layer, field, list(field.features), step, steps.schedule.pressure(place))
+        planes, step = fields[layer].planes, steps.model.steps.planes(layer)
+        terms += of_model._plane_terms(layer, planes, planes.grid, step, steps.schedule.pressure(place))
     (loss + sum(weight * value for _, weight, value in terms)).backward()
     assert {name for name, _, _ in terms} <= set(record)
     whole = float(loss.detach()) + sum(weight * float(value.detach()) for _, weight, value in terms)

@@ -151,7 +151,7 @@ def test_steps_while_time_opens_leave_planes_linear_between_few_instants(dataset
     field = trainer_of(dataset, 100, 20).model.global_deformation
     times = [plane for scale in field.arrays().planes for name, plane in scale.items() if name.endswith("t")]
     assert any(np.ptp(plane) > 1e-3 for plane in times)
-    field.confine(3)
+    field.planes.confine(3)
     for before, after in zip(
         times, (p for s in field.arrays().planes for n, p in s.items() if n[1] == "t"), strict=True
     ):
