@@ -8,7 +8,7 @@ active at level l, so the arrays of prefix l are the first rows of the arrays of
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -200,6 +200,11 @@ def instant(code: int) -> float:
 def plane_sides(planes: dict[str, np.ndarray]) -> tuple[int, int, int, int]:
     """Returns the resolutions along x, y, z, t of one scale, from the shapes of its planes xy and zt."""
     return planes["xy"].shape[2], planes["xy"].shape[1], planes["zt"].shape[2], planes["zt"].shape[1]
+
+
+def plane_shapes(channels: int, sides: Sequence[int]) -> dict[str, tuple[int, int, int]]:
+    """Returns [C, H, W] of the planes of one scale by name, in the order of PLANES. sides: along x, y, z, t."""
+    return {name: (channels, sides[b], sides[a]) for name, a, b in PLANES}
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,6 @@ from functools import cache
 
 import numpy as np
 from hypothesis import strategies as st
-from vectors.blocks import plane_shapes
 
 from pd4dgs_codec import encode
 from pd4dgs_codec.entropy.tables import norm_cdf28_of_each, tables_of_each
@@ -33,6 +32,7 @@ from pd4dgs_codec.scene import (
     SceneInfo,
     Steps,
     Widths,
+    plane_shapes,
 )
 
 HUGE = 1 << 23

@@ -11,11 +11,10 @@ from pathlib import Path
 
 import numpy as np
 from strategies import make_scene
-from vectors.blocks import plane_shapes
 
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.model.config import DeformationConfig, ModelConfig
-from pd4dgs_codec.scene import Camera, Deformation, Network, Scene, SceneInfo, Steps, Widths
+from pd4dgs_codec.scene import Camera, Deformation, Network, Scene, SceneInfo, Steps, Widths, plane_shapes
 
 #: The preset `tiny` with few anchors and cells.
 TINY = ModelConfig(

@@ -26,7 +26,7 @@ from pd4dgs_codec.model.convert import from_scene, to_scene
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.picture import rasterization, render
-from pd4dgs_codec.scene import PLANES, Camera, Deformation, Network, deformation_unit
+from pd4dgs_codec.scene import PLANES, Camera, Deformation, Network, deformation_unit, plane_shapes
 from pd4dgs_codec.train.config import LearningRates, TrainConfig
 from pd4dgs_codec.train.loop import Trainer
 
@@ -60,7 +60,7 @@ ROWS = [x for i in range(4) for x in (i / 3, *(float(np.nextafter(np.float32(i /
 def _planes(resolution: Sequence[int], channels: int) -> tuple[dict[str, np.ndarray], ...]:
     rng = np.random.default_rng(0)
     return tuple(
-        {name: rng.normal(1, 0.7, (channels, reso[b], reso[a])).astype(np.float32) for name, a, b in PLANES}
+        {name: rng.normal(1, 0.7, shape).astype(np.float32) for name, shape in plane_shapes(channels, reso).items()}
         for reso in (tuple(resolution), (*(2 * r for r in resolution[:3]), resolution[3]))
     )
 
@@ -120,8 +120,7 @@ def _bad_points_error() -> Found:
 
 def _field(name: str, plane: np.ndarray) -> Deformation:
     """Makes a deformation with x residuals `plane` [H, W], scene units, over `name`; y residuals mirror them by row."""
-    reso = (6, 6, 6, 12)
-    planes = {name: np.ones((8, reso[b], reso[a]), np.float32) for name, a, b in PLANES}
+    planes = {name: np.ones(shape, np.float32) for name, shape in plane_shapes(8, (6, 6, 6, 12)).items()}
     planes[name][:2] = plane, plane[::-1]
     both = np.zeros((4, 8), np.float32)  # ReLU of a channel and of its negative
     both[:, :2] = [[1, 0], [0, 1], [-1, 0], [0, -1]]

@@ -32,7 +32,18 @@ from pd4dgs_codec.format.planes import (
 )
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, dequantise, expect, expect_array, is_step, magnitude, quantise
 from pd4dgs_codec.format.registry import LAYER_KINDS, LayerKind, Section
-from pd4dgs_codec.scene import INSTANTS, PLANES, TRUNK, Deformation, Planes, Steps, Widths, instant, plane_sides
+from pd4dgs_codec.scene import (
+    INSTANTS,
+    PLANES,
+    TRUNK,
+    Deformation,
+    Planes,
+    Steps,
+    Widths,
+    instant,
+    plane_shapes,
+    plane_sides,
+)
 
 # Keys of the layer parameters.
 KEYS = STEPS, SCALES, NETWORKS, KEY = 3, 4, 5, 6
@@ -205,7 +216,7 @@ class Shape:
     @property
     def planes(self) -> list[PlaneShape]:
         """[C, H, W] of all planes, scale by scale."""
-        return [(s.channels, s.sides[b], s.sides[a]) for s in self.scales for _, a, b in PLANES]
+        return [shape for s in self.scales for shape in plane_shapes(s.channels, s.sides).values()]
 
     @property
     def weights(self) -> list[tuple[int, ...]]:

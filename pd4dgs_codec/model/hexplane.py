@@ -23,7 +23,7 @@ from pd4dgs_codec.format.deformation import plane_rate_bits
 from pd4dgs_codec.model import plane_terms
 from pd4dgs_codec.model.config import DeformationConfig
 from pd4dgs_codec.model.networks import round_straight_through, rounded
-from pd4dgs_codec.scene import PLANES, Planes, plane_sides
+from pd4dgs_codec.scene import PLANES, Planes, plane_shapes, plane_sides
 from pd4dgs_codec.threads import kernel_threads
 
 #: Range of the start values of spatial planes.
@@ -216,10 +216,11 @@ class HexPlane(nn.Module):
         the two do not match."""
         n_cells, channels = grid.shape
         resolutions = shape["resolutions"]
-        needed = sum(r[a] * r[b] for r in resolutions for _, a, b in PLANES)
+        shapes = [plane_shapes(channels, sides) for sides in resolutions]
+        needed = sum(height * width for scale in shapes for _, height, width in scale.values())
         if needed != n_cells:  # checked before planes of that size are allocated
             raise ValueError(f"planes of {n_cells} cells, expected {needed} for the resolutions {resolutions}")
-        return tuple({p: np.zeros((channels, r[b], r[a]), np.float32) for p, a, b in PLANES} for r in resolutions)
+        return tuple({name: np.zeros(shape, np.float32) for name, shape in scale.items()} for scale in shapes)
 
 
 @lru_cache

@@ -35,7 +35,6 @@ from vectors.blocks import (
     make_file,
     make_layer,
     ordered,
-    plane_shapes,
     varint,
 )
 
@@ -45,7 +44,7 @@ from pd4dgs_codec.errors import DecodeError
 from pd4dgs_codec.format.info import hashes
 from pd4dgs_codec.format.planes import residual
 from pd4dgs_codec.morton import morton_order
-from pd4dgs_codec.scene import SCAFFOLD_NETWORKS, Widths
+from pd4dgs_codec.scene import SCAFFOLD_NETWORKS, Widths, plane_shapes
 
 VECTORS = Path(__file__).resolve().parents[2] / "spec" / "vectors"
 LARGEST_SEED = 6000  #: bytes of a vector: larger ones decode slowly

@@ -34,7 +34,7 @@ from pd4dgs_codec.format import canonical
 from pd4dgs_codec.format.container import MAJOR, SIGNATURE
 from pd4dgs_codec.format.planes import residual
 from pd4dgs_codec.morton import morton_order
-from pd4dgs_codec.scene import DEFAULT_WIDTHS, PLANES, Widths
+from pd4dgs_codec.scene import DEFAULT_WIDTHS, Widths, plane_shapes
 
 from . import lzma2
 
@@ -428,11 +428,6 @@ class Layer:
         """The channels of section SYMBOLS."""
         grades = [self.classes] if self.widths.graded else []
         return [self.rises, self.codes, *grades, *self.attributes, *self.flat, *(w.ravel() for w in self.weights)]
-
-
-def plane_shapes(channels: int, sides: Sequence[int]) -> dict[str, tuple[int, int, int]]:
-    """[C, H, W] of the planes of a scale by name, in the order of the format. sides: along x, y, z, t."""
-    return {name: (channels, sides[b], sides[a]) for name, a, b in PLANES}
 
 
 @dataclass(frozen=True)
