@@ -73,6 +73,14 @@ def locked(path: Path) -> Iterator[None]:
         yield
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector: pytest.Collector) -> Iterator[None]:
+    """A module of tests is imported by one worker at a time: the first compiles it, with all that it imports, and the
+    others find that in the caches of bytecode. All at once, each would compile all of it."""
+    with locked(collector.path) if isinstance(collector, pytest.Module) else contextlib.nullcontext():
+        return (yield)
+
+
 @pytest.fixture(autouse=True, scope="session")
 def _kernels_are_compiled_once() -> Iterator[None]:
     """A worker that needs a kernel which another one compiles waits for it, asleep, and loads it from numba's cache:
