@@ -1,4 +1,5 @@
 import os
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 
@@ -38,9 +39,13 @@ def official():
 
 
 @pytest.fixture(scope="session")
-def scene() -> Dataset:
-    """A small synthetic scene, for writers."""
-    return load("synthetic:local?frames=13", downscale=4)
+def scene(once) -> Dataset:
+    """A small synthetic scene, for writers, drawn by one worker."""
+
+    def make(folder: Path) -> None:
+        (folder / "scene").write_bytes(pickle.dumps(load("synthetic:local?frames=13", downscale=4)))
+
+    return pickle.loads((once("small-scene", make) / "scene").read_bytes())
 
 
 @pytest.fixture(autouse=True)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import errno
+import shutil
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,9 +19,15 @@ from pd4dgs_codec.train.state import TrainingViews
 pytest.importorskip("imageio_ffmpeg")
 
 
+@pytest.fixture(scope="module")
+def written(scene, once):
+    return once("synchronised", lambda folder: write_synchronised(scene, folder / "set")) / "set"
+
+
 @pytest.fixture
-def folder(scene, tmp_path):
-    return write_synchronised(scene, tmp_path / "set")
+def folder(written, tmp_path):
+    """A copy that a test may damage."""
+    return shutil.copytree(written, tmp_path / "set")
 
 
 def test_frames_are_decoded_once(folder, monkeypatch, cache):
@@ -95,18 +103,25 @@ def test_training_views_are_kept_within_a_budget(scene, monkeypatch):
     assert few[0] is few[0] and len(few) == 6
 
 
-@pytest.fixture
-def film(tmp_path):
+@pytest.fixture(scope="module")
+def recorded(once):
     """A video of 60 frames that begins with its header, so that it plays while it arrives."""
     from pd4dgs_codec.quality.movie import write_mp4
 
-    pictures = np.random.default_rng(0).integers(0, 255, (60, 48, 64, 3), np.uint8)
-    plain, path = tmp_path / "plain.mp4", tmp_path / "film.mp4"
-    write_mp4(iter(pictures), plain, 30)
-    arguments = ["-i", str(plain), "-c", "copy", "-movflags", "+faststart", str(path)]
-    with cached.ffmpeg(arguments) as run:
-        assert run.end() == (0, "")
-    return path
+    def make(folder):
+        pictures = np.random.default_rng(0).integers(0, 255, (60, 48, 64, 3), np.uint8)
+        write_mp4(iter(pictures), folder / "plain.mp4", 30)
+        arguments = ["-i", str(folder / "plain.mp4"), "-c", "copy", "-movflags", "+faststart", str(folder / "film.mp4")]
+        with cached.ffmpeg(arguments) as run:
+            assert run.end() == (0, "")
+
+    return once("film", make) / "film.mp4"
+
+
+@pytest.fixture
+def film(recorded, tmp_path):
+    """A copy that a test may damage."""
+    return Path(shutil.copy(recorded, tmp_path))
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.97])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -33,6 +34,12 @@ def recording() -> list[np.ndarray]:
     return pictures
 
 
+@pytest.fixture(scope="module")
+def film(recording, once) -> Path:
+    """The recording as a video."""
+    return once("film-of-a-walk", lambda folder: write_video(folder / "film.mp4", recording, FPS)) / "film.mp4"
+
+
 def write_folder(path, pictures) -> None:
     path.mkdir()
     for i, picture in enumerate(pictures):
@@ -40,12 +47,11 @@ def write_folder(path, pictures) -> None:
 
 
 @pytest.mark.parametrize("kind", ["video", "folder"])
-def test_the_blurred_and_the_repeated_frame_are_left_out(kind, recording, tmp_path):
-    path = tmp_path / ("film.mp4" if kind == "video" else "film")
+def test_the_blurred_and_the_repeated_frame_are_left_out(kind, recording, tmp_path, request):
     if kind == "video":
-        write_video(path, recording, FPS)
+        path = request.getfixturevalue("film")
     else:
-        write_folder(path, recording)
+        write_folder(path := tmp_path / "film", recording)
     source = open_recording(path, FPS)
     looks = look(source, nothing)
     assert [frame.time for frame in looks] == pytest.approx([i / FPS for i in range(16)])
@@ -70,10 +76,9 @@ def remade(path, target, before=(), after=()):
     return target
 
 
-def test_a_video_held_upright_is_upright(recording, tmp_path, caplog):
+def test_a_video_held_upright_is_upright(recording, film, tmp_path, caplog):
     """A phone writes its sensor's rows and a rotation, which is no reason for a warning."""
-    write_video(tmp_path / "flat.mp4", recording, FPS)
-    path = remade(tmp_path / "flat.mp4", tmp_path / "up.mp4", ["-display_rotation:v:0", "90"], ["-c", "copy"])
+    path = remade(film, tmp_path / "up.mp4", ["-display_rotation:v:0", "90"], ["-c", "copy"])
     source = open_recording(path, FPS)
     assert source.size == (HEIGHT, WIDTH) and len(look(source, nothing)) == 16
     (found,) = source.pictures([3])
@@ -81,12 +86,11 @@ def test_a_video_held_upright_is_upright(recording, tmp_path, caplog):
     assert not caplog.records
 
 
-def test_frames_of_a_varying_rate_have_their_times(recording, tmp_path):
+def test_frames_of_a_varying_rate_have_their_times(recording, film, tmp_path):
     """A pause of .8 s is in the middle, as when a phone drops frames."""
-    write_video(tmp_path / "even.mp4", recording, FPS)
     true = [i / FPS + 0.8 * (i >= 8) for i in range(16)]
     filters = ["-vf", f"setpts=(N+8*gte(N\\,8))/{FPS}/TB", "-fps_mode", "vfr", "-c:v", "libx264rgb", "-qp", "0"]
-    source = open_recording(remade(tmp_path / "even.mp4", tmp_path / "vary.mp4", after=filters), FPS)
+    source = open_recording(remade(film, tmp_path / "vary.mp4", after=filters), FPS)
     choice = choose(look(source, nothing), 0)
     assert len(choice.chosen) >= FEWEST_FRAMES
     for index, found in zip(choice.chosen, source.pictures(choice.chosen), strict=True):
