@@ -43,7 +43,7 @@ def scene(once) -> Dataset:
     """A small synthetic scene, for writers, drawn by one worker."""
 
     def make(folder: Path) -> None:
-        (folder / "scene").write_bytes(pickle.dumps(load("synthetic:local?frames=13", downscale=4)))
+        (folder / "scene").write_bytes(pickle.dumps(load("synthetic:local?frames=13&size=40x30")))
 
     return pickle.loads((once("small-scene", make) / "scene").read_bytes())
 
