@@ -20,14 +20,24 @@ def assert_same_weights(path, other) -> None:
     assert all(torch.equal(a[name], b[name]) for name in a), (path, other)
 
 
+def run_saving(trainer, folder, cuts, **options) -> None:
+    """Runs a trainer to folder/whole.pt. Before each of the steps `cuts` it saves what a run cut there leaves."""
+    step = trainer.learner.step
+
+    def saved_before():
+        if trainer.iteration in cuts:
+            trainer.save(folder / f"cut-{trainer.iteration}.pt")
+        return step()
+
+    trainer.learner.step = saved_before
+    trainer.run(folder / "whole.pt", **options)
+
+
 def assert_resumes_bit_for_bit(config, dataset, folder, cuts) -> None:
-    """Runs cut before each of the steps `cuts` and resumed end as the one in folder/whole.pt."""
-    part = Trainer(config, dataset)
-    for cut in sorted(cuts):
-        while part.iteration < cut:
-            part.learner.step()
-        part.save(folder / "part.pt")
+    """What `run_saving` saved at `cuts`, resumed, ends as its run did."""
+    for cut in cuts:
         resumed = Trainer(config, dataset)
-        resumed.resume(folder / "part.pt")
+        resumed.resume(folder / f"cut-{cut}.pt")
+        assert resumed.iteration == cut
         resumed.run(folder / f"from-{cut}.pt")
         assert_same_weights(folder / "whole.pt", folder / f"from-{cut}.pt")

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from runs import assert_resumes_bit_for_bit, assert_same_weights, read_log
+from runs import assert_resumes_bit_for_bit, assert_same_weights, read_log, run_saving
 from tiny import TINY, disc
 from trainer_rate import train_rate_bits
 
@@ -62,7 +62,8 @@ def test_a_run_with_all_phases_resumes_bit_for_bit(dataset, tmp_path, monkeypatc
     config = TrainConfig(preset="tiny", iterations=44, seed=4, prune=0.05, grading=0.5, small_pictures=0.6)
     trainer, schedule, whitenings = Trainer(config, dataset), Schedule(44), []
     monkeypatch.setattr(quantisation, "whiten", lambda *args: whitenings.append(trainer.iteration) or whiten(*args))
-    trainer.run(tmp_path / "whole.pt", log=tmp_path / "log.jsonl")
+    cuts = (12, schedule.prune[2], 36)
+    run_saving(trainer, tmp_path, cuts, log=tmp_path / "log.jsonl")
     records = read_log(tmp_path / "log.jsonl")
     pruned, drawn = ([r for r in records if name in r] for name in ("left_model", "prefix"))
     assert [r["iteration"] for r in pruned] == list(schedule.prune) and sum(r["left_model"] for r in pruned) > 0
@@ -71,7 +72,7 @@ def test_a_run_with_all_phases_resumes_bit_for_bit(dataset, tmp_path, monkeypatc
     assert all(r["level"] == 0 and r["prefix"] >= 20 for r in drawn)
     assert whitenings == [schedule.rounding]
     assert sum("grown" in r for r in records) == sum("step_classes" in r for r in records) == 1
-    assert_resumes_bit_for_bit(config, dataset, tmp_path, (12, schedule.prune[2], 36))
+    assert_resumes_bit_for_bit(config, dataset, tmp_path, cuts)
 
 
 @pytest.mark.usefixtures("short_runs_have_phases")
@@ -375,7 +376,7 @@ def test_a_removed_level_stays_away(dataset, tmp_path, monkeypatch):
     trainer = Trainer(config, views)
     held_back, seen, original = held_back_views(trainer.learner), [], learner.next_view
     monkeypatch.setattr(learner, "next_view", lambda *at: seen.append(original(*at)) or seen[-1])
-    trainer.run(tmp_path / "whole.pt", log=tmp_path / "log.jsonl")
+    run_saving(trainer, tmp_path, [25], log=tmp_path / "log.jsonl")
     start = Schedule(30).rounding
     assert len(held_back) == 4 and not set(seen[:start]) & held_back
     records = read_log(tmp_path / "log.jsonl")
