@@ -19,11 +19,16 @@ from pd4dgs_codec.web.server import Server
 VIDEO = replace(fake_video(), poster=b"\xff\xd8 a picture")
 
 
+@pytest.fixture(scope="module")
+def packages(scene_bytes):
+    """Two, one with names that never change."""
+    return {"a b": package(scene_bytes, lambda scene: VIDEO, immutable=True), "c": package(scene_bytes)}
+
+
 @pytest.fixture
-def shelf(tmp_path, scene_bytes):
-    """A folder of two packages, one with names that never change."""
-    made = {"a b": package(scene_bytes, lambda scene: VIDEO, immutable=True), "c": package(scene_bytes)}
-    for name, files in made.items():
+def shelf(tmp_path, packages):
+    """A folder of both, which a test may damage."""
+    for name, files in packages.items():
         (tmp_path / name).mkdir()
         for file, content in files.items():
             (tmp_path / name / file).write_bytes(content)
