@@ -608,24 +608,14 @@ def norm_cdf(n, mu8, si):
     return result
 
 
-# 7.3 NormTable: "with a floor fl the table cum[q] = ((C(q−1) · (2^24 − n·fl)) >> 28) + fl·q for 0 < q < n."
-def table_of(cdf, floor):
+# 7.3 NormTable: "and the table cum[q] = ((C(q−1) · (2^24 − 16·n)) >> 28) + 16·q for 0 < q < n."
+def table_of(cdf):
     n = len(cdf) + 1
-    inner = [((c * (TOTAL - n * floor)) >> 28) + floor * q for q, c in enumerate(cdf, 1)]
+    inner = [((c * (TOTAL - 16 * n)) >> 28) + 16 * q for q, c in enumerate(cdf, 1)]
     return [0, *inner, TOTAL]
 
 
-# 7.5 Histogram tables: "cum[q] = ((W(q) >> h) · (2^24 − n)) // (W(n) >> h) + q, q = 0..n"
-def histogram_table(heights, top, step):
-    sums = [0]
-    for c in heights:
-        b = (top - c) * step
-        sums.append(sums[-1] + (M[b & 63] >> (b >> 6) if c > 0 else 0))
-    h = max(0, sums[-1].bit_length() - 28)
-    return [((s >> h) * (TOTAL - len(heights))) // (sums[-1] >> h) + q for q, s in enumerate(sums)]
-
-
-# 7.6 ANS streams: "A stream is a multiple of 4 bytes: u32 words in the order in which the decoder takes them. It may
+# 7.5 ANS streams: "A stream is a multiple of 4 bytes: u32 words in the order in which the decoder takes them. It may
 # be empty; its first word MUST NOT be 0."
 class Ans:
     def __init__(self, data):
@@ -636,7 +626,7 @@ class Ans:
             self.x = self.x << 32 | self.words[self.at]
             self.at += 1
 
-    # 7.6 ANS streams: "x = (x >> 24)·(cum[s+1] − cum[s]) + q − cum[s] if x < 2^32 and words are left: x = x·2^32 +
+    # 7.5 ANS streams: "x = (x >> 24)·(cum[s+1] − cum[s]) + q − cum[s] if x < 2^32 and words are left: x = x·2^32 +
     # next word"
     def take(self, count, cum):
         if len(cum) == 2:
@@ -652,75 +642,40 @@ class Ans:
             result.append(s)
         return result
 
-    # 7.6 ANS streams: "x MUST be 0 and no word left, else Malformed"
+    # 7.5 ANS streams: "x MUST be 0 and no word left, else Malformed"
     def finish(self):
         need(self.x == 0 and self.at == len(self.words), "an ANS stream does not end in state 0")
 
 
 class Prior:
-    """kmin, n: the window of clause 8.2; cum: its table, for a hist once the heights are known."""
+    """kmin, n: the window of clause 8.2; cum: its table."""
 
     def __init__(self, kmin, n, cum):
         self.kmin, self.n, self.cum = kmin, n, cum
         self.end = kmin + n
-        self.heights = None  # of a hist: (unit, top, differences, table of the heights)
 
 
 # 8.1 Parameter block: "a new prior of this family"
-# 8.2 Priors: "The floor of a mixture is that of its first normal; the bit is reserved in the second."
+# 8.2 Priors: "In a window, kmin + n − 1 MUST NOT exceed K, else Malformed." "u8 weight 1..255 of the second"
 def read_prior(reader, family):
-    need(family <= 3, f"prior family {family}", "UnsupportedFeature")
+    need(family <= 2, f"prior family {family}", "UnsupportedFeature")
     kmin = reader.zigzag(K)
     if family == 0:
         return Prior(kmin, 1, [0, TOTAL])
     n = 2 + reader.varint((1 << 14) - 2)
     need(kmin + n - 1 <= K, "a window reaches beyond symbol K")
-    if family == 3:
-        return read_histogram(reader, Prior(kmin, n, None))
-    mu8, si, floor = read_normal(reader, n)
-    cdf = norm_cdf(n, mu8, si)
+    cdf = norm_cdf(n, *read_normal(reader, n))
     if family == 2:
-        mu8, si, reserved = read_normal(reader, n)
+        second = norm_cdf(n, *read_normal(reader, n))
         w = reader.byte()
         need(w, "a mixture of weight 0")
-        need(not reserved, "a mixture with a reserved bit")
-        cdf = [((256 - w) * c1 + w * c2) >> 8 for c1, c2 in zip(cdf, norm_cdf(n, mu8, si))]  # clause 7.4
-    return Prior(kmin, n, table_of(cdf, 16 if floor else 1))
+        cdf = [((256 - w) * c1 + w * c2) >> 8 for c1, c2 in zip(cdf, second)]  # clause 7.4
+    return Prior(kmin, n, table_of(cdf))
 
 
-# 8.2 Priors: "Of a normal, mu8 = g + 128·(n − 1) and si = (v >> 1) − 640. Bit 0 of v is the floor: fl = 1 if it is 0,
-# else 16."
+# 8.2 Priors: "Of a normal, mu8 = g + 128·(n − 1) and si = v − 640."
 def read_normal(reader, n):
-    mu8 = reader.zigzag(1 << 31) + 128 * (n - 1)
-    v = reader.varint(3841)
-    return mu8, (v >> 1) - 640, v & 1
-
-
-# 8.2 Priors: "Without differences the table has top + 1 symbols and mu8 = 16·m, and each symbol is a height. With
-# differences it has 2·top + 1 symbols and mu8 = 256·top, and symbol r gives the previous height (0 before the first)
-# plus r − top."
-def read_histogram(reader, prior):
-    mode = reader.bits(3)
-    step, differences = 8 << (mode & 3), mode >> 2
-    top = reader.varint(1 + 1984 // step)
-    need(top, "a histogram without heights")
-    si = 16 * reader.byte(63) - 160
-    n, mu8 = (2 * top + 1, 256 * top) if differences else (top + 1, 16 * reader.varint(16 * top))
-    prior.heights = (step, top, differences, table_of(norm_cdf(n, mu8, si), 1))
-    return prior
-
-
-# 8.2 Priors: "A height outside 0..top, or all heights 0, is Malformed."
-# 8.4 Symbols: "The ANS stream holds the heights of each hist prior that the section defines, in the order"
-def take_heights(stream, prior):
-    step, top, differences, cum = prior.heights
-    heights, last = [], 0
-    for symbol in stream.take(prior.n, cum):
-        last = last + symbol - top if differences else symbol
-        heights.append(last)
-    need(0 <= min(heights) and max(heights) <= top, "a histogram's height out of range")
-    need(any(heights), "a histogram of heights 0 alone")
-    prior.cum = histogram_table(heights, top, step)
+    return reader.zigzag(1 << 31) + 128 * (n - 1), reader.varint(1920) - 640
 
 
 # 8.3 Exceptions: "the symbol is kmin − 1 − (c >> 1) if c is odd, else kmin + n + (c >> 1)." "There MUST NOT be
@@ -749,7 +704,7 @@ def read_exceptions(reader, count, prior):
 def decode_channels(data, counts, known=None):
     """known: the priors of the slices before, to which those defined here are added."""
     reader, defined, heads = Reader(data), [] if known is None else known, []
-    first, entries, most = len(defined), 0, sum(counts) + (MORE_ENTRIES if defined else FREE_ENTRIES)
+    entries, most = 0, sum(counts) + (MORE_ENTRIES if defined else FREE_ENTRIES)
     for count in counts:
         if count == 0:
             continue
@@ -762,11 +717,7 @@ def decode_channels(data, counts, known=None):
         need(back < len(defined), "a channel reuses a prior before the first")
         prior = defined[-1 - back]
         heads.append((prior, read_exceptions(reader, count, prior) if token & 1 else {}))
-    stream = Ans(reader.take(reader.left))
-    for prior in defined[first:]:
-        if prior.heights:
-            take_heights(stream, prior)
-    heads = iter(heads)
+    stream, heads = Ans(reader.take(reader.left)), iter(heads)
     channels = [take_channel(stream, count, *next(heads)) if count else [] for count in counts]
     stream.finish()
     return channels

@@ -259,7 +259,7 @@ def assert_same_networks(a: dict[str, Network], b: dict[str, Network]) -> None:
             np.testing.assert_array_equal(ba, bb, err_msg=name)
 
 
-def norm_table(n: int, mu8: int, si: int, floor: int) -> np.ndarray:
+def norm_table(n: int, mu8: int, si: int) -> np.ndarray:
     """NormTable v1 of one quantised Gaussian over symbols 0 .. n - 1: cum int64 [n + 1]."""
-    sizes, mu8s, sis, floors = (np.array([v]) for v in (n, mu8, si, floor))
-    return tables_of_each(norm_cdf28_of_each(sizes, mu8s, sis), sizes, floors)
+    sizes, mu8s, sis = (np.array([v]) for v in (n, mu8, si))
+    return tables_of_each(norm_cdf28_of_each(sizes, mu8s, sis), sizes)

@@ -4,7 +4,7 @@ A payload begins with a record per non-empty channel: a varint token (family << 
 new prior if the family is below 8, and the exceptions, if any: their number, and for each the gap to the previous
 position and the distance outside the window. Family 8 + i stands for the prior defined i definitions before the latest;
 definitions of earlier payloads count if the caller passes them on.
-The ANS words follow: the heights of each histogram prior in order of definition, then each channel's symbols.
+The ANS words of each channel's symbols follow.
 """
 
 from collections.abc import Sequence
@@ -21,12 +21,10 @@ from pd4dgs_codec.entropy.priors import (
     FREE_ENTRIES,
     K_MAX,
     MORE_ENTRIES,
-    Hist,
     Prior,
     Window,
     make_models,
     read_prior,
-    with_height_symbols,
 )
 from pd4dgs_codec.entropy.tables import BIT
 from pd4dgs_codec.entropy.varint import VARINT_MAX, ByteReader, put_varint
@@ -109,9 +107,7 @@ def _encode(
             fresh.append(fitted)
         symbols.append(inside - prior.window.kmin)
         cums.append(prior.cum)
-    tables = [f.prior for f in fresh if isinstance(f.prior, Hist)]
-    words = ans_encode([*(p.height_symbols for p in tables), *symbols], [*(p.height_cum for p in tables), *cums])
-    return bytes(out) + words, fresh
+    return bytes(out) + ans_encode(symbols, cums), fresh
 
 
 def _split(array: np.ndarray, window: Window) -> tuple[np.ndarray, _Exceptions]:
@@ -195,23 +191,13 @@ def decode_joined(payload: bytes | memoryview, counts: Sequence[int], known: lis
             continue
         heads.append(head)
     stream = AnsDecoder(reader.rest())
-    _complete(defined, first, stream)
+    make_models(defined[first:])
     symbols, end = np.empty(sum(counts), np.int32), 0
     for index, count, exceptions in heads:
         end += count
         _take_channel(stream, defined[index], exceptions, symbols[end - count : end])
     stream.finish()
     return symbols
-
-
-def _complete(defined: list[Prior], first: int, stream: AnsDecoder) -> None:
-    """Makes the models of the priors from `first` on, and decodes the heights of the histograms among them."""
-    make_models(defined[first:])
-    places = [at for at in range(first, len(defined)) if isinstance(defined[at], Hist)]
-    histograms = [prior for prior in defined[first:] if isinstance(prior, Hist)]
-    heights = [stream.take(prior.window.n, prior.height_model) for prior in histograms]
-    for at, prior in zip(places, with_height_symbols(histograms, heights), strict=True):
-        defined[at] = prior
 
 
 #: (index of a channel's prior, number of its symbols, its exceptions).

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.entropy.priors import FLOORS, HEIGHT_STEPS
 from pd4dgs_codec.entropy.tables import (
     BIT,
+    FLOOR,
     LOG2,
     NORMAL,
     OCTAVE,
@@ -44,13 +44,8 @@ GAUSS_BITS, MIXTURE_BITS = 8, 10
 GAUSS_ROUNDS = 12
 #: Least gain of a round of the descent; a smaller gain ends it.
 ENOUGH = BIT // 8
-#: Number of widths for the Gaussian of a histogram's heights.
-HEIGHT_WIDTHS = 64
 #: Least probability and least standard deviation, in units of Q, of R(a).
 P_MIN, SIGMA_MIN = 1e-6, 2.0**-10
-
-_STEPS = np.array(HEIGHT_STEPS)
-_LOW, _HIGH = FLOORS  # the higher floor keeps outliers from steering the fit
 
 
 @_inlined
@@ -85,12 +80,12 @@ def _mixed(first: np.ndarray, second: np.ndarray, weight: int, cdf: np.ndarray) 
 
 
 @_compiled
-def _table_cost(cdf: np.ndarray, floor: int, counts: np.ndarray) -> Any:
+def _table_cost(cdf: np.ndarray, counts: np.ndarray) -> Any:
     """Cost of counts int64 [n] under the table of cdf int64 [n - 1]."""
     n = len(counts)
-    cost, before, spread = 0, 0, TOTAL - n * floor
+    cost, before, spread = 0, 0, TOTAL - n * FLOOR
     for k in range(n - 1):
-        cum = ((cdf[k] * spread) >> 28) + floor * (k + 1)
+        cum = ((cdf[k] * spread) >> 28) + FLOOR * (k + 1)
         if counts[k] > 0:
             cost += counts[k] * frequency_cost(cum - before)
         before = cum
@@ -98,13 +93,13 @@ def _table_cost(cdf: np.ndarray, floor: int, counts: np.ndarray) -> Any:
 
 
 @_compiled
-def _entry_costs(cdf: np.ndarray, floor: int) -> np.ndarray:
+def _entry_costs(cdf: np.ndarray) -> np.ndarray:
     """Costs int64 [n] of the entries of the table of cdf int64 [n - 1]."""
     n = len(cdf) + 1
     costs = np.empty(n, np.int64)
-    before, spread = 0, TOTAL - n * floor
+    before, spread = 0, TOTAL - n * FLOOR
     for k in range(n):
-        cum = TOTAL if k == n - 1 else ((cdf[k] * spread) >> 28) + floor * (k + 1)
+        cum = TOTAL if k == n - 1 else ((cdf[k] * spread) >> 28) + FLOOR * (k + 1)
         costs[k] = frequency_cost(cum - before)
         before = cum
     return costs
@@ -118,22 +113,13 @@ if not NUMBA:  # the loops over a table in numpy
     def _mixed(first: np.ndarray, second: np.ndarray, weight: int, cdf: np.ndarray) -> None:
         cdf[:] = ((256 - weight) * first + weight * second) >> 8
 
-    def _entry_costs(cdf: np.ndarray, floor: int) -> np.ndarray:
+    def _entry_costs(cdf: np.ndarray) -> np.ndarray:
         n = len(cdf) + 1
-        cum = ((cdf * (TOTAL - n * floor)) >> 28) + floor * np.arange(1, n)
+        cum = ((cdf * (TOTAL - n * FLOOR)) >> 28) + FLOOR * np.arange(1, n)
         return frequency_costs(np.diff(cum, prepend=0, append=TOTAL))
 
-    def _table_cost(cdf: np.ndarray, floor: int, counts: np.ndarray) -> Any:
-        return _entry_costs(cdf, floor) @ counts
-
-
-@_compiled
-def _cheaper_floor(cdf: np.ndarray, dense: np.ndarray) -> tuple[int, int, np.ndarray]:
-    """Returns (index of the cheaper floor, cost of dense, costs of the entries)."""
-    low, high = _table_cost(cdf, _LOW, dense), _table_cost(cdf, _HIGH, dense)
-    if low <= high:
-        return 0, low, _entry_costs(cdf, _LOW)
-    return 1, high, _entry_costs(cdf, _HIGH)
+    def _table_cost(cdf: np.ndarray, counts: np.ndarray) -> Any:
+        return _entry_costs(cdf) @ counts
 
 
 @_compiled
@@ -159,12 +145,12 @@ def _cost_at(probe: np.ndarray, x: np.ndarray, kept: np.ndarray, scratch: np.nda
         first = scratch[0]
         _cdf28(probe[0], probe[1], first)
     if len(probe) == 2:
-        return _table_cost(first, _HIGH, counts)
+        return _table_cost(first, counts)
     if probe[2] != x[2] or probe[3] != x[3]:
         second = scratch[1]
         _cdf28(probe[2], probe[3], second)
     _mixed(first, second, probe[4], mixed)
-    return _table_cost(mixed, _HIGH, counts)
+    return _table_cost(mixed, counts)
 
 
 @_compiled
@@ -233,8 +219,8 @@ def _quantile(weights: np.ndarray, share: float) -> float:
 
 
 @_compiled
-def gauss(dense: np.ndarray) -> tuple[int, int, int, int, np.ndarray]:
-    """Fits the cheapest Gaussian: (mu8, si, index of the floor, cost of dense, costs of the entries int64 [n])."""
+def gauss(dense: np.ndarray) -> tuple[int, int, int, np.ndarray]:
+    """Fits the cheapest Gaussian: (mu8, si, cost of dense, costs of the entries int64 [n])."""
     counts, shift = _coarsen(dense, GAUSS_BITS)
     n = len(counts)
     weights = counts / counts.sum()
@@ -253,7 +239,7 @@ def gauss(dense: np.ndarray) -> tuple[int, int, int, int, np.ndarray]:
         mu8 = min(max(np.int64(np.rint(256 * mu)), low[0]), high[0])
         si = min(max(np.int64(np.rint(64 * math.log2(sd))), low[1]), high[1])
         _cdf28(mu8, si, cdf)
-        cost = _table_cost(cdf, _HIGH, counts)
+        cost = _table_cost(cdf, counts)
         if cost < least:
             least = cost
             x[0], x[1] = mu8, si
@@ -262,8 +248,7 @@ def gauss(dense: np.ndarray) -> tuple[int, int, int, int, np.ndarray]:
     mu8, si = (x[0] << shift) + 128 * ((1 << shift) - 1), min(x[1] + 64 * shift, SI_MAX)
     full = np.empty(len(dense) - 1, np.int64)
     _cdf28(mu8, si, full)
-    floor, cost, costs = _cheaper_floor(full, dense)
-    return mu8, si, floor, cost, costs
+    return mu8, si, _table_cost(full, dense), _entry_costs(full)
 
 
 @_compiled
@@ -323,8 +308,8 @@ def _expectation_maximisation(counts: np.ndarray, rounds: int) -> np.ndarray:
 
 
 @_compiled
-def mixture(dense: np.ndarray, effort: int) -> tuple[int, int, int, int, int, int, int, np.ndarray]:
-    """Fits two Gaussians: (mu8, si, mu8, si, weight of the second, index of the floor, cost, costs of the entries)."""
+def mixture(dense: np.ndarray, effort: int) -> tuple[int, int, int, int, int, int, np.ndarray]:
+    """Fits two Gaussians: (mu8, si, mu8, si, weight of the second, cost, costs of the entries)."""
     counts, shift = _coarsen(dense, MIXTURE_BITS)
     n = len(counts)
     first, second = np.empty(n - 1, np.int64), np.empty(n - 1, np.int64)
@@ -334,7 +319,7 @@ def mixture(dense: np.ndarray, effort: int) -> tuple[int, int, int, int, int, in
         _cdf28(starts[s, 0], starts[s, 1], first)
         _cdf28(starts[s, 2], starts[s, 3], second)
         _mixed(first, second, starts[s, 4], first)
-        cost = _table_cost(first, _HIGH, counts)
+        cost = _table_cost(first, counts)
         if cost < least:
             best, least = s, cost
     x = starts[best].copy()
@@ -351,98 +336,7 @@ def mixture(dense: np.ndarray, effort: int) -> tuple[int, int, int, int, int, in
     _cdf28(x[0], x[1], one)
     _cdf28(x[2], x[3], two)
     _mixed(one, two, x[4], one)
-    floor, cost, costs = _cheaper_floor(one, dense)
-    return x[0], x[1], x[2], x[3], x[4], floor, cost, costs
-
-
-@_compiled
-def _height_width(counts: np.ndarray, mu8: int, symbols: int) -> tuple[int, int]:
-    """Returns (height_si16, cost) of the cheapest Gaussian around mu8 for counts int64 [n] of height symbols, `symbols`
-    in all, by descent from their standard deviation."""
-    spread = 0.0
-    for k in range(len(counts)):
-        spread += (256.0 * k - mu8) ** 2 * counts[k]
-    si = 64 * math.log2(max(math.sqrt(spread / symbols) / 256, 0.1))
-    width = min(max(np.int64(np.rint((si + 160) / 16)), 0), HEIGHT_WIDTHS - 1)
-    cdf = np.empty(len(counts) - 1, np.int64)
-    _cdf28(mu8, 16 * width - 160, cdf)
-    least = _table_cost(cdf, 1, counts)
-    for step in (-1, 1):
-        moved = False
-        while 0 <= width + step < HEIGHT_WIDTHS:
-            _cdf28(mu8, 16 * (width + step) - 160, cdf)
-            cost = _table_cost(cdf, 1, counts)
-            if cost >= least:
-                break
-            width, least, moved = width + step, cost, True
-        if moved:
-            break
-    return width, least
-
-
-@_compiled
-def heights(dense: np.ndarray) -> tuple[int, int, int, int, int, int, int, np.ndarray, np.ndarray]:
-    """Fits a histogram, frequencies rounded to heights: (index of the step, -1 if none fits, differences, top,
-    height_si16, height_mean16, cost of dense, cost of the heights, costs of the entries, heights int64 [n])."""
-    n, largest = len(dense), dense[0]
-    for k in range(n):
-        largest = max(largest, dense[k])
-    octaves = np.zeros(n, np.int64)
-    for k in range(n):
-        if dense[k] > 0:
-            octaves[k] = frequency_cost(dense[k]) - frequency_cost(largest)
-    below, weights = np.empty(n, np.int64), np.empty(n, np.int64)
-    costs, best_costs, best_heights = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
-    least, best = np.int64(1) << 62, (-1, 0, 0, 0, 0, np.int64(1) << 62, 0)
-    for number in range(len(_STEPS)):
-        step = _STEPS[number]
-        top = 0
-        for k in range(n):
-            if dense[k] > 0:
-                below[k] = (octaves[k] * 64 + step * BIT // 2) // (step * BIT)
-                top = max(top, below[k])
-        top += 1
-        if top > 1 + 31 * 64 // step:
-            continue
-        whole, total = 0, 0
-        for k in range(n):
-            weights[k] = 0
-            if dense[k] > 0:
-                down = below[k] * step
-                weights[k] = OCTAVE[down & 63] >> (down >> 6)
-            whole += weights[k]
-        shift = 0
-        while whole >> shift >= 1 << 28:
-            shift += 1
-        before, running, cost = 0, 0, 0
-        for k in range(n):
-            running += weights[k]
-            cum = (running >> shift) * (TOTAL - n) // (whole >> shift) + k + 1
-            costs[k] = frequency_cost(cum - before)
-            cost += dense[k] * costs[k]
-            before = cum
-        for k in range(n):
-            if dense[k] > 0:
-                total += top - below[k]
-        for differences in range(2):
-            counts = np.zeros(2 * top + 1 if differences else top + 1, np.int64)
-            previous = 0
-            for k in range(n):
-                value = top - below[k] if dense[k] > 0 else 0
-                counts[value - previous + top if differences else value] += 1
-                previous = value
-            mean16 = 0 if differences else (32 * total + n) // (2 * n)
-            width, described = _height_width(counts, 256 * top if differences else 16 * mean16, n)
-            size = 1 + (top >= 1 << 7)
-            if not differences:
-                size += 1 + (mean16 >= 1 << 7) + (mean16 >= 1 << 14)
-            if cost + described + 8 * BIT * size < least:
-                least = cost + described + 8 * BIT * size
-                best = (number, differences, top, width, mean16, cost, described)
-                for k in range(n):
-                    best_costs[k] = costs[k]
-                    best_heights[k] = top - below[k] if dense[k] > 0 else 0
-    return best[0], best[1], best[2], best[3], best[4], best[5], best[6], best_costs, best_heights
+    return x[0], x[1], x[2], x[3], x[4], _table_cost(one, dense), _entry_costs(one)
 
 
 @_compiled

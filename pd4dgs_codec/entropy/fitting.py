@@ -18,15 +18,12 @@ from types import ModuleType
 import numpy as np
 
 from pd4dgs_codec.entropy.priors import (
-    FLOORS,
     FREE_ENTRIES,
-    HEIGHT_STEPS,
     K_MAX,
     MAX_WINDOW,
     MORE_ENTRIES,
     Const,
     Gauss,
-    Hist,
     Mixture,
     Normal,
     Prior,
@@ -122,7 +119,7 @@ def fit_best(h: Histogram, effort: int) -> Fitted:
     found = h.gauss
     if found.prior.window.n == 1:
         return found
-    return _cheapest([found, *_richer_priors(h, found, effort)])
+    return _cheapest([found, *_mixtures(h, found, effort)])
 
 
 def _cheapest(priors: Sequence[Fitted]) -> Fitted:
@@ -135,34 +132,26 @@ def _const(h: Histogram, mode: int) -> Fitted:
 
 
 def _fit_gauss_in(h: Histogram, window: Window) -> Fitted:
-    mu8, si, floor, cost, costs = loops().gauss(_dense(h, window))
-    return _fitted(Gauss(window, Normal(mu8, si), FLOORS[floor]), costs, cost + _beside(h, window))
+    mu8, si, cost, costs = loops().gauss(_dense(h, window))
+    return _fitted(Gauss(window, Normal(mu8, si)), costs, cost + _beside(h, window))
 
 
-def _fitted(prior: Prior, costs: np.ndarray, own: int, heights: int = 0) -> Fitted:
-    """Returns the prior with its costs. heights: cost of a histogram's heights, which are coded with the symbols."""
+def _fitted(prior: Prior, costs: np.ndarray, own: int) -> Fitted:
     out = bytearray()
     prior.write(out)
-    return Fitted(prior, costs, 8 * BIT * len(out) + heights, own)
+    return Fitted(prior, costs, 8 * BIT * len(out), own)
 
 
-def _richer_priors(h: Histogram, found: Fitted, effort: int) -> list[Fitted]:
-    """Fits a mixture and a histogram in the window found, unless the empirical entropy shows that they cannot gain."""
+def _mixtures(h: Histogram, found: Fitted, effort: int) -> list[Fitted]:
+    """Fits a mixture in the window found, unless the empirical entropy shows that it cannot gain."""
     window = found.prior.window
     dense, beside = _dense(h, window), _beside(h, window)
     seen = dense[dense > 0]
     spare = (found.own - beside) / BIT - order0_bits(seen)
-    priors: list[Fitted] = []
-    if spare > 40 + 0.72 * len(seen):  # a mixture takes five more bytes; a sample's entropy is low by log2(e) / 2 each
-        mu1, si1, mu2, si2, weight, floor, cost, costs = loops().mixture(dense, effort)
-        mixture = Mixture(window, Normal(mu1, si1), Normal(mu2, si2), weight, FLOORS[floor])
-        priors.append(_fitted(mixture, costs, cost + beside))
-    if spare > len(seen):  # a height costs a bit or more
-        step, differences, top, width, mean16, cost, described, costs, heights = loops().heights(dense)
-        if step >= 0:
-            hist = Hist(window, HEIGHT_STEPS[step], top, bool(differences), width, mean16, heights)
-            priors.append(_fitted(hist, costs, cost + beside, described))
-    return priors
+    if spare <= 40 + 0.72 * len(seen):  # a mixture takes five more bytes; a sample's entropy is low by log2(e) / 2 each
+        return []
+    mu1, si1, mu2, si2, weight, cost, costs = loops().mixture(dense, effort)
+    return [_fitted(Mixture(window, Normal(mu1, si1), Normal(mu2, si2), weight), costs, cost + beside)]
 
 
 def _dense(h: Histogram, window: Window) -> np.ndarray:

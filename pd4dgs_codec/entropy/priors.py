@@ -9,7 +9,7 @@ only saves time: a family that it does not list makes its tables one by one.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, ClassVar, TypeVar, get_args
 
@@ -17,11 +17,8 @@ import numpy as np
 
 from pd4dgs_codec.entropy.ans import Model, model_of, models_of_each
 from pd4dgs_codec.entropy.tables import (
-    OCTAVE,
     SI_MAX,
     SI_MIN,
-    histogram_table,
-    histogram_tables_of_each,
     norm_cdf28_of_each,
     tables_of_each,
 )
@@ -34,10 +31,8 @@ MAX_WINDOW = 1 << 14
 #: memory: eight bytes can define a table of 2**14 entries, 128 KiB, in each section of each slice.
 FREE_ENTRIES, MORE_ENTRIES = 1 << 18, 1 << 10
 MU8_MAX = 1 << 31
-FLOORS = (1, 16)  #: 16 / 2**24 is the clip of R(a)
-HEIGHT_STEPS = (8, 16, 32, 64)  #: units of a histogram's heights, in 1/64 octave
 
-CONST, GAUSS, GMM2, HIST = 0, 1, 2, 3
+CONST, GAUSS, GMM2 = 0, 1, 2
 FIRST_REUSE = 8  #: family codes from here on refer to an earlier prior
 
 
@@ -72,15 +67,14 @@ class Normal:
     mu8: int
     si: int
 
-    def write(self, out: bytearray, n: int, extra: int = 0) -> None:
+    def write(self, out: bytearray, n: int) -> None:
         put_zigzag(out, self.mu8 - 128 * (n - 1))  # from the window's middle: most often two bytes
-        put_varint(out, 2 * (self.si - SI_MIN) + extra)
+        put_varint(out, self.si - SI_MIN)
 
     @classmethod
-    def read(cls, reader: ByteReader, n: int) -> tuple[Normal, int]:
+    def read(cls, reader: ByteReader, n: int) -> Normal:
         mu8 = reader.zigzag(MU8_MAX, "a Gaussian's mean") + 128 * (n - 1)
-        code = reader.varint(2 * (SI_MAX - SI_MIN) + 1, "a Gaussian's width")
-        return cls(mu8, (code >> 1) + SI_MIN), code & 1
+        return cls(mu8, reader.varint(SI_MAX - SI_MIN, "a Gaussian's width") + SI_MIN)
 
 
 class _Tabled:
@@ -117,17 +111,15 @@ class Gauss(_Tabled):
     id: ClassVar[int] = GAUSS
     window: Window
     normal: Normal
-    floor: int
 
     def write(self, out: bytearray) -> None:
         self.window.write(out)
-        self.normal.write(out, self.window.n, FLOORS.index(self.floor))
+        self.normal.write(out, self.window.n)
 
     @classmethod
     def read(cls, reader: ByteReader) -> Gauss:
         window = Window.read(reader)
-        normal, floor = Normal.read(reader, window.n)
-        return cls(window, normal, FLOORS[floor])
+        return cls(window, Normal.read(reader, window.n))
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,89 +131,24 @@ class Mixture(_Tabled):
     first: Normal
     second: Normal
     weight: int
-    floor: int
 
     def write(self, out: bytearray) -> None:
         self.window.write(out)
-        self.first.write(out, self.window.n, FLOORS.index(self.floor))
+        self.first.write(out, self.window.n)
         self.second.write(out, self.window.n)
         out.append(self.weight)
 
     @classmethod
     def read(cls, reader: ByteReader) -> Mixture:
         window = Window.read(reader)
-        first, floor = Normal.read(reader, window.n)
-        second, reserved = Normal.read(reader, window.n)
+        first, second = Normal.read(reader, window.n), Normal.read(reader, window.n)
         weight = reader.byte("a mixture's weight")
-        if reserved or weight == 0:
-            raise Malformed("a mixture with a reserved bit set or a weight of 0", offset=reader.offset)
-        return cls(window, first, second, weight, FLOORS[floor])
+        if weight == 0:
+            raise Malformed("a mixture with a weight of 0", offset=reader.offset)
+        return cls(window, first, second, weight)
 
 
-@dataclass(frozen=True, eq=False)
-class Hist(_Tabled):
-    """A histogram: frequencies as heights in units of `step` / 64 octaves, up to `top`; height 0 is an absent symbol.
-
-    The heights (or their differences) are coded in the ANS stream, before all channels, under a Gaussian of their own.
-    """
-
-    id: ClassVar[int] = HIST
-    window: Window
-    step: int
-    top: int
-    differences: bool
-    height_si16: int  #: si = 16 * height_si16 - 160
-    height_mean16: int  #: mu8 = 16 * height_mean16; 0 and not stored for differences, whose mean is 0
-    heights: np.ndarray | None  #: int [n] in 0..top; None until the stream has given them
-
-    @property
-    def height_normal(self) -> tuple[int, Normal]:
-        """(number of entries, Gaussian) of the heights' table."""
-        n, mu8 = (2 * self.top + 1, 256 * self.top) if self.differences else (self.top + 1, 16 * self.height_mean16)
-        return n, Normal(mu8, 16 * self.height_si16 - 160)
-
-    @cached_property
-    def height_cum(self) -> np.ndarray:
-        return normal_tables([self])[0]
-
-    @cached_property
-    def height_model(self) -> Model | None:
-        return model_of(self.height_cum)
-
-    @property
-    def height_symbols(self) -> np.ndarray:
-        """The heights as symbols of height_cum, int64 [n]."""
-        heights = np.asarray(self.heights, dtype=np.int64)
-        return np.diff(heights, prepend=0) + self.top if self.differences else heights
-
-    @cached_property
-    def cum(self) -> np.ndarray:
-        heights = np.asarray(self.heights, dtype=np.int64)
-        below = (self.top - heights) * self.step
-        return histogram_table(np.where(heights > 0, OCTAVE[below & 63] >> (below >> 6), 0))
-
-    def write(self, out: bytearray) -> None:
-        self.window.write(out)
-        out.append(HEIGHT_STEPS.index(self.step) | 4 * self.differences)
-        put_varint(out, self.top)
-        out.append(self.height_si16)
-        if not self.differences:
-            put_varint(out, self.height_mean16)
-
-    @classmethod
-    def read(cls, reader: ByteReader) -> Hist:
-        window = Window.read(reader)
-        mode = reader.bits("a histogram's mode", 3)
-        step, differences = HEIGHT_STEPS[mode & 3], bool(mode & 4)
-        top = reader.varint(top_limit(step), "a histogram's largest height")
-        if top == 0:
-            raise Malformed("a histogram without heights", offset=reader.offset)
-        si16 = reader.byte("a histogram's spread of heights", 63)
-        mean16 = 0 if differences else reader.varint(16 * top, "a histogram's mean height")
-        return cls(window, step, top, differences, si16, mean16, None)
-
-
-Prior = Const | Gauss | Mixture | Hist
+Prior = Const | Gauss | Mixture
 AnyPrior = TypeVar("AnyPrior", bound=Prior)
 _FAMILIES: dict[int, type[Prior]] = {family.id: family for family in get_args(Prior)}
 
@@ -231,11 +158,10 @@ BATCH = 1 << 14
 
 
 def make_models(priors: Sequence[Prior]) -> None:
-    """Sets `model` of Gaussians and mixtures, and `height_model` of histograms, many in one pass."""
-    for batch in _batches([prior for prior in priors if isinstance(prior, Gauss | Mixture | Hist)]):
+    """Sets `model` of Gaussians and mixtures, many in one pass."""
+    for batch in _batches([prior for prior in priors if isinstance(prior, Gauss | Mixture)]):
         for prior, model in zip(batch, models_of_each(*normal_tables(batch)), strict=True):
-            # where cached_property keeps it
-            prior.__dict__["height_model" if isinstance(prior, Hist) else "model"] = model
+            prior.__dict__["model"] = model  # where cached_property keeps it
 
 
 def _batches(priors: Sequence[AnyPrior]) -> Iterator[list[AnyPrior]]:
@@ -252,70 +178,33 @@ def _batches(priors: Sequence[AnyPrior]) -> Iterator[list[AnyPrior]]:
 
 
 def normal_tables(priors: Sequence[Prior]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns (concatenated tables int64, their sizes int64 [m]); for histograms, the tables of their heights.
+    """Returns (concatenated tables int64, their sizes int64 [m]).
 
     Raises TypeError for a prior of another class, which has to define `cum` itself."""
-    rows = list[tuple[int, Normal, int]]()
+    normals = list[Normal]()
     for prior in priors:
         if isinstance(prior, Gauss):
-            rows.append((prior.window.n, prior.normal, prior.floor))
+            normals.append(prior.normal)
         elif isinstance(prior, Mixture):
-            rows.append((prior.window.n, prior.first, prior.floor))
-        elif isinstance(prior, Hist):
-            rows.append((*prior.height_normal, 1))
+            normals.append(prior.first)
         elif isinstance(prior, Const):
-            rows.append((1, Normal(0, 0), 1))
+            normals.append(Normal(0, 0))
         else:
             raise TypeError(f"{type(prior).__name__}: its table is not one of Gaussians")
-    sizes, floors = (np.array([row[i] for row in rows], dtype=np.int64) for i in (0, 2))
-    cdf = norm_cdf28_of_each(sizes, *_columns([normal for _, normal, _ in rows]))
+    sizes = np.array([prior.window.n for prior in priors], dtype=np.int64)
+    cdf = norm_cdf28_of_each(sizes, *_columns(normals))
     if mixtures := [prior for prior in priors if isinstance(prior, Mixture)]:
         mixed = np.array([isinstance(prior, Mixture) for prior in priors])
         second = norm_cdf28_of_each(sizes[mixed], *_columns([prior.second for prior in mixtures]))
         weight = np.repeat(np.array([prior.weight for prior in mixtures]), sizes[mixed] + 1)
         inside = np.repeat(mixed, sizes + 1)
         cdf[inside] = ((256 - weight) * cdf[inside] + weight * second) >> 8
-    return tables_of_each(cdf, sizes, floors), sizes
-
-
-def with_height_symbols(priors: Sequence[Hist], symbols: Sequence[np.ndarray]) -> list[Hist]:
-    """Returns the histograms with `heights` from their symbols under height_cum, int32 [n] each, and with `model` set.
-
-    Raises Malformed for heights out of range."""
-    whole = list[Hist]()
-    rest = iter(symbols)
-    for batch in _batches(priors):
-        sizes = np.array([prior.window.n for prior in batch], np.int64)
-        tops, steps = (np.array([getattr(p, name) for p in batch], np.int64) for name in ("top", "step"))
-        of_each = np.repeat(np.arange(len(batch)), sizes)
-        heights = np.concatenate([next(rest) for _ in batch]).astype(np.int64)
-        summed = np.array([prior.differences for prior in batch])[of_each]
-        running = np.cumsum(np.where(summed, heights - tops[of_each], 0))
-        firsts = np.cumsum(sizes) - sizes
-        before = np.concatenate([[0], running])[firsts]
-        heights = np.where(summed, running - before[of_each], heights)
-        low, high = np.minimum.reduceat(heights, firsts), np.maximum.reduceat(heights, firsts)
-        wrong = np.flatnonzero((low < 0) | (high > tops) | (high == 0))
-        if wrong.size:
-            at = wrong[0]
-            raise Malformed(f"histogram heights {low[at]}..{high[at]}, expected 0..{tops[at]}, not all 0")
-        below = (tops[of_each] - heights) * steps[of_each]
-        freqs = np.where(heights > 0, OCTAVE[below & 63] >> (below >> 6), 0)
-        models = models_of_each(histogram_tables_of_each(freqs, sizes), sizes)
-        for prior, first, model in zip(batch, firsts.tolist(), models, strict=True):
-            whole.append(replace(prior, heights=heights[first : first + prior.window.n]))
-            whole[-1].__dict__["model"] = model
-    return whole
+    return tables_of_each(cdf, sizes), sizes
 
 
 def _columns(normals: Sequence[Normal]) -> tuple[np.ndarray, np.ndarray]:
     mu8, si = zip(*((normal.mu8, normal.si) for normal in normals), strict=True)
     return np.array(mu8, dtype=np.int64), np.array(si, dtype=np.int64)
-
-
-def top_limit(step: int) -> int:
-    """Returns the largest height of a histogram: heights reach 31 octaves below the largest frequency."""
-    return 1 + 31 * 64 // step
 
 
 def read_prior(reader: ByteReader, family: int) -> Prior:

@@ -9,6 +9,7 @@ import math
 import numpy as np
 
 TOTAL = 1 << 24
+FLOOR = 16  #: least frequency: 16 / 2**24 is the clip of R(a), and keeps outliers from steering a fit
 SI_MIN, SI_MAX = -640, 1280  #: sigma = Q * 2 ** (si / 64)
 
 # The two constants of NormTable v1. Computing them in float64 is safe: no entry comes closer than 1e-4 to a rounding
@@ -39,17 +40,17 @@ def norm_cdf28_of_each(sizes: np.ndarray, mu8: np.ndarray, si: np.ndarray) -> np
     return _mass(_counted(lengths) * 256 - np.repeat(128 + mu8, lengths), np.repeat(si, lengths))
 
 
-def tables_of_each(cdf: np.ndarray, sizes: np.ndarray, floor: np.ndarray) -> np.ndarray:
-    """NormTable v1: returns the concatenated tables of a result of norm_cdf28_of_each. sizes, floor: int64 [m].
+def tables_of_each(cdf: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """NormTable v1: returns the concatenated tables of a result of norm_cdf28_of_each. sizes: int64 [m].
 
-    Each symbol gets the floor plus its share of the rest; the first also gets the mass below the window, the last the
+    Each symbol gets FLOOR plus its share of the rest; the first also gets the mass below the window, the last the
     mass above it. The caller has checked the limits of clause 8.2: sizes 1 .. 2**14, si within SI_MIN .. SI_MAX, |mu8|
-    < 2**40, floors up to 16.
+    < 2**40.
     """
     lengths = sizes + 1
     ends = np.cumsum(lengths)
-    cum: np.ndarray = (cdf * np.repeat(TOTAL - sizes * floor, lengths)) >> 28
-    cum += np.repeat(floor, lengths) * _counted(lengths)
+    cum: np.ndarray = (cdf * np.repeat(TOTAL - sizes * FLOOR, lengths)) >> 28
+    cum += FLOOR * _counted(lengths)
     cum[ends - lengths], cum[ends - 1] = 0, TOTAL
     return cum
 
@@ -58,30 +59,6 @@ def _counted(lengths: np.ndarray) -> np.ndarray:
     """Returns 0 .. length - 1 for each of `lengths`, concatenated."""
     counted: np.ndarray = np.arange(int(lengths.sum())) - np.repeat(np.cumsum(lengths) - lengths, lengths)
     return counted
-
-
-def histogram_table(freqs: np.ndarray) -> np.ndarray:
-    """Returns cum int64 [n + 1] from non-negative weights [n], each < 2**31, n <= 2**14, not all zero.
-
-    With W(q) the sum of the first q weights and s = max(0, bits(W(n)) - 28):
-    cum[q] = ((W(q) >> s) * (2**24 - n)) // (W(n) >> s) + q, so that an absent symbol keeps 2**-24.
-    """
-    return histogram_tables_of_each(freqs, np.array([len(freqs)]))
-
-
-def histogram_tables_of_each(freqs: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """`histogram_table` of concatenated weights int64 [sum of sizes]; the tables are concatenated too."""
-    lengths, running = sizes + 1, np.zeros(len(freqs) + 1, np.int64)
-    np.cumsum(freqs, out=running[1:])
-    bounds = np.cumsum(np.concatenate([[0], sizes]))
-    total = np.diff(running[bounds])
-    shift = np.maximum(0, np.frexp(total.astype(np.float64))[1] - 28)  # below 2^53 the exponent is the bit length
-    within = running[np.arange(len(freqs) + len(sizes)) - np.repeat(np.arange(len(sizes)), lengths)]
-    within -= np.repeat(running[bounds[:-1]], lengths)
-    cum: np.ndarray = (within >> np.repeat(shift, lengths)) * np.repeat(TOTAL - sizes, lengths)
-    cum //= np.repeat(total >> shift, lengths)
-    cum += _counted(lengths)
-    return cum
 
 
 # -- costs -----------------------------------------------------------------------------------------------------------

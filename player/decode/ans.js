@@ -1,4 +1,4 @@
-// Clause 7.6: ANS streams.
+// Clause 7.5: ANS streams.
 
 import { malformed } from "./errors.js";
 import { INDEX_SHIFT } from "./tables.js";

@@ -4,11 +4,11 @@ import { AnsDecoder } from "./ans.js";
 import { ByteReader, MAX_VARINT } from "./bytes.js";
 import { limitExceeded, malformed, unsupported } from "./errors.js";
 import { FREE_ENTRIES, MAX_CODED, MAX_COUNT, MAX_WINDOW, MORE_ENTRIES } from "./limits.js";
-import { CONSTANT, Table, histogramTable, mixtureTable, normTable } from "./tables.js";
+import { CONSTANT, Table, mixtureTable, normTable } from "./tables.js";
 
 const CONST = 0;
 const GAUSS = 1;
-const HISTOGRAM = 3;
+const MIXTURE = 2;
 const FIRST_REUSE = 8;
 
 /** The symbols kmin .. kmin + n - 1. @typedef {{kmin: number, n: number}} Window */
@@ -18,7 +18,6 @@ const FIRST_REUSE = 8;
  * @property {Window} window
  * @property {() => Int32Array} makeTable
  * @property {Table} [table] made from makeTable's frequencies when it is first used
- * @property {(stream: AnsDecoder) => void} [readHeights] reads a histogram's heights from the stream
  */
 
 /** Symbols outside the window, at ascending positions. @typedef {{positions: number[], values: number[]}} Exceptions */
@@ -31,9 +30,8 @@ const FIRST_REUSE = 8;
  */
 export function decodeChannels(bytes, counts, out, priors = []) {
   const reader = new ByteReader(bytes);
-  const before = priors.length;
   let entries = 0;
-  let most = before ? MORE_ENTRIES : FREE_ENTRIES;
+  let most = priors.length ? MORE_ENTRIES : FREE_ENTRIES;
   for (let i = 0; i < counts.length; i++) most += counts[i];
   /** @type {{count: number, prior: Prior, exceptions: Exceptions | null}[]} */
   const channels = [];
@@ -55,7 +53,6 @@ export function decodeChannels(bytes, counts, out, priors = []) {
     channels.push({ count, prior, exceptions: token & 1 ? readExceptions(reader, count, prior.window) : null });
   }
   const stream = new AnsDecoder(reader.rest());
-  for (let i = before; i < priors.length; i++) priors[i].readHeights?.(stream);
   let at = 0;
   for (const { count, prior, exceptions } of channels) {
     takeChannel(stream, prior, exceptions, out, at, count);
@@ -111,13 +108,11 @@ function readPrior(reader, family) {
     const kmin = reader.zigzag(MAX_CODED, "a constant");
     return { window: { kmin, n: 1 }, table: CONSTANT, makeTable: () => CONSTANT.cum };
   }
-  if (family > HISTOGRAM) throw unsupported(`a prior of family ${family}`);
+  if (family > MIXTURE) throw unsupported(`a prior of family ${family}`);
   const window = readWindow(reader);
-  if (family === HISTOGRAM) return readHistogram(reader, window);
   const first = readNormal(reader, window.n);
-  if (family === GAUSS) return { window, makeTable: () => normTable(window.n, first.mu8, first.si, first.floor) };
+  if (family === GAUSS) return { window, makeTable: () => normTable(window.n, first.mu8, first.si) };
   const second = readNormal(reader, window.n);
-  if (second.floor !== 1) throw malformed("the second normal of a mixture has a floor bit, expected 0");
   const weight = reader.byte("the weight of a mixture");
   if (!weight) throw malformed("a mixture of weight 0");
   return { window, makeTable: () => mixtureTable(window.n, first, second, weight) };
@@ -135,37 +130,5 @@ function readWindow(reader) {
 /** @param {ByteReader} reader @param {number} n */
 function readNormal(reader, n) {
   const mean = reader.zigzag(2 ** 31, "the mean of a prior");
-  const width = reader.varint(3841, "the width of a prior");
-  return { mu8: mean + 128 * (n - 1), si: (width >> 1) - 640, floor: width & 1 ? 16 : 1 };
-}
-
-/** @param {ByteReader} reader @param {Window} window @returns {Prior} */
-function readHistogram(reader, window) {
-  const mode = reader.byte("the mode of a histogram");
-  if (mode > 7) throw malformed(`mode ${mode} of a histogram, whose bits from 3 on are reserved`);
-  const step = 8 << (mode & 3);
-  const differences = (mode & 4) !== 0;
-  const top = reader.varint(1 + Math.floor(1984 / step), "the largest height of a histogram");
-  if (!top) throw malformed("a histogram without heights");
-  const width = reader.byte("the width of a histogram's heights");
-  if (width > 63) throw limitExceeded(`a spread of heights of ${width}, limit 63`);
-  const mu8 = differences ? 256 * top : 16 * reader.varint(16 * top, "the mean of a histogram's heights");
-  const { n } = window;
-  const heights = new Int32Array(n);
-  return {
-    window,
-    makeTable: () => histogramTable(heights, top, step),
-    readHeights(stream) {
-      const table = normTable((differences ? 2 * top : top) + 1, mu8, 16 * width - 160, 1);
-      stream.symbols(new Table(table), heights, 0, n);
-      let any = 0;
-      for (let s = 0, before = 0; s < n; s++) {
-        if (differences) heights[s] += before - top;
-        before = heights[s];
-        if (before < 0 || before > top) throw malformed(`a height of ${before} in a histogram, expected 0..${top}`);
-        any |= before;
-      }
-      if (!any) throw malformed("a histogram whose heights are all 0");
-    },
-  };
+  return { mu8: mean + 128 * (n - 1), si: reader.varint(1920, "the width of a prior") - 640 };
 }

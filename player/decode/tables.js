@@ -1,6 +1,7 @@
-// Clauses 7.2 to 7.5: frequency tables, lists cum of n + 1 integers from 0 to 2^24. All products stay below 2^53.
+// Clauses 7.2 to 7.4: frequency tables, lists cum of n + 1 integers from 0 to 2^24. All products stay below 2^53.
 
 const TOTAL = 2 ** 24;
+const FLOOR = 16;
 
 /** T of 7.3. Appendix B: binary64 yields the same list, as no entry is near a rounding boundary. */
 export const T = /* @__PURE__ */ (() => {
@@ -43,52 +44,32 @@ function distribution(n, mu8, si) {
   return out;
 }
 
-/** The table of a distribution function over n symbols. @param {Float64Array} c [n - 1] @param {number} floor */
-function tableOf(c, floor) {
+/** The table of a distribution function over n symbols. @param {Float64Array} c [n - 1] */
+function tableOf(c) {
   const n = c.length + 1;
   const cum = new Int32Array(n + 1);
-  const spread = TOTAL - n * floor;
-  for (let q = 1; q < n; q++) cum[q] = Math.floor((c[q - 1] * spread) / 2 ** 28) + floor * q;
+  const spread = TOTAL - n * FLOOR;
+  for (let q = 1; q < n; q++) cum[q] = Math.floor((c[q - 1] * spread) / 2 ** 28) + FLOOR * q;
   cum[n] = TOTAL;
   return cum;
 }
 
-/** NormTable, 7.3. @param {number} n @param {number} mu8 @param {number} si @param {number} floor */
-export function normTable(n, mu8, si, floor) {
-  return tableOf(distribution(n, mu8, si), floor);
+/** NormTable, 7.3. @param {number} n @param {number} mu8 @param {number} si */
+export function normTable(n, mu8, si) {
+  return tableOf(distribution(n, mu8, si));
 }
 
 /**
  * A mixture of two Gaussians, 7.4.
  *
- * @param {number} n @param {{mu8: number, si: number, floor: number}} first @param {{mu8: number, si: number}} second
+ * @param {number} n @param {{mu8: number, si: number}} first @param {{mu8: number, si: number}} second
  * @param {number} weight 1..255, of the second in 256
  */
 export function mixtureTable(n, first, second, weight) {
   const c = distribution(n, first.mu8, first.si);
   const other = distribution(n, second.mu8, second.si);
   for (let k = 0; k < n - 1; k++) c[k] = Math.floor(((256 - weight) * c[k] + weight * other[k]) / 256);
-  return tableOf(c, first.floor);
-}
-
-/**
- * A histogram, 7.5.
- *
- * @param {Int32Array} heights 0..top, not all 0 @param {number} top @param {number} step
- */
-export function histogramTable(heights, top, step) {
-  const n = heights.length;
-  const sums = new Float64Array(n + 1);
-  for (let s = 0; s < n; s++) {
-    const b = (top - heights[s]) * step; // at most 1984 where it is used
-    sums[s + 1] = sums[s] + (heights[s] ? M[b & 63] >>> (b >> 6) : 0);
-  }
-  let scale = 1; // 2^-h, which leaves the sums at most 28 binary digits
-  while (sums[n] * scale >= 2 ** 28) scale /= 2;
-  const all = Math.floor(sums[n] * scale);
-  const cum = new Int32Array(n + 1);
-  for (let q = 1; q <= n; q++) cum[q] = Math.floor((Math.floor(sums[q] * scale) * (TOTAL - n)) / all) + q;
-  return cum;
+  return tableOf(c);
 }
 
 /** Bits of the state that select an entry of a table's index. */

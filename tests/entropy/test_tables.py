@@ -2,7 +2,6 @@
 
 import math
 import zlib
-from dataclasses import replace
 
 import mpmath
 import numpy as np
@@ -13,18 +12,14 @@ from hypothesis import strategies as st
 from strategies import norm_table
 
 from pd4dgs_codec.entropy.priors import (
-    HEIGHT_STEPS,
     Const,
     Gauss,
-    Hist,
     Mixture,
     Normal,
     Window,
     _Tabled,
     make_models,
     normal_tables,
-    top_limit,
-    with_height_symbols,
 )
 from pd4dgs_codec.entropy.tables import (
     NORMAL,
@@ -32,8 +27,6 @@ from pd4dgs_codec.entropy.tables import (
     SI_MAX,
     SI_MIN,
     TOTAL,
-    histogram_table,
-    histogram_tables_of_each,
 )
 
 
@@ -57,11 +50,10 @@ def test_constants_match_high_precision_and_stay_clear_of_rounding_boundaries():
     st.integers(2, 300) | st.just(1 << 14),
     st.integers(-(2**31), 2**31),
     st.integers(SI_MIN, SI_MAX) | st.sampled_from([SI_MIN, SI_MAX]),
-    st.sampled_from([1, 16]),
 )
-def test_equals_the_rule_in_python_integers(n, mu8, si, floor):
-    cum = norm_table(n, mu8, si, floor)
-    assert cum.tolist() == refdec.table_of(refdec.norm_cdf(n, mu8, si), floor) and is_table(cum, n)
+def test_equals_the_rule_in_python_integers(n, mu8, si):
+    cum = norm_table(n, mu8, si)
+    assert cum.tolist() == refdec.table_of(refdec.norm_cdf(n, mu8, si)) and is_table(cum, n)
 
 
 @pytest.mark.parametrize("sigma", [0.05, 0.3, 1.0, 7.3, 200.0])
@@ -69,34 +61,21 @@ def test_loses_almost_nothing_against_the_exact_gaussian(sigma):
     si = round(64 * math.log2(sigma))
     sigma, mean = 2 ** (si / 64), 6 * max(sigma, 1) + 0.25
     n = int(2 * mean) + 1
-    cum = norm_table(n, round(256 * mean), si, 1)
+    cum = norm_table(n, round(256 * mean), si)
     scale = sigma * math.sqrt(2)
     exact = np.array([math.erf((k + 0.5 - mean) / scale) - math.erf((k - 0.5 - mean) / scale) for k in range(n)]) / 2
     seen = exact > 1e-12
     loss = exact[seen] @ np.log2(exact[seen] / (np.diff(cum)[seen] / TOTAL))
     bits = -(exact[seen] @ np.log2(exact[seen]))
-    assert 0 <= loss + 1e-9 and loss <= 7e-4 * bits + 1e-5
+    assert 0 <= loss + 1e-9 and loss <= 7e-4 * bits + 2e-5  # the least frequency, 16
 
 
 @given(st.integers(2, 200), st.integers(0, 256), st.integers(SI_MIN, SI_MAX), st.integers(SI_MIN, SI_MAX))
 def test_mixture_is_a_table_between_its_parts(n, weight, si1, si2):
-    cum = Mixture(Window(0, n), Normal(100, si1), Normal(256 * n, si2), weight, 1).cum
-    ends = np.stack([norm_table(n, 100, si1, 1), norm_table(n, 256 * n, si2, 1)])
+    cum = Mixture(Window(0, n), Normal(100, si1), Normal(256 * n, si2), weight).cum
+    ends = np.stack([norm_table(n, 100, si1), norm_table(n, 256 * n, si2)])
     assert is_table(cum, n)
     assert np.all(cum >= ends.min(axis=0) - 1) and np.all(cum <= ends.max(axis=0) + 1)
-
-
-@given(st.lists(st.integers(0, 2**31 - 1), min_size=1, max_size=60).filter(any))
-def test_histogram_table_follows_the_weights(freqs):
-    cum = histogram_table(np.array(freqs))
-    assert is_table(cum, len(freqs))
-    share = np.array(freqs) / sum(freqs)
-    assert np.all(np.abs(np.diff(cum) / TOTAL - share) < (len(freqs) + 3) / TOTAL)
-
-
-def test_histogram_table_at_its_limits():
-    assert histogram_table(np.array([0, 3, 1])).tolist() == [0, 1, 1 + (2**24 - 3) * 3 // 4 + 1, 2**24]
-    assert is_table(histogram_table(np.full(1 << 14, 2**31 - 1)), 1 << 14)
 
 
 def test_tables_are_frozen():
@@ -104,8 +83,8 @@ def test_tables_are_frozen():
     crc = 0
     for si in range(SI_MIN, SI_MAX + 1, 37):
         for mu8 in (-1000, 0, 4321, 10**6):
-            crc = zlib.crc32(norm_table(33, mu8, si, 1 if si % 2 else 16).astype("<i8").tobytes(), crc)
-    assert crc == 0xC5EA5B43
+            crc = zlib.crc32(norm_table(33, mu8, si).astype("<i8").tobytes(), crc)
+    assert crc == 0x63B148BD
 
 
 def test_tables_made_together_are_those_made_alone():
@@ -114,45 +93,18 @@ def test_tables_made_together_are_those_made_alone():
     for n in [2, 3, 7, 300, 20_000, 2, 900, *rng.integers(2, 60, 40).tolist()]:
         means, widths = rng.integers(-(2**31), 2**31, 2) >> rng.integers(0, 31, 2), rng.integers(-640, 1281, 2)
         first, second = map(Normal, means.tolist(), widths.tolist())
-        window, floor = Window(-3, min(n, 1 << 14)), int(rng.choice([1, 16]))
-        priors += [Gauss(window, first, floor), Mixture(window, first, second, int(rng.integers(1, 256)), floor)]
-    priors += [
-        Hist(Window(0, 9), 8, int(rng.integers(1, 30)), bool(i % 2), int(rng.integers(0, 64)), 40, None)
-        for i in range(9)
-    ]
+        window = Window(-3, min(n, 1 << 14))
+        priors += [Gauss(window, first), Mixture(window, first, second, int(rng.integers(1, 256)))]
     cums, sizes = normal_tables(priors[1:])
-    alone = [prior.height_cum if isinstance(prior, Hist) else prior.cum for prior in priors[1:]]
-    for found, expected in zip(np.split(cums, np.cumsum(sizes + 1)[:-1]), alone, strict=True):
-        np.testing.assert_array_equal(found, expected)
+    for found, prior in zip(np.split(cums, np.cumsum(sizes + 1)[:-1]), priors[1:], strict=True):
+        np.testing.assert_array_equal(found, prior.cum)
     make_models(priors)
-    assert all({"model", "height_model"} & {*prior.__dict__} for prior in priors[1:])
+    assert all("model" in prior.__dict__ for prior in priors[1:])
 
 
 def test_priors_of_another_class_are_not_taken_for_gaussians():
     class Laplace(_Tabled):
-        window, normal, floor = Window(0, 9), Normal(0, 0), 1
+        window, normal = Window(0, 9), Normal(0, 0)
 
     with pytest.raises(TypeError, match="^Laplace: "):
         Laplace().cum  # noqa: B018
-
-
-def test_histograms_completed_together_are_those_made_alone():
-    rng = np.random.default_rng(4)
-    whole = []
-    for n in [2, 3, 1 << 14, *rng.integers(2, 60, 40).tolist()]:
-        step = int(rng.choice(HEIGHT_STEPS))
-        heights = rng.integers(0, (top := int(rng.integers(1, top_limit(step) + 1))) + 1, n)
-        heights[rng.integers(n)] = top
-        whole.append(Hist(Window(0, n), step, top, bool(rng.integers(2)), 0, 0, heights))
-    found = with_height_symbols(
-        [replace(prior, heights=None) for prior in whole], [p.height_symbols.astype(np.int32) for p in whole]
-    )
-    for prior, expected in zip(found, whole, strict=True):
-        np.testing.assert_array_equal(prior.heights, expected.heights)
-        assert "model" in prior.__dict__
-        assert prior.cum.tolist() == refdec.histogram_table(expected.heights.tolist(), prior.top, prior.step)
-    weights = [rng.integers(0, 1 << 31, n) for n in (2, 5, 1 << 14, 33)]
-    weights.append(np.array([0, 1, 0]))
-    cums = histogram_tables_of_each(np.concatenate(weights), np.array([len(w) for w in weights]))
-    for table, w in zip(np.split(cums, np.cumsum([len(w) + 1 for w in weights])[:-1]), weights, strict=True):
-        np.testing.assert_array_equal(table, histogram_table(w))

@@ -30,7 +30,7 @@ def one_slice():
 
 @cache
 def sliced():
-    return encode(scene(), effort=2, slices=1700)
+    return encode(scene(), effort=2, slices=1750)
 
 
 def chunks_of(data):
@@ -101,12 +101,12 @@ def test_utility_decides_what_comes_first():
 
 
 def test_slices_take_what_was_asked_and_the_report_says_so():
-    data, report = encode_with_report(scene(), effort=2, slices=1700)
+    data, report = encode_with_report(scene(), effort=2, slices=1750)
     rows = [row for layer in report.layers for row in layer.slices]
     _, chunks, ends = chunks_of(data)
     assert [row.bytes for row in rows] == [20 + len(payload) for *_, payload in chunks]
-    assert all(row.bytes <= 1700 for row in rows)
-    assert ends[0] <= 1700
+    assert all(row.bytes <= 1750 for row in rows)
+    assert ends[0] <= 1750
     assert [sum(s.anchors for s in layer.slices) for layer in report.layers] == [r.anchors for r in report.layers]
     told = info(data)["layers"]
     assert [s["end"] for row in told for s in row["slices"]] == ends

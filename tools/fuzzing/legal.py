@@ -31,7 +31,6 @@ from vectors.blocks import (
     Scale,
     ancillary,
     coded,
-    gauss,
     make_file,
     make_layer,
     ordered,
@@ -39,7 +38,7 @@ from vectors.blocks import (
 )
 
 from pd4dgs_codec.entropy.positions import position_channels
-from pd4dgs_codec.entropy.priors import Const, Hist, Mixture, Normal, Prior, Window, top_limit
+from pd4dgs_codec.entropy.priors import Const, Gauss, Mixture, Normal, Prior, Window
 from pd4dgs_codec.errors import DecodeError
 from pd4dgs_codec.format.info import hashes
 from pd4dgs_codec.format.planes import residual
@@ -155,28 +154,14 @@ def prior(rng: random.Random, k: np.ndarray, most: int) -> Prior:
     n = min(most, max(2, n))
     least = rng.choice((low, low, low, low - rng.randrange(3), high, K, -K))
     window = Window(max(-K, min(least, K - n + 1)), n)
-    floor = rng.choice((1, 16))
-    family = rng.randrange(3)
-    if family == 0:
-        return replace(gauss(window.kmin, n, floor=floor), normal=_normal(rng, n))
-    if family == 1:
-        return Mixture(window, _normal(rng, n), _normal(rng, n), _near(rng, 1, 255), floor)
-    return _histogram(rng, window)
+    if rng.random() < 0.5:
+        return Gauss(window, _normal(rng, n))
+    return Mixture(window, _normal(rng, n), _normal(rng, n), _near(rng, 1, 255))
 
 
 def _normal(rng: random.Random, n: int) -> Normal:
     offset = rng.choice((0, rng.randint(-128 * n, 128 * n), rng.randint(-(1 << 31), 1 << 31), 1 << 31, -(1 << 31)))
     return Normal(offset + 128 * (n - 1), rng.choice((-640, 1280, rng.randint(-640, 1280), 64 * n.bit_length() - 128)))
-
-
-def _histogram(rng: random.Random, window: Window) -> Hist:
-    step = rng.choice((8, 16, 32, 64))
-    top, differences = _near(rng, 1, top_limit(step)), rng.random() < 0.5
-    numbers = np.random.default_rng(rng.randrange(1 << 32))
-    heights = numbers.integers(0, top, window.n, endpoint=True) * (numbers.random(window.n) < rng.choice((0.1, 1)))
-    heights[rng.randrange(window.n)] = _near(rng, 1, top)
-    mean = 0 if differences else _near(rng, 0, 16 * top)
-    return Hist(window, step, top, differences, _near(rng, 0, 63), mean, heights)
 
 
 # -- slices ------------------------------------------------------------------------------------------------------------

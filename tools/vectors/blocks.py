@@ -24,7 +24,6 @@ from pd4dgs_codec.entropy.priors import (
     FIRST_REUSE,
     Const,
     Gauss,
-    Hist,
     Normal,
     Prior,
     Window,
@@ -100,9 +99,9 @@ def pattern(*shape: int, low: int = -3, high: int = 3, seed: int = 0) -> np.ndar
 
 
 @lru_cache
-def gauss(low: int, n: int, *, si: int = 64, offset: int = 0, floor: int = 1) -> Gauss:
+def gauss(low: int, n: int, *, si: int = 64, offset: int = 0) -> Gauss:
     """A Gaussian prior over n entries from `low`. offset: of its mean from the middle of the window, entries / 256."""
-    return Gauss(Window(low, n), Normal(offset + 128 * (n - 1), si), floor)
+    return Gauss(Window(low, n), Normal(offset + 128 * (n - 1), si))
 
 
 SMALL = gauss(-3, 7)
@@ -121,8 +120,7 @@ def default_prior(symbols: np.ndarray) -> Prior:
     return gauss(min(max(low, -most), most - n + 1), n, si=64 * n.bit_length() - 128)
 
 
-Key = tuple[bytes, bytes]  # definition of a prior, with the classes of a histogram
-Known = list[Key]
+Known = list[bytes]  # definitions of priors
 
 
 def coded(
@@ -134,8 +132,7 @@ def coded(
     some channels, by their number. known: definitions of the slices before, to which those of this section are added.
     """
     block, defined = b"", [] if known is None else known
-    tables, parts = list[tuple[np.ndarray, np.ndarray]](), list[tuple[np.ndarray, Prior]]()
-    used = dict[Key, Prior]()
+    parts, used = list[tuple[np.ndarray, Prior]](), dict[bytes, Prior]()
     for number, channel in enumerate(channels):
         k = np.asarray(channel, np.int64)
         if not k.size:
@@ -145,19 +142,16 @@ def coded(
         inside = (k >= window.kmin) & (k < window.end)
         parameters = bytearray()
         prior.write(parameters)
-        key = bytes([prior.id]) + parameters, np.asarray(getattr(prior, "heights", ())).tobytes()
+        key = bytes([prior.id]) + parameters
         if key in defined:
             block += varint(2 * (FIRST_REUSE + defined[::-1].index(key)) + (not inside.all()))
         else:
             block += varint(2 * prior.id + (not inside.all())) + parameters
             defined.append(key)
-            if isinstance(prior, Hist):
-                tables.append((prior.height_symbols, prior.height_cum))
         if not inside.all():
             block += _exceptions(k, inside, window)
         parts.append((k[inside] - window.kmin, used.setdefault(key, prior)))  # one makes a table for all equal ones
-    tables += [(symbols, prior.cum) for symbols, prior in parts]
-    return block + ans_encode([symbols for symbols, _ in tables], [cum for _, cum in tables])
+    return block + ans_encode([symbols for symbols, _ in parts], [prior.cum for _, prior in parts])
 
 
 def _exceptions(k: np.ndarray, inside: np.ndarray, window: Window) -> bytes:

@@ -40,8 +40,7 @@ from typing import Any
 import numpy as np
 
 import pd4dgs_codec.entropy.priors
-from pd4dgs_codec.entropy.ans import ans_encode
-from pd4dgs_codec.entropy.priors import Const, Hist, Prior, Window
+from pd4dgs_codec.entropy.priors import Const, Prior, Window
 from pd4dgs_codec.format import canonical
 from pd4dgs_codec.format.planes import restore
 
@@ -310,13 +309,6 @@ def predicted(k: np.ndarray, block: Block | None = None, **fields: Any) -> File:
     return with_section(ATTRIBUTES, section, make_file(layer))
 
 
-def histogram(d: int, top: int, count: int, differences: bool, si16: int = 20, m: int = 0) -> Hist:
-    """A histogram from -3 on, the extreme heights at its edges."""
-    heights = pattern(count, low=0, high=top, seed=top)
-    heights[0], heights[1], heights[-1] = 0, min(1, top), top
-    return Hist(Window(-3, count), d, top, differences, si16, m, heights)
-
-
 def tables_at_limit(more: bool = False) -> File:
     """A section of windows of 2^18 entries, and one entry for each of its symbols; one more if so."""
     file = deformed(Scale(32, (1, 1, 1, 1)))
@@ -446,19 +438,6 @@ def steep(prior: Prior, sign: int = 1) -> File:
     """The residuals of `steep_plane` under this prior."""
     residuals = [[-M * sign, 2 * M * sign], [0] * 2, [0] * 2, [0], [0], [0]]
     return make_file(make_layer(), steep_plane(sign=sign).with_sections({PLANE: plain_planes(residuals, {0: prior})}))
-
-
-def hist_codes(prior: Hist, block: bytes | None = None, heights: list[int] | None = None) -> bytes:
-    """Section MASKS of the codes 5, 9, 7. block: instead of the prior's parameters. heights: instead of its symbols in
-    the stream; the codes behind them are written for what they mean, if that is a table at all."""
-    out = bytearray(varint(2 * prior.id))
-    prior.write(out)
-    symbols = prior.height_symbols if heights is None else np.array(heights)
-    meant = np.cumsum(symbols - prior.top) if prior.differences else symbols
-    if not 0 < meant.max() <= prior.top:
-        meant = np.full(prior.window.n, 5)
-    stream = ans_encode([symbols, np.array([2, 6, 4])], [prior.height_cum, replace(prior, heights=meant).cum])
-    return (bytes(out) if block is None else block) + stream
 
 
 def slices_with_classes(go_on: bool) -> File:
