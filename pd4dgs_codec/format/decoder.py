@@ -4,10 +4,9 @@ from collections.abc import Callable, Iterator
 
 from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.errors import DecodeError, Malformed, Truncated, UnsupportedFeature
-from pd4dgs_codec.format.attributes import Past
 from pd4dgs_codec.format.container import CHUNK_OVERHEAD, PREAMBLE_SIZE, Chunk, read_chunk, read_preamble
 from pd4dgs_codec.format.header import Header, scene_id_of, unpack_header
-from pd4dgs_codec.format.payload import Declared, read_layer
+from pd4dgs_codec.format.payload import Declared, Past, read_layer
 from pd4dgs_codec.format.registry import BY_CHUNK_TYPE, LayerKind
 from pd4dgs_codec.format.symbols import GrowingScene, LayerSymbols, SceneSymbols, TakenVoxels, check_slice, merged
 from pd4dgs_codec.scene import Scene

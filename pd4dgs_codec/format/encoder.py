@@ -11,7 +11,6 @@ import numpy as np
 
 from pd4dgs_codec.entropy.fitting import Fitted
 from pd4dgs_codec.errors import DecodeError, EncodeError, LimitExceeded
-from pd4dgs_codec.format.attributes import Past
 from pd4dgs_codec.format.check import ErrorBound, check_scene, rounding_bounds, verify_errors
 from pd4dgs_codec.format.container import (
     CHUNK_OVERHEAD,
@@ -27,7 +26,7 @@ from pd4dgs_codec.format.header import DIGEST_SIZE, Header, pack_header, payload
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.format.metadata import CHUNK_TYPE, Metadata, write_metadata
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
-from pd4dgs_codec.format.payload import StreamReport, write_layer
+from pd4dgs_codec.format.payload import Past, StreamReport, write_layer
 from pd4dgs_codec.format.plan import LeftOut, plan
 from pd4dgs_codec.format.registry import MAX_CHUNKS
 from pd4dgs_codec.format.symbols import LayerSymbols, SceneSymbols, sliced
@@ -208,13 +207,13 @@ def _write_slices(layer: LayerSymbols, options: EncodeOptions, size: float, util
             room = room if number == 1 else left / number / SLACK
         elif least:
             room = max(room, 2 * fixed)
-        tries: list[tuple[bool, int, _Slice, Past[Fitted]]] = []  # fits, anchors, slice, state for the next slice
+        tries: list[tuple[bool, int, _Slice, Past[Fitted]]] = []  # fits, anchors, slice, priors for the next slice
         for _ in range(TRIES):
             expected = (costs[done + 1 :] - costs[done]) * scale + fixed
             likely = int(np.searchsorted(expected, room * SLACK, side="right"))
             count = min(max(likely, least), len(rows) - done)
             trial = past.copy()
-            payload, streams = write_layer(sliced(layer, rows[done : done + count], not found), options, trial, layer)
+            payload, streams = write_layer(sliced(layer, rows[done : done + count], not found), options, trial)
             if count:
                 scale *= max(len(payload) - fixed, 1) / max(expected[count - 1] - fixed, 1)
             fits = len(payload) <= room or count <= least

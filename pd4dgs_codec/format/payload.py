@@ -6,7 +6,8 @@ is one scalar of the anchors' attributes, one channel of a plane (its residuals,
 """
 
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.entropy.tables import entropy_bits
 from pd4dgs_codec.errors import LimitExceeded, Malformed
 from pd4dgs_codec.format import canonical, deformation
-from pd4dgs_codec.format.attributes import Past, by_class, check_classes, read_attributes, write_attributes
+from pd4dgs_codec.format.attributes import by_class, check_classes, read_attributes, write_attributes
 from pd4dgs_codec.format.canonical import Fields
 from pd4dgs_codec.format.deformation import Scale, Shape
 from pd4dgs_codec.format.options import EncodeOptions
@@ -124,6 +125,22 @@ def _check_declared(total: Declared, where: str) -> None:
             raise LimitExceeded(f"{where}: {found} {what} in {size}, limit {limit}")
 
 
+Known = TypeVar("Known", Prior, Fitted)
+
+
+@dataclass(eq=False)
+class Past(Generic[Known]):
+    """Priors of a layer's earlier slices that a later slice may use, by section, in order of definition."""
+
+    positions: list[Known] = field(default_factory=list)
+    masks: list[Known] = field(default_factory=list)
+    attributes: list[Known] = field(default_factory=list)
+
+    def copy(self) -> "Past[Known]":
+        """A copy that grows independently."""
+        return Past(list(self.positions), list(self.masks), list(self.attributes))
+
+
 # -- writing -----------------------------------------------------------------------------------------------------------
 
 
@@ -138,14 +155,11 @@ class StreamReport:
 
 
 def write_layer(
-    symbols: LayerSymbols,
-    options: EncodeOptions,
-    past: Past[Fitted] | None = None,
-    population: LayerSymbols | None = None,
+    symbols: LayerSymbols, options: EncodeOptions, past: Past[Fitted] | None = None
 ) -> tuple[bytes, list[StreamReport]]:
     """Returns (payload of a slice, a report per section, the positions first). The inverse of read_layer.
 
-    past: state of the layer's earlier slices, to which this one is added. population: the whole layer.
+    past: priors of the layer's earlier slices, to which those of this one are added.
     """
     past = past or Past()
     coded = deformation.decorrelate(symbols.tensors, symbols.kind)
@@ -153,7 +167,7 @@ def write_layer(
     if options.mode == "lzma":
         sections |= _write_lzma(symbols, coded, options)
     else:
-        sections |= _write_ans(symbols, coded, options, past, population)
+        sections |= _write_ans(symbols, coded, options, past)
     counts = _counts(symbols, coded)
     reports = [
         StreamReport(section.name.lower(), 8 * len(data), rate_bits, counts[section])
@@ -178,11 +192,7 @@ def _counts(symbols: LayerSymbols, coded: deformation.Decorrelated) -> dict[Sect
 
 
 def _write_ans(
-    symbols: LayerSymbols,
-    coded: deformation.Decorrelated,
-    options: EncodeOptions,
-    past: Past[Fitted],
-    population: LayerSymbols | None,
+    symbols: LayerSymbols, coded: deformation.Decorrelated, options: EncodeOptions, past: Past[Fitted]
 ) -> dict[Section, tuple[bytes, float]]:
     """Returns (bytes, sum of R(a)) by section, only for sections with symbols."""
     sections = {}
@@ -192,9 +202,8 @@ def _write_ans(
         past.masks += found.defined
         sections[Section.MASKS] = found.payload, found.rate_bits
     if symbols.attributes.size:
-        everything = None if population is None else (population.attributes, population.classes)
         sections[Section.ATTRIBUTES] = write_attributes(
-            symbols.attributes, symbols.classes, symbols.widths, options.priors, options.effort, past, everything
+            symbols.attributes, symbols.classes, options.priors, options.effort, past.attributes
         )
     return sections | deformation.write_sections(coded, options)
 
@@ -229,8 +238,8 @@ def read_layer(
 ) -> tuple[LayerSymbols, Declared]:
     """Returns (symbols, sums with this slice) of a payload. Arguments as in read_parameters.
 
-    past: state of the layer's earlier slices, to which this one is added. Raises subclasses of DecodeError; nothing is
-    allocated for a count beyond the limits or the payload.
+    past: priors of the layer's earlier slices, to which those of this one are added. Raises subclasses of DecodeError;
+    nothing is allocated for a count beyond the limits or the payload.
     """
     parameters, start, declared = read_parameters(payload, kind, widths, before, later)
     sections = _Sections(payload, start, parameters.sections, kind)
@@ -285,7 +294,7 @@ def _read_ans(sections: _Sections, parameters: Parameters, past: Past[Prior] | N
     data = sections.take(Section.ATTRIBUTES, rows)
     classes, attributes = NO_CLASSES, np.zeros((widths.channels, 0), np.int32)
     if data:
-        classes, attributes = read_attributes(data, widths, rows, past)
+        classes, attributes = read_attributes(data, widths, rows, past.attributes if past else None)
     return increase, own, classes, attributes, deformation.read_sections(sections.take, parameters.shape)
 
 

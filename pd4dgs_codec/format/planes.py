@@ -11,16 +11,14 @@ from itertools import accumulate
 
 import numpy as np
 
-from pd4dgs_codec.entropy.channels import decode_joined
-from pd4dgs_codec.entropy.tables import BIT, frequency_costs, symbol_counts
+from pd4dgs_codec.entropy.channels import decode_joined, encode_channels
+from pd4dgs_codec.entropy.fitting import histogram
+from pd4dgs_codec.entropy.tables import BIT, entropy_bits, frequency_costs, symbol_counts
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import Malformed, UnsupportedFeature
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, magnitude
 from pd4dgs_codec.format.stages import (
-    PLAIN,
-    STAGED,
     Activity,
-    CodedSection,
     Group,
     Places,
     activity_classes,
@@ -29,12 +27,13 @@ from pd4dgs_codec.format.stages import (
     parts_of,
     read_class_count,
     read_stages,
-    smaller_form,
 )
 
 PlaneShape = tuple[int, int, int]  #: of a plane: channels, rows, columns
 Array = np.ndarray
 
+#: The two forms of the section: all channels as they are, or stages.
+PLAIN, STAGED = 0, 1
 #: Largest difference in cells between the positions of two renderers, which round coordinates differently.
 CELL_SLACK = 0.02
 
@@ -238,14 +237,18 @@ def _filled(k: Array, given: Array, predictor: int) -> Array:
     return np.ascontiguousarray(filled.T).reshape(k.shape)
 
 
-# -- the planes section of mode ans (clause 8.8) -----------------------------------------------------------------------
+# -- the planes section of mode ans (clause 8.6) -----------------------------------------------------------------------
 
 
 def write_planes(residuals: Sequence[np.ndarray], priors: str, effort: int) -> tuple[bytes, float]:
     """Writes residuals int32 [C, H, W] per plane in the smaller form: (section bytes, sum of R(a) of all channels)."""
     channels = [channel.ravel() for plane in residuals for channel in plane]
-    section, rate_bits = smaller_form(lambda: channels, lambda: _write_staged(residuals, effort), priors, effort)
-    return section.data, rate_bits
+    staged = _write_staged(residuals, effort) if priors == "best" and effort > 1 else None
+    if staged and 8 * (len(staged) - 1) <= sum(map(entropy_bits, channels)):  # the plain form is not shorter
+        return staged, sum(histogram(channel).rate_bits for channel in channels if channel.size)
+    plain = encode_channels(channels, priors=priors, effort=effort)
+    section = bytes([PLAIN]) + plain.payload
+    return staged if staged and len(staged) < len(section) else section, plain.rate_bits
 
 
 def read_planes(data: bytes, shapes: Sequence[PlaneShape]) -> list[np.ndarray]:
@@ -265,7 +268,7 @@ def read_planes(data: bytes, shapes: Sequence[PlaneShape]) -> list[np.ndarray]:
     return [plane.reshape(shape) for plane, shape in zip(planes, shapes, strict=True)]
 
 
-def _write_staged(residuals: Sequence[np.ndarray], effort: int) -> CodedSection:
+def _write_staged(residuals: Sequence[np.ndarray], effort: int) -> bytes:
     shapes: list[PlaneShape] = [plane.shape for plane in residuals]
     planes = [plane.reshape(len(plane), -1) for plane in residuals]
     counts, activities = [], [Activity(plane.shape[1]) for plane in planes]

@@ -14,12 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from pd4dgs_codec.archives import Module
 from pd4dgs_codec.data.files import LARGEST, read_vertices
 from pd4dgs_codec.data.posed import points_box
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.runs import PLY, Config, State, iteration, network_of, read_cameras, read_torch, run_of
+from pd4dgs_codec.model.sensitivity import whitening_transform
 from pd4dgs_codec.morton import MAX_VOXEL
 from pd4dgs_codec.scene import MAX_FEATURE, MAX_SLOTS, SCALING_DIM, Network, Scene, SceneInfo, Steps, Widths
 
@@ -55,7 +57,8 @@ class Choices:
 
 
 def read_scaffold_gs(folder: Path, choices: Choices) -> Scene:
-    """Reads a scene with anchors in voxels and all else unquantised. Raises DataError for unsupported models."""
+    """Reads a scene with anchors in voxels, whitened features and all else as it is. Raises DataError for unsupported
+    models."""
     place = _iteration(folder, choices.iteration)
     run = run_of(place)
     config = Config.of(run)
@@ -67,6 +70,7 @@ def read_scaffold_gs(folder: Path, choices: Choices) -> Scene:
         name: _network(name, decoder, place / f"{DECODERS[name]}.pt", widths, embedding, choices)
         for name, decoder in decoders.items()
     }
+    feature, networks = _whitened(table["feature"], networks)
     anchor = table["anchor"]
     voxel = choices.voxel_size or _voxel_size(config)
     voxel = float(np.float32(voxel if voxel > 0 else _grid(anchor, ply)))
@@ -80,7 +84,7 @@ def read_scaffold_gs(folder: Path, choices: Choices) -> Scene:
         layers=(0,),
         rows=(len(anchor),),
         anchor_q=_cells(anchor, voxel, ply),
-        feature=table["feature"],
+        feature=feature,
         scaling_log=table["scaling_log"],
         offset=table["offset"],
         mask=(np.full(len(anchor), 255, np.uint8),),
@@ -211,6 +215,23 @@ def _network(
             raise DataError(f"{path.parent}: colours depend on the picture; {how}")
         w1, b1 = w1[:, :usual], b1 + w1[:, usual:] @ embedding[choices.appearance]
     return (w1.astype(np.float32), b1.astype(np.float32)), (w2, b2)
+
+
+def _whitened(feature: np.ndarray, networks: dict[str, Network]) -> tuple[np.ndarray, dict[str, Network]]:
+    """Transforms features [N, D] so that they cost fewer bits at the same error, and the networks' first layers, which
+    undo it. The errors by direction are those of the first layers."""
+    width = feature.shape[1]
+    reads = np.concatenate([first[0][:, :width] for first, _ in networks.values()]).astype(np.float64)
+    covariance = np.cov(feature.T.astype(np.float64), bias=True).reshape(width, width)
+    if not reads.any():
+        return feature, networks
+    transform = whitening_transform(torch.from_numpy(reads.T @ reads), torch.from_numpy(covariance)).numpy()
+    back = np.linalg.inv(transform)
+    white = dict[str, Network]()
+    for name, ((weights, bias), second) in networks.items():
+        read = np.concatenate([weights[:, :width] @ back, weights[:, width:]], axis=1)
+        white[name] = (read.astype(np.float32), bias), second
+    return (feature @ transform.T).astype(np.float32), white
 
 
 def _grid(anchor: np.ndarray, path: Path) -> float:

@@ -1,6 +1,7 @@
 """How pictures depend on single anchors: the errors of omitting one or rounding its attributes, and a ranking.
 
-These measures decide which anchors leave a layer or a model, their step classes, and their order in slices.
+These measures decide which anchors leave a layer or a model, their step classes, the channels of their features, and
+their order in slices.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from pd4dgs_codec.model.networks import EXACT, Rounding
 from pd4dgs_codec.model.picture import draw, render_image
 from pd4dgs_codec.scene import ATTRIBUTES, Camera, Scene
 
+#: Share of the mean error that every direction has at least, so that invisible directions are scaled within bounds.
+LEAST_ERROR = 0.01
 Viewpoint = tuple[Camera, float]  #: a camera and a normalised time
 
 #: Random pictures of signs per view for each estimate.
@@ -201,3 +204,22 @@ def smaller(camera: Camera) -> Camera:
     width, height = (max(1, round(side * factor)) for side in (camera.width, camera.height))
     scale = np.array([[width / camera.width], [height / camera.height], [1.0]], np.float32)
     return Camera(camera.viewmat, (camera.K * scale).astype(np.float32), width, height)
+
+
+def whitening_transform(errors: Tensor, covariance: Tensor) -> Tensor:
+    """float64 [D, D]: A of features f' = A f, for which a quantisation step costs the same in every channel.
+
+    The networks read few directions of a feature, which are not its channels: rounding causes errors in these
+    directions but costs bits in all. Only linear layers read or change a feature, so they can undo A. With H the
+    errors by direction and C the features' covariance, the bits at a given error are least where H becomes the identity
+    and C diagonal (Goyal, Theoretical foundations of transform coding, 2001). Here A^-T H A^-1 is about a multiple of
+    the identity with the trace of H, and A C A^T is diagonal with falling entries. errors: H, covariance: C, both
+    [D, D], symmetric and positive semidefinite.
+    """
+    floor = LEAST_ERROR * errors.trace() / len(errors) * torch.eye(len(errors)).to(errors)
+    root = torch.linalg.cholesky(errors + floor)
+    back = torch.linalg.inv(root)
+    root = root * ((back @ errors @ back.T).trace() / errors.trace()).sqrt()
+    _, axes = torch.linalg.eigh(root.T @ covariance @ root)
+    found: Tensor = axes.flip(1).T @ root.T
+    return found

@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from pd4dgs_codec.entropy.channels import encode_channels
 from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.format import planes as module
-from pd4dgs_codec.format.planes import read_planes, write_planes
-from pd4dgs_codec.format.stages import PLAIN, STAGED
+from pd4dgs_codec.format.planes import PLAIN, STAGED, read_planes, write_planes
 
 
 def busy(shape: tuple[int, int, int], seed: int = 0) -> np.ndarray:
@@ -33,7 +32,7 @@ def written_in_stages(planes, class_count=None):
     """The section in form 1, even where form 0 is shorter; class_count, if any, instead of the best."""
     choose = module.cheapest_class_count if class_count is None else lambda _: class_count
     with patch.object(module, "cheapest_class_count", choose):
-        return module._write_staged(planes, 1).data
+        return module._write_staged(planes, 1)
 
 
 @pytest.mark.parametrize("channels", [4, 7])

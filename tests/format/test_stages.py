@@ -1,4 +1,4 @@
-"""Stages: magnitudes and classes are those of clause 8.9, on integers; what is put in stages comes back."""
+"""Stages: magnitudes and classes are those of clause 8.7, on integers; what is put in stages comes back."""
 
 import numpy as np
 from hypothesis import given, settings
@@ -82,7 +82,7 @@ def halves(target):
 
 
 def in_halves(symbols):
-    return coded_stages(bytearray(), map(parts_of, halves(symbols)), 1).data
+    return coded_stages(bytearray(), map(parts_of, halves(symbols)), 1)
 
 
 @given(st.lists(st.integers(-2, 2), max_size=20).map(lambda v: v + v))

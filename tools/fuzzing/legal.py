@@ -1,8 +1,8 @@
 """Legal `.pd4` files: the small valid vectors, and files of random choices that no encoder need make.
 
 A random file is made from its symbols: the writer of the vectors says which hashes a decoder must arrive at. Every
-choice that the format leaves is drawn, near its limits more often than not: priors and their parameters, forms, terms,
-splits, classes, predictors, slices, voxels, steps, what may be ignored.
+choice that the format leaves is drawn, near its limits more often than not: priors and their parameters, forms,
+classes, predictors, slices, voxels, steps, what may be ignored.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ from vectors.blocks import (
     POSITIONS,
     SYMBOLS,
     WEIGHTS,
-    Block,
     File,
     Known,
     Layer,
@@ -217,9 +216,7 @@ class Written:
 
     def __init__(self, choices: Choices):
         self.choices, rng = choices, choices.rng
-        self.sections = {name: Section(rng) for name in ("positions", "masks", "plain", *range(8))}
-        self.block: Block | None = None
-        self.of: blocks.Slice | None = None
+        self.sections = {name: Section(rng) for name in ("positions", "masks", "attributes")}
 
     def add(self, layer: Layer) -> Layer:
         """The slice with its anchors coded as chance has it."""
@@ -236,37 +233,13 @@ class Written:
         return layer.with_sections(found)
 
     def _attributes(self, layer: Layer) -> bytes:
-        rng, k, classes, widths = self.choices.rng, layer.attributes, layer.classes, layer.widths
+        rng, k, classes = self.choices.rng, layer.attributes, layer.classes
         grades = b""
         if classes.size:
             section = Section(rng).coded([classes])
             grades = varint(len(section)) + section
-        form = rng.randrange(3)
-        block = _block(rng, widths) if form == 1 else self.block if form == 2 else None
-        if block is None or abs(block.residuals(k, widths)).max() > K:
-            parts = [c[classes == q] for c in k for q in range(7)] if classes.size else list(k)
-            return b"\0" + grades + self.sections["plain"].coded(parts)
-        own = block.residuals(k, widths), classes
-        if form == 1:
-            self.block, self.of = block, own
-        assert self.of is not None
-        stages = blocks.attribute_stages(own, self.of, block, widths)
-        payloads = [self.sections[s].coded(stage) for s, stage in enumerate(stages)]
-        front = bytes([form]) + grades + (block.data(widths) if form == 1 else b"")
-        return front + varint(*map(len, payloads[:-1])) + b"".join(payloads)
-
-
-def _block(rng: random.Random, widths: Widths) -> Block:
-    terms, weight = {}, rng.choice((3, 900, 1 << 15))
-    for c in range(1, widths.predicted):
-        if rng.random() < 0.3:
-            of = sorted(rng.sample(range(c), min(c, rng.choice((1, 1, 2, c)))))
-            terms[c] = [(j, rng.choice((rng.randint(-weight, weight), weight, -weight, 0))) for j in of]
-    centre = rng.choice((2, 2, K))
-    splits = {
-        i: (rng.randrange(4), _near(rng, -centre, centre), _near(rng, -centre, centre)) for i in range(widths.slots)
-    }
-    return Block(terms, splits, [_near(rng, 1, 8) for _ in range(5 + widths.graded)])
+        parts = [c[classes == q] for c in k for q in range(7)] if classes.size else list(k)
+        return grades + self.sections["attributes"].coded(parts)
 
 
 def _lzma(rng: random.Random, layer: Layer) -> dict[int, bytes | None]:

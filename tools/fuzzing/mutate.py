@@ -27,7 +27,7 @@ from pd4dgs_codec.scene import Widths
 
 from .legal import Seed, legal
 
-ATTRIBUTES, PLANES = 2, 3  # sections in stages
+PLANES = 3  # the section that may be in stages
 SECTIONS = 2  # key of the layer parameters
 _POWERS = (7, 8, 12, 14, 15, 16, 20, 21, 22, 23, 24, 26, 28, 31, 32)
 #: Around every limit of the format and every width of an integer.
@@ -228,33 +228,18 @@ def put_together(parts: Parts, header: bytes | None = None) -> bytes:
 
 
 def stages_of(section: bytes, number: int, header: dict[int, Any], meta: dict[int, Any]) -> tuple[bytes, list[bytes]]:
-    """(all before the lengths of the stages, the stages) of a valid section of form 1 or 2, else (the section, [])."""
+    """(all before the lengths of the stages, the stages) of planes in form 1, else (the section, [])."""
     reader = ByteReader(section)
-    form, graded, (feature, slots, _) = reader.byte("a form"), 3 in header, header[15]
-
-    def numbers(count: int) -> list[int]:
-        return [reader.varint(VARINT_MAX, "a number") for _ in range(count)]
-
-    if number == ATTRIBUTES and form in (1, 2):
-        count = 8
-        if graded:
-            reader.take(*numbers(1))
-        if form == 1:
-            for _ in range(1, feature + 6):
-                numbers(2 * numbers(1)[0])
-            numbers(5 + graded)
-            for _ in range(slots):
-                (split,) = numbers(1)
-                numbers((split > 0) + (split > 1))
-    elif number == PLANES and form == 1:
-        fields, widths = canonical.Fields(meta, "layer", set(meta)), Widths(feature, slots)
-        shape, _ = unpack_parameters(fields, LAYER_KINDS[1], widths, (), False, "layer")
-        count = max(1, (shape.scales[0].channels - 1).bit_length())
-        numbers(count - 1)
-    else:
+    if number != PLANES or reader.byte("a form") != 1:
         return section, []
+    fields, widths = canonical.Fields(meta, "layer", set(meta)), Widths(*header[15][:2])
+    shape, _ = unpack_parameters(fields, LAYER_KINDS[1], widths, (), False, "layer")
+    count = max(1, (shape.scales[0].channels - 1).bit_length())
+    for _ in range(count - 1):
+        reader.varint(VARINT_MAX, "a class count")
     block = section[: reader.offset]
-    bounds = list(itertools.accumulate(numbers(count - 1), initial=0))
+    lengths = (reader.varint(VARINT_MAX, "a length") for _ in range(count - 1))
+    bounds = list(itertools.accumulate(lengths, initial=0))
     rest = bytes(reader.rest())
     return block, [rest[start:end] for start, end in itertools.pairwise([*bounds, len(rest)])]
 

@@ -177,39 +177,37 @@ def graded_part(classes: np.ndarray, length: int | None = None) -> bytes:
     return varint(len(section) if length is None else length) + section
 
 
-def plain_attributes(
+def coded_attributes(
     k: np.ndarray,
     priors: Mapping[int, Prior] | None = None,
     known: Known | None = None,
     *,
     classes: np.ndarray = NO_CLASSES,
 ) -> bytes:
-    """Section ATTRIBUTES of int32 [channels, n], form 0 (clause 8.5)."""
+    """Section ATTRIBUTES of int32 [channels, n] (clause 8.5)."""
     channels = [c[classes == q] for c in k for q in range(7)] if classes.size else k
-    return b"\0" + graded_part(classes) + coded(channels, priors, known)
+    return graded_part(classes) + coded(channels, priors, known)
 
 
 def plain_planes(residuals: Iterable[Iterable[int]], priors: Mapping[int, Prior] | None = None) -> bytes:
-    """Section PLANES of the channels of all planes, form 0 (clause 8.8)."""
+    """Section PLANES of the channels of all planes, form 0 (clause 8.6)."""
     return b"\0" + coded(residuals, priors)
 
 
-def relative_magnitude(e: np.ndarray, of: np.ndarray | None = None) -> np.ndarray:
-    """int64 [n] of residuals int64 [m, n]. of: the residuals that N and s_c are taken from (clause 8.9)."""
-    of = e if of is None else of
-    sums = [int(abs(c).sum()) for c in of]
-    parts = (np.minimum(abs(c), s) * 256 * of.shape[1] // (1 + s) for c, s in zip(e, sums, strict=True))
+def relative_magnitude(e: np.ndarray) -> np.ndarray:
+    """int64 [n] of residuals int64 [m, n] (clause 8.7)."""
+    parts = (abs(c) * 256 * e.shape[1] // (1 + int(abs(c).sum())) for c in e)
     return sum(parts, np.zeros(e.shape[1], np.int64))
 
 
-def classes_by_activity(activity: np.ndarray, count: int, of: np.ndarray | None = None) -> np.ndarray:
-    """Class 0 .. count − 1 of each place. of: the activity that the bounds are taken from (clause 8.9)."""
-    of = activity if of is None else of
-    return np.searchsorted(np.sort(of)[[i * len(of) // count for i in range(1, count)]], activity, side="right")
+def classes_by_activity(activity: np.ndarray, count: int) -> np.ndarray:
+    """Class 0 .. count − 1 of each place (clause 8.7)."""
+    bounds = np.sort(activity)[[i * len(activity) // count for i in range(1, count)]]
+    return np.searchsorted(bounds, activity, side="right")
 
 
 def classes_of_plane(e: np.ndarray, count: int) -> np.ndarray:
-    """Class [H·W] of each cell, by residuals int64 [m, H, W] of the stages before (clause 8.8)."""
+    """Class [H·W] of each cell, by residuals int64 [m, H, W] of the stages before (clause 8.6)."""
     _, height, width = e.shape
     size = relative_magnitude(e.reshape(len(e), -1)).reshape(height, width)
     i, j = np.indices((height, width))
@@ -231,13 +229,9 @@ def staged(
     lengths: Lengths = lambda sizes: sizes,
     tail: bytes = b"",
     priors: StagePriors | None = None,
-    known: Sequence[Known] | None = None,
 ) -> bytes:
     """The lengths of all stages but the last, then the stages. lengths: the stated ones, from the true ones."""
-    payloads = [
-        coded(stage, (priors or {}).get(number), known[number] if known else None)
-        for number, stage in enumerate(stages)
-    ]
+    payloads = [coded(stage, (priors or {}).get(number)) for number, stage in enumerate(stages)]
     return varint(*lengths([len(p) for p in payloads[:-1]])) + b"".join(payloads) + tail
 
 
@@ -248,12 +242,12 @@ def staged_planes(
     tail: bytes = b"",
     priors: StagePriors | None = None,
 ) -> bytes:
-    """Section PLANES of residuals int32 [C, H, W], form 1 (clause 8.8). counts: classes of the stages from 1 on."""
+    """Section PLANES of residuals int32 [C, H, W], form 1 (clause 8.6). counts: classes of the stages from 1 on."""
     return b"\1" + varint(*counts) + staged(plane_stages(planes, counts), lengths, tail, priors)
 
 
 def plane_stages(planes: Sequence[np.ndarray], counts: Sequence[int]) -> list[list[np.ndarray]]:
-    """The channels of the stages of clause 8.8."""
+    """The channels of the stages of clause 8.6."""
     stages = []
     for stage in range(max(1, (len(planes[0]) - 1).bit_length())):
         first, end, channels = (1 << stage if stage else 0), 2 << stage, list[np.ndarray]()
@@ -264,83 +258,6 @@ def plane_stages(planes: Sequence[np.ndarray], counts: Sequence[int]) -> list[li
                 channels += _split(channel.ravel(), classes, count)
         stages.append(channels)
     return stages
-
-
-@dataclass(frozen=True)
-class Block:
-    """A prediction block (clause 8.6). terms: channel -> (channel, weight) ascending. splits: Gaussian -> (f, a, b).
-    classes: class counts of the stages that are split by activity."""
-
-    terms: Mapping[int, Sequence[tuple[int, int]]] = field(default_factory=dict)
-    splits: Mapping[int, tuple[int, int, int]] = field(default_factory=dict)
-    classes: Sequence[int] = (1,) * 5
-
-    def data(self, widths: Widths = DEFAULT_WIDTHS, counts: Mapping[int, int] | None = None) -> bytes:
-        """Items 1 to 3 of clause 8.6. counts: stated numbers of terms instead of the true ones."""
-        out = b""
-        for c in range(1, widths.predicted):
-            own = self.terms.get(c, ())
-            out += varint((counts or {}).get(c, len(own)))
-            for last, (j, w) in zip([-1, *(j for j, _ in own)], own, strict=False):
-                out += varint(j - last - 1) + zigzag(w)
-        out += varint(*self.classes)
-        for i in range(widths.slots):
-            flags, a, b = self.splits.get(i, (0, 0, 0))
-            out += varint(flags) + (zigzag(a) if flags else b"") + (zigzag(b) if flags & 2 else b"")
-        return out
-
-    def residuals(self, k: np.ndarray, widths: Widths = DEFAULT_WIDTHS) -> np.ndarray:
-        """int64 [channels, n] of attributes int32 [channels, n]: the predicted ones less their prediction (8.7)."""
-        e = k.astype(np.int64)
-        for c in range(1, widths.predicted):
-            total = sum((w * k[j].astype(np.int64) for j, w in self.terms.get(c, ())), np.zeros_like(e[c]))
-            e[c] -= total + 512 >> 10
-        return e
-
-
-Slice = tuple[np.ndarray, np.ndarray]  # attributes or residuals, and step classes
-
-
-def attribute_stages(own: Slice, of: Slice, block: Block, widths: Widths) -> list[list[np.ndarray]]:
-    """The channels of the eight stages of clause 8.7. own: residuals of this slice. of: of the block's slice."""
-    e, p, graded, stages = own[0], widths.predicted, bool(own[1].size), list[list[np.ndarray]]()
-    bounds = [p * a // 38 for a in (0, 6, 12, 20, 29, 38)]
-    for stage, count in enumerate(block.classes if graded else (1, *block.classes)):
-        first = bounds[stage]
-        measured, by = (
-            np.concatenate([*[(64 >> g.astype(np.int64))[None]] * 4, x[:first]]) if graded else x[:first]
-            for x, g in (own, of)
-        )
-        activity, measure = relative_magnitude(measured, by), relative_magnitude(by)
-        classes = classes_by_activity(activity, count, measure)
-        channels = e[first : bounds[stage + 1]] if stage < 5 else e[p::3]
-        stages.append([part for channel in channels for part in _split(channel, classes, count)])
-    ys, zs = list[np.ndarray](), list[np.ndarray]()
-    for i in range(widths.slots):
-        x, y, z = e[p + 3 * i : p + 3 * i + 3]
-        flags, a, b = block.splits.get(i, (0, 0, 0))
-        ys += _split(y, np.minimum(abs(x - a), 4), 5) if flags & 1 else [y]
-        zs += _split(z, np.minimum(abs(x - a) + abs(y - b), 6), 7) if flags & 2 else [z]
-    return [*stages, ys, zs]
-
-
-def predicted_attributes(
-    k: np.ndarray,
-    block: Block,
-    *,
-    widths: Widths = DEFAULT_WIDTHS,
-    classes: np.ndarray = NO_CLASSES,
-    lengths: Lengths = lambda sizes: sizes,
-    tail: bytes = b"",
-    known: Sequence[Known] | None = None,
-    of: Slice | None = None,
-) -> bytes:
-    """Section ATTRIBUTES of int32 [channels, n], form 1, or form 2 with the attributes and step classes of the slice
-    that the block stands in as `of` (clauses 8.5 to 8.9). lengths, tail: see `staged`."""
-    own = block.residuals(k, widths), classes
-    before = own if of is None else (block.residuals(of[0], widths), of[1])
-    front = b"\2" + graded_part(classes) if of else b"\1" + graded_part(classes) + block.data(widths)
-    return front + staged(attribute_stages(own, before, block, widths), lengths, tail, known=known)
 
 
 # -- LZMA sections (clause 9) ------------------------------------------------------------------------------------------
@@ -532,7 +449,7 @@ def _sections(layer: Layer, mode: int) -> dict[int, bytes | None]:
         return sections | {SYMBOLS: lzma_symbols(channels, stream=lzma2.packed) if some else None}
     return sections | {
         MASKS: coded([layer.rises, layer.codes]) if layer.rises.size or n else None,
-        ATTRIBUTES: plain_attributes(layer.attributes, classes=layer.classes) if n else None,
+        ATTRIBUTES: coded_attributes(layer.attributes, classes=layer.classes) if n else None,
         PLANE: plain_planes(layer.flat) if layer.flat else None,
         WEIGHTS: coded(w.ravel() for w in layer.weights) if layer.weights else None,
     }
@@ -549,26 +466,16 @@ class Slices:
 
     positions: Known = field(default_factory=list)
     masks: Known = field(default_factory=list)
-    plain: Known = field(default_factory=list)
-    stages: list[Known] = field(default_factory=lambda: [[] for _ in range(8)])
-    block: Block = field(default_factory=Block)
-    of: Slice | None = None  #: attributes and step classes of the slice that the block stands in
+    attributes: Known = field(default_factory=list)
 
-    def add(self, layer: Layer, block: Block | None = None, go_on: bool = False) -> Layer:
-        """The slice as it is written: with a block in form 1, with go_on in form 2, else in form 0."""
-        k, classes, sections = layer.attributes, layer.classes, dict[int, bytes | None]()
+    def add(self, layer: Layer) -> Layer:
+        """The slice as it is written."""
+        sections = dict[int, bytes | None]()
         if layer.rises.size or layer.codes.size:
             sections[MASKS] = coded([layer.rises, layer.codes], known=self.masks)
         if layer.codes.size:
             sections[POSITIONS] = positions(layer.cells, self.positions)
-            if block or go_on:
-                of = self.of if go_on else None
-                self.block, self.of = block or self.block, of or (k, classes)
-                sections[ATTRIBUTES] = predicted_attributes(
-                    k, self.block, widths=layer.widths, classes=classes, known=self.stages, of=of
-                )
-            else:
-                sections[ATTRIBUTES] = plain_attributes(k, known=self.plain, classes=classes)
+            sections[ATTRIBUTES] = coded_attributes(layer.attributes, known=self.attributes, classes=layer.classes)
         return layer.with_sections(sections)
 
 

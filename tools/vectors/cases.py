@@ -53,13 +53,13 @@ from .blocks import (
     SMALL,
     SYMBOLS,
     WEIGHTS,
-    Block,
     File,
     Layer,
     Scale,
     Slices,
     Vector,
     coded,
+    coded_attributes,
     constant,
     gauss,
     graded_part,
@@ -69,7 +69,6 @@ from .blocks import (
     make_file,
     make_layer,
     pattern,
-    plain_attributes,
     plain_planes,
     staged_planes,
     varint,
@@ -259,15 +258,10 @@ def deformed(*scales: Scale, number: int = 1, **fields: Any) -> File:
     return make_file(make_layer(), make_layer(number, (), before=1, scales=scales, **fields))
 
 
-def slices_of(*parts: Any) -> File:
-    """A file of slices that go on with those before. A part: a slice of form 0; (slice, block), of form 1; or (slice,
-    None), of form 2."""
-    written, layers = dict[int, Slices](), list[Layer]()
-    for part in parts:
-        layer, *block = part if isinstance(part, tuple) else (part,)
-        slices = written.setdefault(layer.number, Slices())
-        layers.append(slices.add(layer, *block, go_on=block == [None]))
-    return make_file(*layers)
+def slices_of(*parts: Layer) -> File:
+    """A file of slices, which refer to the priors of those before."""
+    written = dict[int, Slices]()
+    return make_file(*[written.setdefault(layer.number, Slices()).add(layer) for layer in parts])
 
 
 def with_meta(file: File, chunk: int, fields: dict[int, Any], sections: Any = None) -> File:
@@ -291,7 +285,7 @@ def with_section(number: int, data: bytes, file: File, chunk: int = 0) -> File:
 def with_priors(priors: dict[int, Any], k: np.ndarray | None = None) -> File:
     """40 anchors, whose attributes are coded under these priors, by channel."""
     k = pattern(68, ROWS) if k is None else k
-    return with_section(ATTRIBUTES, plain_attributes(k, priors), rows(ROWS, attributes=k))
+    return with_section(ATTRIBUTES, coded_attributes(k, priors), rows(ROWS, attributes=k))
 
 
 def of_highs(*highs: int) -> np.ndarray:
@@ -300,13 +294,6 @@ def of_highs(*highs: int) -> np.ndarray:
     for c, high in enumerate(highs):
         k[c] = pattern(ROWS, low=-high, high=high, seed=c)
     return k
-
-
-def predicted(k: np.ndarray, block: Block | None = None, **fields: Any) -> File:
-    """Layer 0 in form 1."""
-    layer = make_layer(0, line(k.shape[1]), attributes=k, **fields)
-    section = blocks.predicted_attributes(k, block or Block(), widths=layer.widths, classes=layer.classes)
-    return with_section(ATTRIBUTES, section, make_file(layer))
 
 
 def tables_at_limit(more: bool = False) -> File:
@@ -336,7 +323,7 @@ def tables_of_slices(over: int) -> File:
         k = np.full((68, 1), number, np.int32)
         layer = later(0, line(1, z=4), attributes=k) if number else make_layer(0, line(1), attributes=k)
         priors = {c: gauss(min(c, count - 1) - 20, n) for c in range(68)}
-        layers.append(layer.with_sections({ATTRIBUTES: plain_attributes(k, priors, known)}))
+        layers.append(layer.with_sections({ATTRIBUTES: coded_attributes(k, priors, known)}))
     return make_file(*layers)
 
 
@@ -448,8 +435,8 @@ def slices_with_classes(go_on: bool) -> File:
     part = coded([[6, 0, 3]], {} if go_on else {0: gauss(0, 2 << 10)}, known if go_on else None)
     first = make_layer(0, line(3), attributes=pattern(68, 3), classes=[0, 3, 6])
     second = later(0, line(3, z=2), attributes=pattern(68, 3, seed=1), classes=[6, 0, 3])
-    rest = second.sections[ATTRIBUTES][1 + len(graded_part(second.classes)) :]
-    return make_file(first, second.with_sections({ATTRIBUTES: b"\0" + varint(len(part)) + part + rest}))
+    rest = second.sections[ATTRIBUTES][len(graded_part(second.classes)) :]
+    return make_file(first, second.with_sections({ATTRIBUTES: varint(len(part)) + part + rest}))
 
 
 def costly(which: int) -> File:

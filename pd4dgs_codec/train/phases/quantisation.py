@@ -1,10 +1,7 @@
 """Fitting of the scene to its quantisation, where planes and weights begin to be rounded: whitening and step classes.
 
-Whitening transforms the features so that a quantisation step costs the same in every channel. The networks read few
-directions of a feature, which are not its channels: rounding causes errors in these directions but costs bits in all.
-Only linear layers read or change a feature, so they can undo any invertible transform of its channels. With H
-the mean Gauss-Newton matrix of the pictures by an anchor's feature and C the features' covariance, the bits at a given
-error are least where H becomes the identity and C diagonal (Goyal, Theoretical foundations of transform coding, 2001).
+Whitening transforms the features so that a quantisation step costs the same in every channel, see
+`sensitivity.whitening_transform`. Its H is the mean Gauss-Newton matrix of the pictures by an anchor's feature.
 
 Step classes give coarser steps to anchors that pictures depend on little. The error of a step differs a thousandfold
 between anchors, and neither position nor size predicts it, so it is measured. Each next class doubles the steps, which
@@ -21,7 +18,7 @@ from torch import Tensor
 
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.networks import Rounding
-from pd4dgs_codec.model.sensitivity import attribute_slopes, rounding_error
+from pd4dgs_codec.model.sensitivity import attribute_slopes, rounding_error, whitening_transform
 from pd4dgs_codec.scene import MASK_THRESHOLD, MAX_CLASS, SCAFFOLD_NETWORKS
 from pd4dgs_codec.train import phases, workers
 from pd4dgs_codec.train.optimiser import Optimiser
@@ -32,8 +29,6 @@ from pd4dgs_codec.train.state import TrainingView, TrainState
 VIEWS = 16
 #: Halvings of the interval in which the threshold of the classes is searched.
 HALVINGS = 40
-#: Share of the mean error that every direction has at least, so that invisible directions are scaled within bounds.
-LEAST_ERROR = 0.01
 
 
 class FitQuantisation(phases.Phase):
@@ -128,19 +123,6 @@ def _measured(model: Model, levels: Sequence[int], views: Sequence[TrainingView]
         return None
     scaled = model.feature.detach()[active].double() / model.spacing[active, None]
     return whitening_transform(errors, torch.cov(scaled.T)).cpu()
-
-
-def whitening_transform(errors: Tensor, covariance: Tensor) -> Tensor:
-    """float64 [D, D]: A of features f' = A f. A^-T errors A^-1, the errors in the new channels, is about a multiple of
-    the identity with the trace of `errors`, and A covariance A^T is diagonal with falling entries. Both arguments are
-    [D, D], symmetric and positive semidefinite."""
-    floor = LEAST_ERROR * errors.trace() / len(errors) * torch.eye(len(errors)).to(errors)
-    root = torch.linalg.cholesky(errors + floor)
-    back = torch.linalg.inv(root)
-    root = root * ((back @ errors @ back.T).trace() / errors.trace()).sqrt()
-    _, axes = torch.linalg.eigh(root.T @ covariance @ root)
-    found: Tensor = axes.flip(1).T @ root.T
-    return found
 
 
 def _feature_error(model: Model, *viewpoint: Any, **options: Any) -> tuple[Tensor, Tensor, Tensor]:
