@@ -52,7 +52,7 @@ def limited(value, high, what, low=0):
 
 
 # 15 Errors and security: "UnsupportedFeature is an integer of whatever size and sign that is not a registered mode,
-# form of a section, predictor, network or prior family"
+# form of the planes, predictor, network or prior family"
 def registered(value, known, what):
     need(type(value) is int, f"{what} is not an integer")
     need(value in known, f"{what} is {value}, which is not registered", "UnsupportedFeature")
@@ -372,22 +372,18 @@ def check_slice(flags, number, kind, following):
     need(not following or (flags >> 1 & 1) == (following[0] == kind), f"flags {flags:#x} before layers {following}")
 
 
-class Past:
-    """What a slice may refer to of its layer's slices before it: priors by section and stage, the prediction block."""
-
-    def __init__(self):
-        self.priors, self.block = {}, None
-
-    def of(self, *section):
-        return self.priors.setdefault(section, [])
+# 8 Coded channels: "Three prior lists begin with the priors that the earlier slices of the layer have defined in the
+# same list: those of section 0, of section 1 and of the channels of 11.2 in section 2."
+SHARED = (POSITIONS, MASKS, ATTRIBUTE_SECTION)
 
 
 class Layer:
     """What one slice of a layer says: symbols {name: [int]} in the order of clause 12.4, and what dequantisation
     needs."""
 
-    def __init__(self, number, later, rows_before, below, header, past):
-        self.number, self.later, self.rows_before, self.header, self.past = number, later, rows_before, header, past
+    def __init__(self, number, later, rows_before, below, header, known):
+        self.number, self.later, self.rows_before, self.header = number, later, rows_before, header
+        self.known = known  # the prior lists that later slices go on with, by section
         self.below = below  # the scales of the layers before it
         self.rises = 0 if later else rows_before
         self.slices = [self]  # those of its layer, if it is the first
@@ -396,8 +392,8 @@ class Layer:
 
 
 # 6.1 Layout: "The lengths of the sections MUST sum to the rest exactly."
-def read_layer(payload, number, later, before, below, header, past):
-    layer = Layer(number, later, before[0], below, header, past)
+def read_layer(payload, number, later, before, below, header, known):
+    layer = Layer(number, later, before[0], below, header, known)
     reader = Reader(payload)
     parameters = reader.take(limited(reader.number("<I"), 4096, "the parameters' length"))
     read_parameters(layer, unpack(parameters))
@@ -517,12 +513,12 @@ def read_sections(layer, parts):
         need(section in parts or not count, f"section {section} is missing")
         return parts.pop(section, b"") if count else b""
 
-    planes, weights, past = plane_shapes(layer), weight_shapes(layer), layer.past
+    planes, weights, known = plane_shapes(layer), weight_shapes(layer), layer.known
     counts = {MASKS: [layer.rises, layer.rows], ATTRIBUTE_SECTION: []}
     counts[ATTRIBUTE_SECTION] = [layer.rows] * (channel_count(layer.header) + (3 in layer.header))
     counts[PLANE_SECTION] = [h * w for _, _, (c, h, w) in planes for _ in range(c)]
     counts[WEIGHTS] = [size for _, size in weights]
-    positions = decode_positions(part(POSITIONS, layer.rows), layer.rows, past.of(POSITIONS))
+    positions = decode_positions(part(POSITIONS, layer.rows), layer.rows, known[POSITIONS])
     channels = {}
     if layer.header[2] == 1:
         flat = [count for section in counts for count in counts[section]]
@@ -534,11 +530,11 @@ def read_sections(layer, parts):
         for section, sizes in counts.items():
             data = part(section, sum(sizes))
             if section == ATTRIBUTE_SECTION and sum(sizes):
-                channels[section] = decode_attributes(data, *layer.header[15][:2], layer.rows, past, 3 in layer.header)
+                channels[section] = decode_attributes(data, sizes, 3 in layer.header, known[section])
             elif section == PLANE_SECTION and sizes:
                 channels[section] = decode_planes(data, [shape for _, _, shape in planes])
             else:
-                channels[section] = decode_channels(data, sizes, past.of(section))
+                channels[section] = decode_channels(data, sizes, known.get(section))
     need(not parts, f"sections {sorted(parts)} are present for 0 symbols")
     keep_symbols(layer, positions, channels, planes, weights)
 
@@ -732,109 +728,36 @@ def take_channel(stream, count, prior, exceptions):
     return [exceptions[at] if at in exceptions else next(inside) for at in range(count)]
 
 
-# 8.5 The attributes section: "Section 2 begins with a u8, the form." "the prediction block (8.6), then eight sections
-# of coded channels, the stages 0..7 (8.7)" "the lengths (8.9) of stages 0..6, then the stages 0..7, with the prediction
-# block of the latest earlier slice of form 1; Malformed if the layer has none"
-# 8.7 Stages of the attributes: "The activity of a row is the relative magnitude (8.9) of the residuals named, with the
-# n rows as places." "Form 2 takes N, the sums s_c (also that of the step classes) and the bounds (8.9) from the slice"
-# 8.7 Stages of the attributes: "With b_s = (P·a_s) // 38, where a_1 .. a_5 are 6, 12, 20, 29 and 38"
-def decode_attributes(data, feature, slots, n, past, graded):
-    reader, p = Reader(data), feature + 6
-    form = read_form(reader, 3)
-    grades = [decode_grades(reader, n)] if graded else []
-    if form == 0:
-        one, known = grades[0] if graded else [0] * n, past.of(ATTRIBUTE_SECTION)
-        return grades + decode_classes(reader.take(reader.left), [one] * (p + 3 * slots), 7 if graded else 1, known)
-    if form == 1:
-        past.block = read_block(reader, p, slots, graded)
-    need(past.block, "no earlier slice has a prediction block")
-    terms, class_counts, splits, scales = past.block
-    own = [[64 >> c for c in grades[0]]] * 4 if graded else []  # four times the relative magnitude of one
-    *stages, stage_y, stage_z = take_stages(reader, 8)
-    known = [past.of(ATTRIBUTE_SECTION, stage) for stage in range(8)]
-    k = []  # r_0 .. r_(P − 1), then x_0 .. x_(G − 1)
-    ends = [p * a // 38 for a in (6, 12, 20, 29, 38)] + [p + slots]
-    for s, (stage, end, class_count) in enumerate(zip(stages, ends, class_counts if graded else [1, *class_counts])):
-        if s not in scales:  # the slice that the block stands in
-            scales[s] = n, channel_sums(own + k), class_bounds(relative_magnitude(own + k, n), class_count)
-        places, sums, bounds = scales[s]
-        classes = classes_within(bounds, relative_magnitude(own + k, n, places, sums))
-        k += decode_classes(stage, [classes] * (end - len(k)), class_count, known[s])
-    residuals, x = k[:p], k[p:]
-    y = decode_classes(stage_y, [y_classes(split, *each) for split, *each in zip(splits, x)], 5, known[6])
-    z = decode_classes(stage_z, [z_classes(split, *each) for split, *each in zip(splits, x, y)], 7, known[7])
-    return grades + add_predictions(residuals, terms) + [channel for offset in zip(x, y, z) for channel in offset]
+# 8.5 The attributes section: "Without header key 3, section 2 is one section of coded channels: the channels of 11.2,
+# of n symbols each." "to the end of section 2, the section of the channels of 11.2. Each of them is coded as seven
+# channels: for each step class 0..6 in order, the symbols of the rows of that class, in row order."
+def decode_attributes(data, sizes, graded, known):
+    """The step classes if there are any, then the channels of 11.2; sizes: of all these."""
+    if not graded:
+        return decode_channels(data, sizes, known)
+    reader = Reader(data)
+    grades = decode_grades(reader, sizes[0])
+    return [grades, *decode_classes(reader.take(reader.left), [grades] * (len(sizes) - 1), 7, known)]
 
 
-# 8.5 The attributes section: "a varint, the length in bytes of their section of coded channels, at most the bytes left
-# in section 2, the varint's own included; then this section, with one channel of n symbols."
+# 8.5 The attributes section: "a varint, the length in bytes of the section of the step classes (11.2), at most the
+# bytes left in section 2, the varint's own included; then this section, with one channel of n symbols."
 def decode_grades(reader, n):
     (grades,) = decode_channels(reader.take(reader.varint(reader.left)), [n])
     return step_classes(grades)
 
 
-# 8.5 The attributes section: "Each symbol MUST lie in 0..6, else Malformed."
+# 8.5 The attributes section: "Each symbol MUST lie in 0..6, else Malformed"
 def step_classes(symbols):
     need(all(0 <= c <= 6 for c in symbols), "a step class over 6")
     return symbols
 
 
-# 8.5 The attributes section: "Other forms are UnsupportedFeature."
-# 8.8 The planes section: "Other forms are UnsupportedFeature."
-def read_form(reader, forms=2):
-    form = reader.byte()
-    need(form < forms, f"form {form} of a section", "UnsupportedFeature")
-    return form
-
-
-# 8.6 Prediction block: "The block holds, without gaps"
-def read_block(reader, p, slots, graded):
-    """(terms, class counts, splits, what the classes of each stage are measured by, empty)."""
-    terms = [read_terms(reader, p, c) for c in range(1, p)]
-    class_counts = [read_class_count(reader) for _ in range(5 + graded)]
-    return terms, class_counts, [read_split(reader) for _ in range(slots)], {}
-
-
-# 8.6 Prediction block: "a varint m ≤ c, then m times a varint g ≤ P and a zigzag weight w, |w| ≤ 2^15. The term
-# refers to channel j = j' + 1 + g, where j' is the channel of the term before, −1 for the first; so the j ascend. j
-# MUST be less than c, else Malformed"
-def read_terms(reader, p, c):
-    """[(channel, weight)] of channel c."""
-    terms, j = [], -1
-    for _ in range(reader.varint(c)):
-        j += 1 + reader.varint(p)
-        need(j < c, f"channel {c} is predicted from channel {j}")
-        terms.append((j, reader.zigzag(1 << 15)))
-    return terms
-
-
-# 8.6 Prediction block: "a varint f ≤ 3. Bit 0: y_i is split, by x_i. Bit 1: z_i is split, by x_i and y_i. If f >
-# 0, a zigzag centre a_i of x_i follows; if bit 1 is set, then a zigzag centre b_i of y_i; |a_i| and |b_i| ≤ K"
-def read_split(reader):
-    """(y is split, z is split, a, b) of a Gaussian."""
-    f = reader.varint(3)
-    a = reader.zigzag(K) if f else 0
-    return f & 1, f >> 1, a, reader.zigzag(K) if f >> 1 else 0
-
-
-# 8.7 Stages of the attributes: "min(|x_i − a_i|, 4) for y_i, classes 0..4"
-def y_classes(split, x):
-    """The class of each row; 0 if y is not split."""
-    is_split, _, a, _ = split
-    return [is_split * min(abs(v - a), 4) for v in x]
-
-
-# 8.7 Stages of the attributes: "min(|x_i − a_i| + |y_i − b_i|, 6) for z_i, classes 0..6"
-def z_classes(split, x, y):
-    _, is_split, a, b = split
-    return [is_split * min(abs(v - a) + abs(w - b), 6) for v, w in zip(x, y)]
-
-
-# 8.7 Stages of the attributes: "A channel that is split is coded as one channel per class 0, 1, .. in order, each with
-# the symbols of the rows of that class, in row order."
+# 8.6 The planes section: "it is coded as one channel per class (8.7), ascending, each with the residuals of the cells
+# of that class in row-major order."
 # 8 Coded channels: "Channels of length 0 leave no trace."
 def decode_classes(data, classes, class_count, known=None):
-    """The channels of a stage, given the class of each place of each; a channel that is not split is all class 0."""
+    """The channels of a section, given the class of each place of each."""
     parts = map(iter, decode_channels(data, [own.count(q) for own in classes for q in range(class_count)], known))
     channels = []
     for own in classes:
@@ -843,25 +766,13 @@ def decode_classes(data, classes, class_count, known=None):
     return channels
 
 
-# 8.7 Stages of the attributes: "k_c = r_c + ((Σ w·k_j + 512) >> 10)" "Every k_c MUST lie in −K..K, else Malformed"
-def add_predictions(residuals, terms):
-    k = residuals[:1]
-    for own, r in zip(terms, residuals[1:]):
-        sums = [512] * len(r)
-        for j, w in own:
-            sums = [s + w * v for s, v in zip(sums, k[j])]
-        k.append([v + (s >> 10) for v, s in zip(r, sums)])
-        need(all(abs(v) <= K for v in k[-1]), "a predicted symbol over K")
-    return k
-
-
-# 8.8 The planes section: "Stage 0 codes the plane channels 0 and 1, stage s ≥ 1 the plane channels 2^s .. 2^(s+1) − 1,
+# 8.6 The planes section: "Stage 0 codes the plane channels 0 and 1, stage s ≥ 1 the plane channels 2^s .. 2^(s+1) − 1,
 # as far as they exist. A stage codes plane by plane in the order of the plain form, in each plane its plane channels,
-# ascending, in each plane channel its classes, ascending."
+# ascending." "Other forms are UnsupportedFeature."
 def decode_planes(data, shapes):
     """The residuals, channel by channel in the order of the plain form; shapes: (channels, height, width) of each."""
     reader, channels = Reader(data), shapes[0][0]
-    if read_form(reader) == 0:
+    if registered(reader.byte(), (0, 1), "the form of the planes") == 0:
         return decode_channels(reader.take(reader.left), [h * w for c, h, w in shapes for _ in range(c)])
     number = max(1, (channels - 1).bit_length())
     class_counts = [read_class_count(reader) for _ in range(number - 1)]
@@ -876,8 +787,8 @@ def decode_planes(data, shapes):
     return [channel for e in planes for channel in e]
 
 
-# 8.8 The planes section: "The activity of cell (i, j), row i and column j, is the sum, over the nine cells (clip(i + a,
-# 0, H − 1), clip(j + b, 0, W − 1)) with a and b in −1..1, of their relative magnitudes (8.9) in the residuals of the
+# 8.6 The planes section: "The activity of cell (i, j), row i and column j, is the sum, over the nine cells (clip(i + a,
+# 0, H − 1), clip(j + b, 0, W − 1)) with a and b in −1..1, of their relative magnitudes (8.7) in the residuals of the
 # plane's channels in the stages before, with the plane's cells as places."
 def cell_activity(channels, h, w):
     magnitude = relative_magnitude(channels, h * w)
@@ -886,14 +797,14 @@ def cell_activity(channels, h, w):
     return [sum(magnitude[i * w + j] for i in near_i for j in near_j) for near_i in rows for near_j in columns]
 
 
-# 8.9 Classes by activity: "A class count is a varint 1..8 (0 is Malformed)."
+# 8.7 Classes by activity: "A class count is a varint 1..8 (0 is Malformed)."
 def read_class_count(reader):
     count = reader.varint(8)
     need(count, "a class count of 0")
     return count
 
 
-# 8.9 Classes by activity: "Lengths are varints, each the number of bytes of a stage, at most the bytes left in the
+# 8.7 Classes by activity: "Lengths are varints, each the number of bytes of a stage, at most the bytes left in the
 # section, the varint's own included; their sum MUST NOT exceed the bytes that follow the last length, else Malformed.
 # The last stage takes the rest, to the section's end."
 def take_stages(reader, number):
@@ -901,37 +812,22 @@ def take_stages(reader, number):
     return [reader.take(size) for size in sizes] + [reader.take(reader.left)]
 
 
-# 8.9 Classes by activity: "Σ over channels c of (min(|e_c[p]|, s_c) · 256·N) // (1 + s_c)"
-def relative_magnitude(channels, n, places=None, sums=None):
-    """Of each of the n places; places and sums: N and s_c of another slice, if it is theirs that count."""
-    if sums is None:
-        places, sums = n, channel_sums(channels)
+# 8.7 Classes by activity: "Σ over channels c of (|e_c[p]| · 256·N) // (1 + s_c), s_c the sum over places q of |e_c[q]|"
+def relative_magnitude(channels, n):
+    """Of each of the n places."""
     magnitude = [0] * n
-    for e, s in zip(channels, sums):
-        magnitude = [m + min(abs(v), s) * 256 * places // (1 + s) for m, v in zip(magnitude, e)]
+    for e in channels:
+        s = sum(abs(v) for v in e)
+        magnitude = [m + abs(v) * 256 * n // (1 + s) for m, v in zip(magnitude, e)]
     return magnitude
 
 
-# 8.9 Classes by activity: "s_c the sum over places q of |e_c[q]|"
-def channel_sums(channels):
-    return [sum(abs(v) for v in e) for e in channels]
-
-
-# 8.9 Classes by activity: "let A be the activities in ascending order. The bounds are A[(i·N) // C] for i in 1 .. C −
-# 1"
-def class_bounds(activity, class_count):
-    ascending = sorted(activity)
-    return [ascending[i * len(ascending) // class_count] for i in range(1, class_count)]
-
-
-# 8.9 Classes by activity: "the class of a place is the number of bounds that are at most its activity."
-def classes_within(bounds, activity):
-    return [bisect_right(bounds, value) for value in activity]
-
-
-# 8.9 Classes by activity: "With C = 1 every place has class 0."
+# 8.7 Classes by activity: "let A be the activities in ascending order. The bounds are A[(i·N) // C] for i in 1 .. C −
+# 1, and the class of a place is the number of bounds that are at most its activity."
 def classes_by_activity(activity, class_count):
-    return classes_within(class_bounds(activity, class_count), activity)
+    ascending = sorted(activity)
+    bounds = [ascending[i * len(ascending) // class_count] for i in range(1, class_count)]
+    return [bisect_right(bounds, value) for value in activity]
 
 
 # 9.3 LZMA2: "A stream is a list of chunks, each behind its control byte, and ends with the control byte 0."
@@ -1297,7 +1193,8 @@ def decode(data, max_layer=None):
             number, following = len(layers[-1].slices) if later else 0, [k for k, _ in header[1][i + 1 :] if k < 3]
             check_slice(flags, number, kind, following)
             below = [scale for own in layers for scale in own.scales]
-            read = read_layer(payload, kind, later, declared, below, header, layers[-1].past if later else Past())
+            known = layers[-1].known if later else {section: [] for section in SHARED}
+            read = read_layer(payload, kind, later, declared, below, header, known)
             if later:
                 add_slice(layers[-1], read)
             else:
