@@ -41,14 +41,13 @@ export function decodeLayer(payload, kind, before, continuation, later) {
   const parameters = readParameters(payload, kind, before, later);
   const { rows, sections, scales, networks } = parameters;
   const { positions, masks, attributes: section, planes, weights } = sections;
-  const known = continuation.definitions("positions");
-  const voxels = positions ? decodePositions(positions, rows, known) : new Int32Array(0);
+  const voxels = positions ? decodePositions(positions, rows, continuation.positions) : new Int32Array(0);
   const codes = new Int32Array(earlierRows + rows);
-  if (masks) decodeChannels(masks, [earlierRows, rows], codes, continuation.definitions("masks"));
+  if (masks) decodeChannels(masks, [earlierRows, rows], codes, continuation.masks);
   checkRange(codes.subarray(0, earlierRows), 0, MOST_CODE, "a rise of a mask code");
   checkRange(codes.subarray(earlierRows), LEAST_OWN_CODE, MOST_CODE, "a mask code");
   const none = { stepClasses: new Int32Array(0), attributes: new Int32Array(0) };
-  const { stepClasses, attributes } = section ? decodeAttributes(section, rows, kind, continuation) : none;
+  const { stepClasses, attributes } = section ? decodeAttributes(section, rows, kind, continuation.attributes) : none;
   checkRange(attributes, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of an attribute");
   return {
     kind,

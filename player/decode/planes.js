@@ -1,21 +1,16 @@
-// Clauses 8.8 and 11.3: the planes section, and samples from its residuals.
+// Clauses 8.6, 8.7 and 11.3: the planes section, and samples from its residuals.
 
 import { ByteReader } from "./bytes.js";
+import { channelsOf, decodeSplit, groupByClass } from "./classes.js";
 import { malformed, unsupported } from "./errors.js";
-import { MAX_SYMBOL } from "./limits.js";
-import {
-  activityBounds,
-  addRelativeMagnitudes,
-  channelsOf,
-  decodeStage,
-  groupByActivity,
-  readClassCount,
-  readStages,
-} from "./stages.js";
+import { MAX_CLASSES, MAX_SYMBOL } from "./limits.js";
+/** @import { Groups } from "./classes.js" */
 /** @import { PlaneShape } from "./parameters.js" */
 
 /** How many predictors 11.3 has. */
 export const PREDICTORS = 4;
+/** Relative magnitudes of residuals below this come from a table. */
+const LOOKED_UP = 256;
 
 /**
  * The samples of each plane.
@@ -28,7 +23,7 @@ export function decodePlanes(bytes, shapes) {
   const form = reader.byte("the form of the planes");
   const planes = shapes.map(({ channels, height, width }) => new Int32Array(channels * height * width));
   const all = planes.map((plane, i) => channelsOf(plane, shapes[i].channels));
-  if (form === 0) decodeStage(reader.rest(), all.flat(), all.flat().map(() => null));
+  if (form === 0) decodeSplit(reader.rest(), all.flat(), all.flat().map(() => null));
   else if (form === 1) decodeStaged(reader, shapes, all);
   else throw unsupported(`form ${form} of the planes`);
   all.forEach((channels, i) => channels.forEach((channel) => restore(channel, shapes[i])));
@@ -49,22 +44,86 @@ function decodeStaged(reader, shapes, all) {
     const classCount = classCounts[stage];
     /** @type {Int32Array[]} */
     const targets = [];
-    /** @type {(import("./stages.js").Groups | null)[]} */
+    /** @type {(Groups | null)[]} */
     const groups = [];
     shapes.forEach(({ height, width }, i) => {
-      const activity = classCount > 1 ? sumOfNine(magnitudes[i], height, width) : null;
-      const own = activity && groupByActivity(activity, activityBounds(activity, classCount));
+      const own = classCount > 1 ? groupByActivity(sumOfNine(magnitudes[i], height, width), classCount) : null;
       for (const target of all[i].slice(first, end)) {
         targets.push(target);
         groups.push(own);
       }
     });
-    decodeStage(stages[stage], targets, groups);
+    decodeSplit(stages[stage], targets, groups);
     if (!classCounts.slice(stage + 1).some((later) => later > 1)) continue;
     all.forEach((plane, i) => {
       for (const residuals of plane.slice(first, end)) addRelativeMagnitudes(residuals, magnitudes[i]);
     });
   }
+}
+
+/** @param {ByteReader} reader */
+function readClassCount(reader) {
+  const count = reader.varint(MAX_CLASSES, "a class count");
+  if (!count) throw malformed("a class count of 0");
+  return count;
+}
+
+/**
+ * The stages: the lengths of all but the last, then their bytes, to the section's end.
+ *
+ * @param {ByteReader} reader @param {number} count
+ * @returns {Uint8Array[]} [count]
+ */
+function readStages(reader, count) {
+  const lengths = [];
+  let sum = 0;
+  for (let i = 1; i < count; i++) {
+    const length = reader.varint(reader.remaining, "the length of a stage");
+    lengths.push(length);
+    sum += length;
+  }
+  const rest = reader.rest();
+  if (sum > rest.length) throw malformed(`stages of ${sum} bytes or more, ${rest.length} bytes are left`);
+  let at = 0;
+  const stages = lengths.map((length) => rest.subarray(at, (at += length)));
+  return [...stages, rest.subarray(at)];
+}
+
+/** Adds the relative magnitude of each cell in one channel to `sums`. @param {Int32Array} residuals
+ * @param {Float64Array} sums */
+function addRelativeMagnitudes(residuals, sums) {
+  const n = residuals.length;
+  let total = 1;
+  let largest = 0;
+  for (let p = 0; p < n; p++) {
+    const e = Math.abs(residuals[p]);
+    total += e;
+    largest = Math.max(largest, e);
+  }
+  const factor = 256 * n;
+  if (largest * factor > Number.MAX_SAFE_INTEGER) {
+    for (let p = 0; p < n; p++) sums[p] += Number((BigInt(Math.abs(residuals[p])) * BigInt(factor)) / BigInt(total));
+    return;
+  }
+  // The quotient of two integers below 2^53, rounded to binary64, does not reach the next integer: the floor is exact.
+  const known = new Float64Array(Math.min(largest + 1, LOOKED_UP));
+  for (let e = 0; e < known.length; e++) known[e] = Math.floor((e * factor) / total);
+  for (let p = 0; p < n; p++) {
+    const e = Math.abs(residuals[p]);
+    sums[p] += e < LOOKED_UP ? known[e] : Math.floor((e * factor) / total);
+  }
+}
+
+/** Groups cells by activity into classes of about equal size. @param {Float64Array} activity @param {number} count */
+function groupByActivity(activity, count) {
+  const n = activity.length;
+  const ascending = activity.slice().sort();
+  const classes = new Uint8Array(n);
+  for (let i = 1; i < count; i++) {
+    const bound = ascending[Math.floor((i * n) / count)];
+    for (let p = 0; p < n; p++) if (activity[p] >= bound) classes[p]++;
+  }
+  return groupByClass(classes, count);
 }
 
 /** Per cell the sum over the nine cells around it; beyond the border the border's cells count again.

@@ -1,32 +1,21 @@
 // Clauses 3.6, 8 and 12.2: state from slice to slice of a layer, and the order of their rows.
 
-/**
- * What later slices of a layer may refer to: the priors of each section, by its name or the number of a stage, and the
- * latest prediction block.
- */
+/** What later slices of a layer may refer to: the priors of each section, in their order. */
 export class Continuation {
   constructor() {
-    /** @type {Map<string | number, import("./channels.js").Prior[]>} */
-    this._sections = new Map();
-    /** @type {import("./attributes.js").Block | null} */
-    this.block = null;
-  }
-
-  /** @param {string | number} section */
-  definitions(section) {
-    let known = this._sections.get(section);
-    if (!known) this._sections.set(section, (known = []));
-    return known;
+    /** @type {import("./channels.js").Prior[]} */
+    this.positions = [];
+    /** @type {import("./channels.js").Prior[]} */
+    this.masks = [];
+    /** @type {import("./channels.js").Prior[]} of the channels of 11.2 */
+    this.attributes = [];
   }
 
   /** Returns a function that undoes later additions: a damaged slice may be fetched again. */
   mark() {
-    const { block } = this;
-    const sizes = new Map([...this._sections].map(([name, priors]) => [name, priors.length]));
-    return () => {
-      this.block = block;
-      for (const [name, priors] of this._sections) priors.length = sizes.get(name) ?? 0;
-    };
+    const lists = [this.positions, this.masks, this.attributes];
+    const sizes = lists.map((priors) => priors.length);
+    return () => lists.forEach((priors, i) => (priors.length = sizes[i]));
   }
 }
 
