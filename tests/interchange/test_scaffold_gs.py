@@ -138,6 +138,28 @@ def test_imported_scene_encodes_and_keeps_its_anchors(tmp_path):
     np.testing.assert_allclose(back.anchor[order[0]], theirs.anchor[order[1]], atol=1e-6)
 
 
+@pytest.mark.parametrize("silent", [False, True])
+def test_features_are_whitened(tmp_path, silent):
+    """Channels mixed from five sources become independent ones, which take fewer bytes; decoders without weights have
+    no say in it."""
+    theirs, rng = Checkpoint(2), np.random.default_rng(2)
+    n = len(theirs.anchor)
+    mixed = rng.normal(size=(n, 5)) @ rng.normal(size=(5, F)) + rng.normal(size=(n, F)) / 9
+    theirs.feature = mixed.astype(np.float32)
+    if silent:
+        for module in (theirs.opacity, theirs.cov, theirs.color):
+            torch.nn.init.zeros_(module[0].weight)
+    scene = read_scaffold_gs(theirs.write(tmp_path), Choices())
+    if silent:
+        np.testing.assert_array_equal(np.sort(scene.feature, axis=0), np.sort(theirs.feature, axis=0))
+        return
+    correlation = np.corrcoef(scene.feature.T) - np.eye(F)
+    assert np.abs(correlation).max() < 1e-3 < 0.5 < np.abs(np.corrcoef(theirs.feature.T) - np.eye(F)).max()
+    steps = scene.steps.feature
+    entropy = [np.log2(1 + feature.std(axis=0) / steps).sum() for feature in (scene.feature, theirs.feature)]
+    assert entropy[0] < 0.8 * entropy[1]
+
+
 def test_run_files_give_voxel_background_and_camera(tmp_path):
     theirs = Checkpoint(voxel=0.02)
     theirs.write(tmp_path)
