@@ -53,7 +53,7 @@ class _Exceptions:
 
 
 def check_channels(channels: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Returns the channels as int32 [N]. Raises EncodeError unless each is a 1-D integer array, |k| <= 2**24 - 1."""
+    """Returns the channels as int32 [N]. Raises EncodeError unless each is a 1-D integer array, |k| <= 2**24."""
     checked = []
     for index, channel in enumerate(channels):
         array = np.asarray(channel)
@@ -70,7 +70,7 @@ def check_channels(channels: Sequence[np.ndarray]) -> list[np.ndarray]:
 def encode_channels(
     channels: Sequence[np.ndarray], *, priors: str = "best", effort: int = 5, known: Sequence[Fitted] = ()
 ) -> CodedChannels:
-    """Encodes int32 channels (1-D, any lengths, |k| <= 2**24 - 1) into one payload.
+    """Encodes int32 channels (1-D, any lengths, |k| <= 2**24) into one payload.
 
     priors: "gauss" allows only const and gauss, the model of R(a). "best" allows every prior, and keeps the smaller
     result of both if the payload has less than 4 kB or the estimate for Gaussians alone comes close.

@@ -420,41 +420,6 @@ def assign(costs: np.ndarray, prices: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 @_compiled
-def split_cost(channels: np.ndarray, classes: np.ndarray, count: int) -> Any:
-    """Order-0 entropy, in 2^-20 bits, of channels int64 [m, n], each split by the `count` classes int64 [n]."""
-    n, cost = channels.shape[1], np.int64(0)
-    sizes = np.zeros(count, np.int64)
-    for i in range(n):
-        sizes[classes[i]] += 1
-    for channel in channels:
-        low, high = channel[0], channel[0]
-        for i in range(n):
-            low, high = min(low, channel[i]), max(high, channel[i])
-        width = high - low + 1
-        if count * width > 16 * n + 4096:  # too wide to count in place
-            for k in range(count):
-                part = np.sort(channel[classes == k])
-                run = 0
-                for i in range(len(part)):
-                    run += 1
-                    if i + 1 == len(part) or part[i + 1] != part[i]:
-                        cost += run * frequency_cost(run)
-                        run = 0
-        else:
-            seen = np.zeros((count, width), np.int64)
-            for i in range(n):
-                seen[classes[i], channel[i] - low] += 1
-            for k in range(count):
-                for i in range(width):
-                    if seen[k, i] > 0:
-                        cost += seen[k, i] * frequency_cost(seen[k, i])
-        for k in range(count):
-            if sizes[k] > 0:
-                cost -= sizes[k] * frequency_cost(sizes[k])
-    return cost
-
-
-@_compiled
 def gaussian_bits(values: np.ndarray, counts: np.ndarray) -> Any:
     """Sum of R(a) = -log2(Phi((k + 1/2 - mu) / sigma) - Phi((k - 1/2 - mu) / sigma)) over values k int64 [U] that occur
     counts [U] times, in bits.

@@ -83,11 +83,6 @@ def pool(histograms: Sequence[Histogram]) -> Histogram:
     return Histogram(*symbol_counts(np.concatenate(values), np.concatenate(counts)))
 
 
-def split_bits(channels: np.ndarray, classes: np.ndarray, count: int) -> float:
-    """Order-0 entropy in bits of channels int64 [m, n], each split by the `count` classes int64 [n] of its elements."""
-    return float(loops().split_cost(channels, classes, count)) / BIT
-
-
 def costs_of(histograms: Sequence[Histogram], priors: Sequence[Fitted]) -> np.ndarray:
     """Cost of coding each histogram's symbols under each prior, int64 [histograms, priors]; see `cost_matrix`."""
     windows = [p.prior.window for p in priors]

@@ -24,7 +24,7 @@ _SIGNED: list[np.dtype] = [np.dtype("<i1"), np.dtype("<i2"), np.dtype("<i4")]
 
 
 def encode_channels_lzma(channels: Sequence[np.ndarray], *, effort: int = 5) -> bytes:
-    """Encodes int32 channels (1-D, |k| <= 2**24 - 1). effort: 1..9, settings to try. Raises EncodeError."""
+    """Encodes int32 channels (1-D, |k| <= 2**24). effort: 1..9, settings to try. Raises EncodeError."""
     head, numbers = bytearray(), list[np.ndarray]()
     for array in check_channels(channels):
         if len(array):

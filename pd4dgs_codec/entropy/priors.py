@@ -25,7 +25,7 @@ from pd4dgs_codec.entropy.tables import (
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
 from pd4dgs_codec.errors import Malformed, UnsupportedFeature
 
-K_MAX = (1 << 24) - 1  #: |k| of any symbol
+K_MAX = 1 << 24  #: |k| of any symbol
 MAX_WINDOW = 1 << 14
 #: Most entries of all tables that a section defines, beyond one per symbol: without and with earlier priors. They bound
 #: memory: eight bytes can define a table of 2**14 entries, 128 KiB, in each section of each slice.

@@ -10,8 +10,8 @@ from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.entropy.tables import entropy_bits
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import Malformed
+from pd4dgs_codec.format.classes import Places
 from pd4dgs_codec.format.quantise import NO_CLASSES
-from pd4dgs_codec.format.stages import Places
 from pd4dgs_codec.scene import MAX_CLASS, Widths
 
 

@@ -5,7 +5,7 @@ N = k[i-1, j] and NW = k[i-1, j-1], and the residual k - prediction is coded. In
 column 0 W and NW are taken equal to N, and at (0, 0) all three are 0 (clause 11.3). All arithmetic is on integers.
 """
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 
@@ -13,27 +13,17 @@ import numpy as np
 
 from pd4dgs_codec.entropy.channels import decode_joined, encode_channels
 from pd4dgs_codec.entropy.fitting import histogram
-from pd4dgs_codec.entropy.tables import BIT, entropy_bits, frequency_costs, symbol_counts
+from pd4dgs_codec.entropy.tables import BIT, frequency_costs, symbol_counts
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
-from pd4dgs_codec.errors import Malformed, UnsupportedFeature
+from pd4dgs_codec.errors import Malformed
+from pd4dgs_codec.format.classes import Places, activity_classes, relative_magnitude
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, magnitude
-from pd4dgs_codec.format.stages import (
-    Activity,
-    Group,
-    Places,
-    activity_classes,
-    cheapest_class_count,
-    coded_stages,
-    parts_of,
-    read_class_count,
-    read_stages,
-)
 
 PlaneShape = tuple[int, int, int]  #: of a plane: channels, rows, columns
 Array = np.ndarray
 
-#: The two forms of the section: all channels as they are, or stages.
-PLAIN, STAGED = 0, 1
+#: Channel 2 and all that follow are split into this many classes of cells.
+CLASSES = 8
 #: Largest difference in cells between the positions of two renderers, which round coordinates differently.
 CELL_SLACK = 0.02
 
@@ -57,11 +47,6 @@ def _median(w: Array, n: Array, nw: Array) -> Array:
     return median
 
 
-def _restore_left(r: Array) -> Array:
-    r[:, :, 0] = np.cumsum(r[:, :, 0], axis=1)
-    return np.cumsum(r, axis=2)
-
-
 def _restore_up(r: Array) -> Array:
     r[:, 0, :] = np.cumsum(r[:, 0, :], axis=1)
     return np.cumsum(r, axis=1)
@@ -69,15 +54,13 @@ def _restore_up(r: Array) -> Array:
 
 #: Predictors by their id in the bitstream. On time planes "up" is the previous instant.
 PREDICTORS: dict[int, Predictor] = {
-    0: Predictor("none", lambda w, n, nw: np.zeros_like(w), lambda r: r),
-    1: Predictor("left", lambda w, n, nw: w, _restore_left),
-    2: Predictor("up", lambda w, n, nw: n, _restore_up),
-    3: Predictor("median", _median),
+    0: Predictor("up", lambda w, n, nw: n, _restore_up),
+    1: Predictor("median", _median),
 }
 
 
 def residual(predictor: int, k: Array) -> Array:
-    """Returns residuals of samples k, both int32 [C, H, W], under PREDICTORS[predictor]. They may exceed MAX_SYMBOL."""
+    """Returns residuals of samples k, both int32 [C, H, W], under PREDICTORS[predictor]: up to 2 MAX_SYMBOL = K_MAX."""
     w, n, nw = np.zeros_like(k), np.zeros_like(k), np.zeros_like(k)
     w[:, :, 1:], n[:, 1:, :], nw[:, 1:, 1:] = k[:, :, :-1], k[:, :-1, :], k[:, :-1, :-1]
     n[:, 0, :] = nw[:, 0, :] = w[:, 0, :]
@@ -161,19 +144,11 @@ def _scan_together(planes: Sequence[Array]) -> list[Array]:
 
 
 def choose_predictor(k: Array) -> tuple[int, Array, float]:
-    """Returns (id, int32 residuals, estimated bits) of the cheapest predictor with residuals within MAX_SYMBOL."""
-    bits, predictor, _, r = min(_candidates((predictor, k) for predictor in PREDICTORS), key=lambda found: found[0])
-    return predictor, r, bits
-
-
-def _candidates(planes: Iterable[tuple[int, Array]]) -> Iterator[tuple[float, int, Array, Array]]:
-    """Yields (estimated bits, predictor, samples, residuals) of each (predictor, samples) within MAX_SYMBOL. Predictor
-    0 always is, because its residuals are the samples."""
-    for predictor, k in planes:
-        if magnitude(k) <= MAX_SYMBOL:
-            r = residual(predictor, k)
-            if magnitude(r) <= MAX_SYMBOL:
-                yield _estimated_bits(r), predictor, k, r
+    """Returns (id, int32 residuals, estimated bits) of the cheapest predictor for samples k int32 [C, H, W]."""
+    found = [(predictor, residual(predictor, k)) for predictor in PREDICTORS]
+    bits = [_estimated_bits(r) for _, r in found]
+    best = int(np.argmin(bits))
+    return *found[best], bits[best]
 
 
 def _estimated_bits(residuals: Array) -> float:
@@ -213,9 +188,9 @@ def fill_plane(k: Array, given: Array) -> tuple[Array, float]:
     under the predictor that then codes the plane cheapest. Returns (samples, estimated bits saved)."""
     if given.all():
         return k, 0.0
-    filled = _candidates((predictor, _filled(k, given, predictor)) for predictor in PREDICTORS)
-    bits, _, samples, _ = min(filled, key=lambda found: found[0])
-    return samples, choose_predictor(k)[2] - bits
+    filled = [_filled(k, given, predictor) for predictor in PREDICTORS]
+    bits = [_estimated_bits(residual(predictor, x)) for predictor, x in zip(PREDICTORS, filled, strict=True)]
+    return filled[int(np.argmin(bits))], choose_predictor(k)[2] - min(bits)
 
 
 def _filled(k: Array, given: Array, predictor: int) -> Array:
@@ -233,59 +208,44 @@ def _filled(k: Array, given: Array, predictor: int) -> Array:
         if end > first:
             at = slice(first, end)
             x[cell[at]] = PREDICTORS[predictor].predict(x[west[at]], x[north[at]], x[corner[at]]) if cell[first] else 0
-    filled: Array = np.clip(x, -1 - MAX_SYMBOL, 1 + MAX_SYMBOL).astype(np.int32)
-    return np.ascontiguousarray(filled.T).reshape(k.shape)
+    return np.ascontiguousarray(x.astype(np.int32).T).reshape(k.shape)
 
 
-# -- the planes section of mode ans (clause 8.6) -----------------------------------------------------------------------
+# -- the planes section of mode ans (clauses 8.6 and 8.7) --------------------------------------------------------------
 
 
-def write_planes(residuals: Sequence[np.ndarray], priors: str, effort: int) -> tuple[bytes, float]:
-    """Writes residuals int32 [C, H, W] per plane in the smaller form: (section bytes, sum of R(a) of all channels)."""
-    channels = [channel.ravel() for plane in residuals for channel in plane]
-    staged = _write_staged(residuals, effort) if priors == "best" and effort > 1 else None
-    if staged and 8 * (len(staged) - 1) <= sum(map(entropy_bits, channels)):  # the plain form is not shorter
-        return staged, sum(histogram(channel).rate_bits for channel in channels if channel.size)
-    plain = encode_channels(channels, priors=priors, effort=effort)
-    section = bytes([PLAIN]) + plain.payload
-    return staged if staged and len(staged) < len(section) else section, plain.rate_bits
+def write_planes(residuals: Sequence[Array], priors: str, effort: int) -> tuple[bytes, float]:
+    """Writes residuals int32 [C, H, W] per plane: (section bytes, sum of R(a) of all channels)."""
+    planes = [plane.reshape(len(plane), -1) for plane in residuals]
+    payloads = [
+        encode_channels(
+            [part for channels, places in stage for part in places.parts(channels)], priors=priors, effort=effort
+        ).payload
+        for stage in _stages(planes, [plane.shape for plane in residuals])
+    ]
+    out = bytearray()
+    for payload in payloads[:-1]:
+        put_varint(out, len(payload))
+    return bytes(out) + b"".join(payloads), sum(histogram(c).rate_bits for plane in planes for c in plane)
 
 
-def read_planes(data: bytes, shapes: Sequence[PlaneShape]) -> list[np.ndarray]:
+def read_planes(data: bytes, shapes: Sequence[PlaneShape]) -> list[Array]:
     """Reads residuals int32 [C, H, W] per plane, the inverse of write_planes. shapes: checked against the limits."""
     reader = ByteReader(data)
-    form = reader.byte("the form of the planes")
-    if form == PLAIN:
-        symbols = decode_joined(reader.rest(), [h * w for c, h, w in shapes for _ in range(c)])
-        ends = accumulate(c * h * w for c, h, w in shapes)
-        return [symbols[end - c * h * w : end].reshape(c, h, w) for (c, h, w), end in zip(shapes, ends, strict=True)]
-    if form != STAGED:
-        raise UnsupportedFeature(f"form {form} of the planes, expected {PLAIN} or {STAGED}")
     number = _stage_count(shapes)
-    counts = [read_class_count(reader, stage) for stage in range(1, number)]
+    lengths = [reader.varint(reader.remaining, f"the length of stage {stage}") for stage in range(number - 1)]
+    rest = reader.rest()
+    if sum(lengths) > len(rest):
+        raise Malformed(f"stages of {sum(lengths)} bytes or more, {len(rest)} bytes are left")
+    bounds = [0, *accumulate(lengths), len(rest)]
     planes = [np.zeros((c, h * w), np.int32) for c, h, w in shapes]
-    read_stages(reader, number, _groups(planes, shapes, counts))
+    for stage, groups in enumerate(_stages(planes, shapes)):
+        counts = [count for channels, places in groups for count in places.sizes * len(channels)]
+        symbols, end = decode_joined(rest[bounds[stage] : bounds[stage + 1]], counts), 0
+        for channels, places in groups:
+            first, end = end, end + channels.size
+            places.put(symbols[first:end], channels)
     return [plane.reshape(shape) for plane, shape in zip(planes, shapes, strict=True)]
-
-
-def _write_staged(residuals: Sequence[np.ndarray], effort: int) -> bytes:
-    shapes: list[PlaneShape] = [plane.shape for plane in residuals]
-    planes = [plane.reshape(len(plane), -1) for plane in residuals]
-    counts, activities = [], [Activity(plane.shape[1]) for plane in planes]
-    for stage in range(_stage_count(shapes)):
-        first, end = _bounds(stage)
-        if stage:
-            groups = [
-                (plane[first:end], _around(activity.now, shape))
-                for plane, activity, shape in zip(planes, activities, shapes, strict=True)
-            ]
-            counts.append(cheapest_class_count(groups))
-        for plane, activity in zip(planes, activities, strict=True):
-            activity.add(plane[first:end])
-    out = bytearray([STAGED])
-    for count in counts:
-        put_varint(out, count)
-    return coded_stages(out, map(parts_of, _groups(planes, shapes, counts)), effort)
 
 
 def _stage_count(shapes: Sequence[PlaneShape]) -> int:
@@ -293,27 +253,22 @@ def _stage_count(shapes: Sequence[PlaneShape]) -> int:
     return max(1, (shapes[0][0] - 1).bit_length())
 
 
-def _bounds(stage: int) -> tuple[int, int]:
-    """Returns the first channels of a stage and of the next stage."""
-    return (1 << stage if stage else 0), 2 << stage
-
-
-def _groups(planes: Sequence[np.ndarray], shapes: Sequence[PlaneShape], counts: Sequence[int]) -> Iterator[list[Group]]:
-    """Yields the groups of each stage, one per plane. planes: int32 [C, H * W], read only as far as earlier stages
-    reach."""
-    activities = [Activity(plane.shape[1]) for plane in planes]
-    for stage, count in enumerate((1, *counts)):
-        first, end = _bounds(stage)
-        groups: list[Group] = []
+def _stages(planes: Sequence[Array], shapes: Sequence[PlaneShape]) -> Iterator[list[tuple[Array, Places]]]:
+    """Yields (channels int32 [m, H * W], order of their places) per plane for each stage, which is decoded before the
+    next. planes: int32 [C, H * W], read only as far as earlier stages reach."""
+    activities = [np.zeros(plane.shape[1]) for plane in planes]
+    for stage in range(_stage_count(shapes)):
+        first, end = (1 << stage if stage else 0), 2 << stage
+        groups: list[tuple[Array, Places]] = []
         for plane, activity, shape in zip(planes, activities, shapes, strict=True):
             places = Places.whole(plane.shape[1])
-            if count > 1:
-                places = Places.by(activity_classes(_around(activity.now, shape), count), count)
+            if stage:
+                places = Places.by(activity_classes(_around(activity, shape), CLASSES), CLASSES)
             groups.append((plane[first:end], places))
         yield groups
-        if any(later > 1 for later in counts[stage:]):
+        if end < len(planes[0]):
             for plane, activity in zip(planes, activities, strict=True):
-                activity.add(plane[first:end])
+                activity += relative_magnitude(plane[first:end])
 
 
 def _around(activity: np.ndarray, shape: PlaneShape) -> np.ndarray:

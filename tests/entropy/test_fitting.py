@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from pd4dgs_codec.entropy import channels, fit_kernels, fitting
 from pd4dgs_codec.entropy.channels import encode_channels
 from pd4dgs_codec.entropy.fitting import fit_best, histogram, pool
-from pd4dgs_codec.entropy.tables import BIT, entropy_bits
+from pd4dgs_codec.entropy.tables import BIT
 
 
 def _channel(seed: int) -> np.ndarray:
@@ -113,17 +113,6 @@ def test_channels_share_a_prior_only_if_that_saves_bits():
     assert owner.tolist() == [0, 1, 2] and total == 30
 
 
-def test_the_cost_of_classes_is_their_entropy(interpreted):
-    rng = np.random.default_rng(0)
-    for spread, count in ((1, 1), (3, 5), (1 << 20, 3)):
-        channels = (rng.integers(-9, 9, (4, 700)) * spread).astype(np.int32)  # the type that encoders compile
-        classes = rng.integers(0, count, 700)
-        expected = sum(entropy_bits(channel[classes == k]) for channel in channels for k in range(count))
-        cost = fit_kernels.split_cost(channels, classes, count)
-        assert cost == interpreted.split_cost(channels, classes, count)
-        assert cost / BIT == pytest.approx(expected, rel=1e-6)
-
-
 def test_pooled_histograms_count_all_symbols():
     for spread in (1, 1 << 20):
         parts = [symbols * spread for symbols in CHANNELS[:4]]
@@ -150,7 +139,7 @@ def exact_bits(symbols: list[int]) -> float:
 
 
 @settings(max_examples=40)
-@given(st.lists(st.integers(-200, 200) | st.integers(-(2**24) + 1, 2**24 - 1), min_size=1, max_size=30))
+@given(st.lists(st.integers(-200, 200) | st.integers(-(2**24), 2**24), min_size=1, max_size=30))
 def test_agrees_with_mpmath(symbols):
     rate = histogram(np.array(symbols, dtype=np.int32)).rate_bits
     assert rate == pytest.approx(exact_bits(symbols), rel=1e-8, abs=1e-8)

@@ -1,8 +1,8 @@
 """Legal `.pd4` files: the small valid vectors, and files of random choices that no encoder need make.
 
 A random file is made from its symbols: the writer of the vectors says which hashes a decoder must arrive at. Every
-choice that the format leaves is drawn, near its limits more often than not: priors and their parameters, forms,
-classes, predictors, slices, voxels, steps, what may be ignored.
+choice that the format leaves is drawn, near its limits more often than not: priors and their parameters, step classes,
+predictors, slices, voxels, steps, what may be ignored.
 """
 
 from __future__ import annotations
@@ -40,13 +40,12 @@ from pd4dgs_codec.entropy.positions import position_channels
 from pd4dgs_codec.entropy.priors import Const, Gauss, Mixture, Normal, Prior, Window
 from pd4dgs_codec.errors import DecodeError
 from pd4dgs_codec.format.info import hashes
-from pd4dgs_codec.format.planes import residual
 from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import SCAFFOLD_NETWORKS, Widths, plane_shapes
 
 VECTORS = Path(__file__).resolve().parents[2] / "spec" / "vectors"
 LARGEST_SEED = 6000  #: bytes of a vector: larger ones decode slowly
-M, K, V = 1 << 23, (1 << 24) - 1, 1 << 20  #: largest symbol of a value, of a channel, and voxel index
+M, K, V = 1 << 23, 1 << 24, 1 << 20  #: largest symbol of a value, of a channel, and voxel index
 LEAST, LARGEST = 2.0**-126, (2.0 - 2.0**-23) * 2.0**127
 TO_INFINITY = 2.0**128 - 2.0**103
 
@@ -288,12 +287,8 @@ def _tensors(rng: random.Random, layer: Layer) -> dict[int, bytes | None]:
     found: dict[int, bytes | None] = {WEIGHTS: Section(rng).coded(layer.weights)} if layer.weights else {}
     if not layer.flat:
         return found
-    if rng.random() < 0.4:
-        return found | {PLANE: b"\0" + Section(rng).coded(layer.flat)}
-    number = max(1, (len(layer.residuals[0]) - 1).bit_length())
-    counts = [_near(rng, 1, 8) for _ in range(number - 1)]
-    payloads = [Section(rng).coded(stage) for stage in blocks.plane_stages(layer.residuals, counts)]
-    return found | {PLANE: b"\1" + varint(*counts, *map(len, payloads[:-1])) + b"".join(payloads)}
+    payloads = [Section(rng).coded(stage) for stage in blocks.plane_stages(layer.residuals)]
+    return found | {PLANE: varint(*map(len, payloads[:-1])) + b"".join(payloads)}
 
 
 def _scales(rng: random.Random, channels: int) -> list[Scale]:
@@ -302,8 +297,7 @@ def _scales(rng: random.Random, channels: int) -> list[Scale]:
         sides = [rng.choices((1, 2, 3, 5, 40), (8, 8, 8, 4, 1))[0] for _ in range(4)]
         shapes = plane_shapes(channels, sides).items()
         samples = {name: symbols(rng, *shape, most=rng.choice((M, 3))) for name, shape in shapes}
-        chosen = [(rng.randrange(4), plane) for plane in samples.values()]
-        predictors = tuple(p if abs(residual(p, k).astype(np.int64)).max() <= K else 0 for p, k in chosen)
+        predictors = tuple(rng.randrange(2) for _ in samples)
         made.append(Scale(channels, tuple(sides), predictors, lambda n, shape, samples=samples: samples[n]))  # type: ignore
     return made
 

@@ -227,21 +227,18 @@ def put_together(parts: Parts, header: bytes | None = None) -> bytes:
     return b"".join([write_preamble(header), *framed])
 
 
-def stages_of(section: bytes, number: int, header: dict[int, Any], meta: dict[int, Any]) -> tuple[bytes, list[bytes]]:
-    """(all before the lengths of the stages, the stages) of planes in form 1, else (the section, [])."""
+def stages_of(section: bytes, number: int, header: dict[int, Any], meta: dict[int, Any]) -> list[bytes]:
+    """The stages of a section, which is one itself unless it holds planes."""
+    if number != PLANES:
+        return [section]
     reader = ByteReader(section)
-    if number != PLANES or reader.byte("a form") != 1:
-        return section, []
     fields, widths = canonical.Fields(meta, "layer", set(meta)), Widths(*header[15][:2])
     shape, _ = unpack_parameters(fields, LAYER_KINDS[1], widths, (), False, "layer")
     count = max(1, (shape.scales[0].channels - 1).bit_length())
-    for _ in range(count - 1):
-        reader.varint(VARINT_MAX, "a class count")
-    block = section[: reader.offset]
     lengths = (reader.varint(VARINT_MAX, "a length") for _ in range(count - 1))
     bounds = list(itertools.accumulate(lengths, initial=0))
     rest = bytes(reader.rest())
-    return block, [rest[start:end] for start, end in itertools.pairwise([*bounds, len(rest)])]
+    return [rest[start:end] for start, end in itertools.pairwise([*bounds, len(rest)])]
 
 
 def _layer(rng: random.Random, parts: Parts) -> Chunk | None:
@@ -250,27 +247,20 @@ def _layer(rng: random.Random, parts: Parts) -> Chunk | None:
 
 
 def section_bytes(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
-    """Bytes of a section, or of one of its stages or the block before them; lengths follow."""
+    """Bytes of a section or of one of its stages; lengths follow."""
     chunk = _layer(rng, parts)
     if chunk is None or chunk.sections is None or chunk.meta is None:
         return
     number = rng.choice(list(chunk.sections))
     section = chunk.sections[number]
     try:
-        block, stages = stages_of(section, number, parts.header, chunk.meta)
+        stages = stages_of(section, number, parts.header, chunk.meta)
     except (DecodeError, LookupError, TypeError, ValueError):  # changed before
-        block, stages = section, []
-    names.append(f"section {number}")
-    if not stages:
-        chunk.sections[number] = change_bytes(rng, section, section, names)
-        return
-    at = rng.randrange(-1, len(stages))
-    if at < 0:
-        block = block[:1] + change_bytes(rng, block[1:], block, names)
-    else:
-        stages[at] = change_bytes(rng, stages[at], rng.choice(stages), names)
-    names.append(f"stage {at}" if at >= 0 else "block")
-    chunk.sections[number] = block + varint(*(len(s) for s in stages[:-1])) + b"".join(stages)
+        stages = [section]
+    at = rng.randrange(len(stages))
+    names.append(f"section {number}, stage {at}")
+    stages[at] = change_bytes(rng, stages[at], rng.choice(stages), names)
+    chunk.sections[number] = varint(*(len(s) for s in stages[:-1])) + b"".join(stages)
 
 
 def section_swap(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:

@@ -189,73 +189,50 @@ def coded_attributes(
     return graded_part(classes) + coded(channels, priors, known)
 
 
-def plain_planes(residuals: Iterable[Iterable[int]], priors: Mapping[int, Prior] | None = None) -> bytes:
-    """Section PLANES of the channels of all planes, form 0 (clause 8.6)."""
-    return b"\0" + coded(residuals, priors)
-
-
 def relative_magnitude(e: np.ndarray) -> np.ndarray:
     """int64 [n] of residuals int64 [m, n] (clause 8.7)."""
     parts = (abs(c) * 256 * e.shape[1] // (1 + int(abs(c).sum())) for c in e)
     return sum(parts, np.zeros(e.shape[1], np.int64))
 
 
-def classes_by_activity(activity: np.ndarray, count: int) -> np.ndarray:
-    """Class 0 .. count − 1 of each place (clause 8.7)."""
-    bounds = np.sort(activity)[[i * len(activity) // count for i in range(1, count)]]
-    return np.searchsorted(bounds, activity, side="right")
-
-
-def classes_of_plane(e: np.ndarray, count: int) -> np.ndarray:
-    """Class [H·W] of each cell, by residuals int64 [m, H, W] of the stages before (clause 8.6)."""
+def classes_of_plane(e: np.ndarray) -> np.ndarray:
+    """Class 0..7 [H·W] of each cell, by residuals int64 [m, H, W] of the stages before (clause 8.6)."""
     _, height, width = e.shape
     size = relative_magnitude(e.reshape(len(e), -1)).reshape(height, width)
     i, j = np.indices((height, width))
     near = itertools.product((-1, 0, 1), repeat=2)
     parts = (size[np.clip(i + a, 0, height - 1), np.clip(j + b, 0, width - 1)] for a, b in near)
-    return classes_by_activity(sum(parts, np.zeros_like(size)).ravel(), count)
-
-
-def _split(channel: np.ndarray, classes: np.ndarray, count: int) -> list[np.ndarray]:
-    return [channel[classes == q] for q in range(count)]
+    activity = sum(parts, np.zeros_like(size)).ravel()
+    bounds = np.sort(activity)[[i * len(activity) // 8 for i in range(1, 8)]]
+    return np.searchsorted(bounds, activity, side="right")
 
 
 Lengths = Callable[[list[int]], list[int]]
 StagePriors = Mapping[int, Mapping[int, Prior]]  # by stage, then by channel of the stage
 
 
-def staged(
-    stages: Iterable[Iterable[np.ndarray]],
+def coded_planes(
+    planes: Sequence[np.ndarray],
     lengths: Lengths = lambda sizes: sizes,
     tail: bytes = b"",
     priors: StagePriors | None = None,
 ) -> bytes:
-    """The lengths of all stages but the last, then the stages. lengths: the stated ones, from the true ones."""
-    payloads = [coded(stage, (priors or {}).get(number)) for number, stage in enumerate(stages)]
+    """Section PLANES of residuals int32 [C, H, W] (clause 8.6). lengths: the stated ones of all stages but the last,
+    from the true ones."""
+    payloads = [coded(stage, (priors or {}).get(number)) for number, stage in enumerate(plane_stages(planes))]
     return varint(*lengths([len(p) for p in payloads[:-1]])) + b"".join(payloads) + tail
 
 
-def staged_planes(
-    planes: Sequence[np.ndarray],
-    counts: Sequence[int],
-    lengths: Lengths = lambda sizes: sizes,
-    tail: bytes = b"",
-    priors: StagePriors | None = None,
-) -> bytes:
-    """Section PLANES of residuals int32 [C, H, W], form 1 (clause 8.6). counts: classes of the stages from 1 on."""
-    return b"\1" + varint(*counts) + staged(plane_stages(planes, counts), lengths, tail, priors)
-
-
-def plane_stages(planes: Sequence[np.ndarray], counts: Sequence[int]) -> list[list[np.ndarray]]:
+def plane_stages(planes: Sequence[np.ndarray]) -> list[list[np.ndarray]]:
     """The channels of the stages of clause 8.6."""
     stages = []
     for stage in range(max(1, (len(planes[0]) - 1).bit_length())):
         first, end, channels = (1 << stage if stage else 0), 2 << stage, list[np.ndarray]()
         for plane in planes:
-            e, count = plane.astype(np.int64), counts[stage - 1] if stage else 1
-            classes = classes_of_plane(e[:first], count) if stage else np.zeros(e[0].size)
-            for channel in e[first:end]:
-                channels += _split(channel.ravel(), classes, count)
+            e = plane.astype(np.int64)
+            classes = classes_of_plane(e[:first]) if stage else None
+            for channel in map(np.ravel, e[first:end]):
+                channels += [channel] if classes is None else [channel[classes == q] for q in range(8)]
         stages.append(channels)
     return stages
 
@@ -450,7 +427,7 @@ def _sections(layer: Layer, mode: int) -> dict[int, bytes | None]:
     return sections | {
         MASKS: coded([layer.rises, layer.codes]) if layer.rises.size or n else None,
         ATTRIBUTES: coded_attributes(layer.attributes, classes=layer.classes) if n else None,
-        PLANE: plain_planes(layer.flat) if layer.flat else None,
+        PLANE: coded_planes(layer.residuals) if layer.residuals else None,
         WEIGHTS: coded(w.ravel() for w in layer.weights) if layer.weights else None,
     }
 

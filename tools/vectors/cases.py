@@ -60,6 +60,7 @@ from .blocks import (
     Vector,
     coded,
     coded_attributes,
+    coded_planes,
     constant,
     gauss,
     graded_part,
@@ -69,13 +70,11 @@ from .blocks import (
     make_file,
     make_layer,
     pattern,
-    plain_planes,
-    staged_planes,
     varint,
 )
 
 TABLE = Path(__file__).with_name("table.txt")
-M, K, ROWS = 1 << 23, (1 << 24) - 1, 40
+M, K, ROWS = 1 << 23, 1 << 24, 40
 LEAST, LARGEST, SUBNORMAL = 2.0**-126, (2.0 - 2.0**-23) * 2.0**127, 2.0**-127
 FRAME = {"type": 0, "flags": 2, "length": 4, "scene_id": 8}  # offsets in a chunk
 PREAMBLE = {"signature": 0, "major": 8, "declared": 12, "crc": 16}
@@ -298,22 +297,19 @@ def of_highs(*highs: int) -> np.ndarray:
 
 def tables_at_limit(more: bool = False) -> File:
     """A section of windows of 2^18 entries, and one entry for each of its symbols; one more if so."""
-    file = deformed(Scale(32, (1, 1, 1, 1)))
-    channels = file.layer(1).flat
+    k = pattern(68, ROWS)
+    k[67] = 1
     own: list[Any] = [gauss(-(1 << 13), 1 << 14, si=200 + c) for c in range(16)]
-    own.append(gauss(-(len(channels) >> 1), len(channels)))
-    priors = {c: own[c % len(own)] for c in range(len(channels))}
-    if more:
-        priors[len(channels) - 1] = Const(Window(int(channels[-1][0]), 1))
-    return with_section(PLANE, plain_planes(channels, priors), file, 1)
+    own.append(gauss(-(k.size >> 1), k.size))
+    return with_priors({c: own[c % len(own)] for c in range(67 if more else 68)}, k)
 
 
 def tables_of_stages() -> File:
-    """Windows of more than 2^18 entries in all stages together, not in any of them."""
+    """Windows of more than 2^18 entries in all stages together, not in any of them. Planes of one cell, of class 7."""
     file = deformed(Scale(32, (1, 1, 1, 1)))
     wide = [gauss(-(1 << 13), 1 << 14, si=200 + c) for c in range(14)]
-    priors: dict[int, dict[int, Prior]] = {3: dict(enumerate(wide[:7])), 4: dict(enumerate(wide))}
-    return with_section(PLANE, staged_planes(file.layer(1).planes, (1,) * 4, priors=priors), file, 1)
+    priors: dict[int, dict[int, Prior]] = {s: {8 * c + 7: p for c, p in enumerate(wide)} for s in (3, 4)}
+    return with_section(PLANE, coded_planes(file.layer(1).residuals, priors=priors), file, 1)
 
 
 def tables_of_slices(over: int) -> File:
@@ -328,36 +324,36 @@ def tables_of_slices(over: int) -> File:
 
 
 def large_products() -> File:
-    """Plane xy of 4096 by 521 cells, N in all. In channel 0 the sum of all magnitudes is M − 1, and 256·N·E + 1 is a
+    """Plane xy of 521 by 4096 cells, N in all. In channel 0 the sum of all magnitudes is M − 1, and 256·N·E + 1 is a
     multiple of M: the quotient of E is its integer less 1 / M, which binary64 cannot tell from the integer. Magnitudes
     of E + 1 make up more than an eighth of the cells around them, so they are of the last class, and E is not."""
     height, width, total, e = 521, 4096, 549756251549, 16669554
     product = 256 * height * width * e
     assert product % total == total - 1 and int(product / total) == product // total + 1
     residuals = np.zeros((3, height, width), np.int64)
-    residuals[0, 0, 0] = -M  # from here every other magnitude leads up, and the next one down
+    residuals[0, 0, 0] = -M  # from here every other magnitude leads up, and the next one down, in a column
     left = total - 1 - M
     for (i, j), (same, k) in zip(*[iter(itertools.product(range(3, 520, 3), range(20, 4081, 20)))] * 2, strict=False):
         size = e if i == 252 and j == 20 * 51 else e + 1
         if i == same and left >= 2 * size:
             residuals[0, i, [j, k]] = size, -size
             left -= 2 * size
-    for i in (1, 2):  # the rest, where nothing follows in its row
+    for i in (1, 2):  # the rest, where nothing follows in its column
         residuals[0, height - i, width - 1] = min(left, e)
         left -= min(left, e)
     assert left == 0
-    residuals[2] = (blocks.classes_of_plane(residuals[:2], 8) == 7).reshape(height, width)
-    samples = restore([(1, residuals.astype(np.int32))])[0]
+    residuals[2] = (blocks.classes_of_plane(residuals[:2]) == 7).reshape(height, width)
+    samples = restore([(0, residuals.astype(np.int32).swapaxes(1, 2))])[0]
     fill = lambda name, shape: samples if name == "xy" else np.zeros(shape, np.int32)  # noqa: E731
-    layer = make_layer(1, (), scales=[Scale(3, (width, height, 1, 1), (1, *[0] * 5), fill)])
-    section = staged_planes([residuals, *layer.planes[1:]], (8,), priors={0: {0: Const(Window(0, 1))}})
+    layer = make_layer(1, (), scales=[Scale(3, (height, width, 1, 1), fill=fill)])
+    section = coded_planes(layer.residuals, priors={0: {0: Const(Window(0, 1))}})
     return with_section(PLANE, section, make_file(make_layer(cells=()), layer), 1)
 
 
 def symbols_at_limit(over: int = 0, count: int = 0, graded: bool = False) -> File:
     """As many symbols as clause 6.5 allows a file, or `over` more, with `count` anchors in either layer."""
     classes = [1] * count if graded else None
-    plane = Scale(1, (2048, 1920, 1, 1), fill=constant(1))
+    plane = Scale(1, (2048, 1920, 1, 1), fill=constant(0))
 
     def layer(first: int, second: int, hidden: int) -> Layer:
         networks = {0: (first, second), 1: (hidden, 3)}
@@ -414,19 +410,6 @@ def lzma_narrow() -> bytes:
     return narrow + lzma_symbols(channels, base=None, width=2)[len(wide) :]
 
 
-def steep_plane(mode: int = 0, sign: int = 1) -> Layer:
-    """Layer 1 with a plane whose samples are within 2^23, while its second residual is K + 1, or −K − 1."""
-    ends = np.array([-M, M], np.int32) * sign
-    scale = Scale(1, (2, 1, 1, 1), (1, 0, 0, 0, 0, 0), lambda name, shape: np.resize(ends * (name == "xy"), shape))
-    return make_layer(1, (), before=1, scales=[scale], mode=mode)
-
-
-def steep(prior: Prior, sign: int = 1) -> File:
-    """The residuals of `steep_plane` under this prior."""
-    residuals = [[-M * sign, 2 * M * sign], [0] * 2, [0] * 2, [0], [0], [0]]
-    return make_file(make_layer(), steep_plane(sign=sign).with_sections({PLANE: plain_planes(residuals, {0: prior})}))
-
-
 def slices_with_classes(go_on: bool) -> File:
     """Two slices with step classes; those of the second under the prior of the first one's, which is wrong, or under
     one of its own of more entries than a section may define that goes on."""
@@ -441,13 +424,12 @@ def slices_with_classes(go_on: bool) -> File:
 
 def costly(which: int) -> File:
     """A few hundred bytes that declare some 3 million symbols. 0: planes of one channel, to be predicted sample by
-    sample. 1: stages with eight classes of many cells, the dearest in memory."""
+    sample. 1: two stages of many cells, the dearest in memory."""
     if which == 0:
-        flat = Scale(1, (4096, 256, 256, 256), (3,) * 6, constant(0))
+        flat = Scale(1, (4096, 256, 256, 256), (1,) * 6, constant(0))
         first = make_layer(0, networks={0: (64, 10), 1: (64, 70), 2: (64, 30)})
         return make_file(first, make_layer(1, (), before=1, scales=[flat]))
-    file = deformed(*[Scale(4, s, fill=constant(0)) for s in ((4095, 5, 1, 16), (64, 256, 64, 256), (4095, 2, 2, 99))])
-    return with_section(PLANE, staged_planes(file.layer(1).planes, (8,)), file, 1)
+    return deformed(*[Scale(4, s, fill=constant(0)) for s in ((4095, 5, 1, 16), (64, 256, 64, 256), (4095, 2, 2, 99))])
 
 
 def exceptions() -> File:
@@ -463,6 +445,6 @@ def stage_of_rest(file: File, more: int) -> bytes:
     """Stage 0 stated as long as all that its length and the rest take, or longer."""
     said, section = 0, b""
     for _ in range(3):  # the bytes of the length count
-        section = staged_planes(file.layer(1).planes, (3, 2), lambda s: [said + more, s[1]])  # noqa: B023
-        said = len(section) - 3
+        section = coded_planes(file.layer(1).residuals, lambda s: [said + more, s[1]])  # noqa: B023
+        said = len(section)
     return section
