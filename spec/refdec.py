@@ -18,7 +18,7 @@ import zlib
 from bisect import bisect_right
 
 SIGNATURE = bytes.fromhex("89504434 0D0A1A0A")
-K = (1 << 24) - 1  # clause 14: coded symbols
+K = 1 << 24  # clause 14: coded symbols
 MAX_SYMBOL = 1 << 23  # clause 14: symbols of attributes, plane samples and weights
 MAX_VOXEL = 1 << 20
 MAX_COUNT = 1 << 26
@@ -52,7 +52,7 @@ def limited(value, high, what, low=0):
 
 
 # 15 Errors and security: "UnsupportedFeature is an integer of whatever size and sign that is not a registered mode,
-# form of the planes, predictor, network or prior family"
+# predictor, network or prior family"
 def registered(value, known, what):
     need(type(value) is int, f"{what} is not an integer")
     need(value in known, f"{what} is {value}, which is not registered", "UnsupportedFeature")
@@ -442,7 +442,7 @@ def read_scales(rows, below):
         for side in row[1:5]:
             limited(side, 4096, "a plane's side", 1)
         for predictor in row[5:]:
-            registered(predictor, range(4), "a predictor")
+            registered(predictor, (0, 1), "a predictor")
     return rows
 
 
@@ -565,7 +565,7 @@ def keep_symbols(layer, positions, channels, planes, weights):
 # three are 0."
 def restore(residuals, predictor, h, w):
     k = list(residuals)
-    for at in range(len(k)) if predictor else ():
+    for at in range(len(k)):
         i, j = divmod(at, w)
         west, north = k[at - 1] if j else 0, k[at - w] if i else 0
         corner = k[at - w - 1] if i and j else 0
@@ -573,9 +573,7 @@ def restore(residuals, predictor, h, w):
             north = corner = west
         elif j == 0:
             west = corner = north
-        if predictor == 1:
-            k[at] += west
-        elif predictor == 2:
+        if predictor == 0:
             k[at] += north
         else:
             k[at] += max(min(west, north), min(max(west, north), west + north - corner))
@@ -753,8 +751,8 @@ def step_classes(symbols):
     return symbols
 
 
-# 8.6 The planes section: "it is coded as one channel per class (8.7), ascending, each with the residuals of the cells
-# of that class in row-major order."
+# 8.6 The planes section: "one per class (8.7), ascending, each with the residuals of the cells of that class in
+# row-major order."
 # 8 Coded channels: "Channels of length 0 leave no trace."
 def decode_classes(data, classes, class_count, known=None):
     """The channels of a section, given the class of each place of each."""
@@ -767,23 +765,22 @@ def decode_classes(data, classes, class_count, known=None):
 
 
 # 8.6 The planes section: "Stage 0 codes the plane channels 0 and 1, stage s ≥ 1 the plane channels 2^s .. 2^(s+1) − 1,
-# as far as they exist. A stage codes plane by plane in the order of the plain form, in each plane its plane channels,
-# ascending." "Other forms are UnsupportedFeature."
+# as far as they exist. A stage codes scale by scale and plane by plane (6.3), in each plane its plane channels,
+# ascending. In stage 0 each plane channel is one channel, with its residuals row by row."
 def decode_planes(data, shapes):
-    """The residuals, channel by channel in the order of the plain form; shapes: (channels, height, width) of each."""
+    """The residuals, one list per scale, plane and plane channel; shapes: (channels, height, width) of each plane."""
     reader, channels = Reader(data), shapes[0][0]
-    if registered(reader.byte(), (0, 1), "the form of the planes") == 0:
-        return decode_channels(reader.take(reader.left), [h * w for c, h, w in shapes for _ in range(c)])
-    number = max(1, (channels - 1).bit_length())
-    class_counts = [read_class_count(reader) for _ in range(number - 1)]
     planes = [[] for _ in shapes]
-    for s, (stage, class_count) in enumerate(zip(take_stages(reader, number), [1, *class_counts])):
-        first, end = len(planes[0]), min(2 << s, channels)
-        classes = [classes_by_activity(cell_activity(e, h, w), class_count) for e, (_, h, w) in zip(planes, shapes)]
-        decoded = decode_classes(stage, [own for own in classes for _ in range(first, end)], class_count)
+    for s, stage in enumerate(take_stages(reader, max(1, (channels - 1).bit_length()))):
+        number = min(2 << s, channels) - len(planes[0])
+        if s == 0:
+            decoded = decode_channels(stage, [h * w for _, h, w in shapes for _ in range(number)])
+        else:
+            classes = [classes_by_activity(cell_activity(e, h, w)) for e, (_, h, w) in zip(planes, shapes)]
+            decoded = decode_classes(stage, [own for own in classes for _ in range(number)], 8)
         for e in planes:
-            e += decoded[: end - first]
-            del decoded[: end - first]
+            e += decoded[:number]
+            del decoded[:number]
     return [channel for e in planes for channel in e]
 
 
@@ -795,13 +792,6 @@ def cell_activity(channels, h, w):
     rows = [[min(max(i + a, 0), h - 1) for a in (-1, 0, 1)] for i in range(h)]
     columns = [[min(max(j + b, 0), w - 1) for b in (-1, 0, 1)] for j in range(w)]
     return [sum(magnitude[i * w + j] for i in near_i for j in near_j) for near_i in rows for near_j in columns]
-
-
-# 8.7 Classes by activity: "A class count is a varint 1..8 (0 is Malformed)."
-def read_class_count(reader):
-    count = reader.varint(8)
-    need(count, "a class count of 0")
-    return count
 
 
 # 8.7 Classes by activity: "Lengths are varints, each the number of bytes of a stage, at most the bytes left in the
@@ -822,11 +812,11 @@ def relative_magnitude(channels, n):
     return magnitude
 
 
-# 8.7 Classes by activity: "let A be the activities in ascending order. The bounds are A[(i·N) // C] for i in 1 .. C −
-# 1, and the class of a place is the number of bounds that are at most its activity."
-def classes_by_activity(activity, class_count):
+# 8.7 Classes by activity: "let A be the activities in ascending order. The bounds are A[(i·N) // 8] for i in 1 .. 7,
+# and the class of a place, 0..7, is the number of bounds that are at most its activity."
+def classes_by_activity(activity):
     ascending = sorted(activity)
-    bounds = [ascending[i * len(ascending) // class_count] for i in range(1, class_count)]
+    bounds = [ascending[i * len(ascending) // 8] for i in range(1, 8)]
     return [bisect_right(bounds, value) for value in activity]
 
 
