@@ -15,7 +15,7 @@ export const MAX_FEATURE = 64;
 export const MAX_SLOTS = 16;
 export const MAX_VOXEL = 2 ** 20;
 /** K: the largest coded symbol. */
-export const MAX_CODED = 2 ** 24 - 1;
+export const MAX_CODED = 2 ** 24;
 /** The largest symbol of an attribute, plane sample or weight. */
 export const MAX_SYMBOL = 2 ** 23;
 /** Symbols of one channel. */
@@ -24,7 +24,6 @@ export const MAX_WINDOW = 2 ** 14;
 /** Entries of all windows of a section of coded channels beyond one per symbol: without and with earlier priors. */
 export const FREE_ENTRIES = 2 ** 18;
 export const MORE_ENTRIES = 2 ** 10;
-export const MAX_CLASSES = 8;
 export const MAX_SCALES = 8;
 export const MAX_CHANNELS = 256;
 export const MAX_SIDE = 4096;

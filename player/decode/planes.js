@@ -2,13 +2,14 @@
 
 import { ByteReader } from "./bytes.js";
 import { channelsOf, decodeSplit, groupByClass } from "./classes.js";
-import { malformed, unsupported } from "./errors.js";
-import { MAX_CLASSES, MAX_SYMBOL } from "./limits.js";
-/** @import { Groups } from "./classes.js" */
+import { malformed } from "./errors.js";
+import { MAX_SYMBOL } from "./limits.js";
 /** @import { PlaneShape } from "./parameters.js" */
 
 /** How many predictors 11.3 has. */
-export const PREDICTORS = 4;
+export const PREDICTORS = 2;
+/** Classes of a plane channel that is split. */
+const CLASSES = 8;
 /** Relative magnitudes of residuals below this come from a table. */
 const LOOKED_UP = 256;
 
@@ -19,53 +20,28 @@ const LOOKED_UP = 256;
  * @returns {Int32Array[]} [channels, height, width] each
  */
 export function decodePlanes(bytes, shapes) {
-  const reader = new ByteReader(bytes);
-  const form = reader.byte("the form of the planes");
-  const planes = shapes.map(({ channels, height, width }) => new Int32Array(channels * height * width));
-  const all = planes.map((plane, i) => channelsOf(plane, shapes[i].channels));
-  if (form === 0) decodeSplit(reader.rest(), all.flat(), all.flat().map(() => null));
-  else if (form === 1) decodeStaged(reader, shapes, all);
-  else throw unsupported(`form ${form} of the planes`);
-  all.forEach((channels, i) => channels.forEach((channel) => restore(channel, shapes[i])));
-  return planes;
-}
-
-/** @param {ByteReader} reader @param {PlaneShape[]} shapes @param {Int32Array[][]} all the channels of each plane */
-function decodeStaged(reader, shapes, all) {
   const { channels } = shapes[0];
-  const count = Math.max(1, 32 - Math.clz32(channels - 1));
-  const classCounts = [1];
-  for (let stage = 1; stage < count; stage++) classCounts.push(readClassCount(reader));
-  const stages = readStages(reader, count);
-  const magnitudes = shapes.map(({ height, width }) => new Float64Array(height * width));
-  for (let stage = 0; stage < count; stage++) {
+  const planes = shapes.map(({ height, width }) => new Int32Array(channels * height * width));
+  const all = planes.map((plane) => channelsOf(plane, channels));
+  const stages = readStages(new ByteReader(bytes), Math.max(1, 32 - Math.clz32(channels - 1)));
+  /** @type {Float64Array[]} */
+  const magnitudes = []; // sums over the stages before, per plane
+  stages.forEach((section, stage) => {
     const first = stage ? 2 ** stage : 0;
-    const end = Math.min(2 ** (stage + 1), channels);
-    const classCount = classCounts[stage];
-    /** @type {Int32Array[]} */
-    const targets = [];
-    /** @type {(Groups | null)[]} */
-    const groups = [];
-    shapes.forEach(({ height, width }, i) => {
-      const own = classCount > 1 ? groupByActivity(sumOfNine(magnitudes[i], height, width), classCount) : null;
-      for (const target of all[i].slice(first, end)) {
-        targets.push(target);
-        groups.push(own);
-      }
+    const decoded = all.map((plane) => plane.slice(first, 2 ** (stage + 1)));
+    const groups = shapes.flatMap(({ height, width }, i) => {
+      const own = stage ? groupByActivity(sumOfNine(magnitudes[i], height, width)) : null;
+      return decoded[i].map(() => own);
     });
-    decodeSplit(stages[stage], targets, groups);
-    if (!classCounts.slice(stage + 1).some((later) => later > 1)) continue;
-    all.forEach((plane, i) => {
-      for (const residuals of plane.slice(first, end)) addRelativeMagnitudes(residuals, magnitudes[i]);
+    decodeSplit(section, decoded.flat(), groups);
+    if (stage + 1 === stages.length) return;
+    decoded.forEach((plane, i) => {
+      magnitudes[i] ??= new Float64Array(shapes[i].height * shapes[i].width);
+      for (const residuals of plane) addRelativeMagnitudes(residuals, magnitudes[i]);
     });
-  }
-}
-
-/** @param {ByteReader} reader */
-function readClassCount(reader) {
-  const count = reader.varint(MAX_CLASSES, "a class count");
-  if (!count) throw malformed("a class count of 0");
-  return count;
+  });
+  all.forEach((plane, i) => plane.forEach((channel) => restore(channel, shapes[i])));
+  return planes;
 }
 
 /**
@@ -114,16 +90,16 @@ function addRelativeMagnitudes(residuals, sums) {
   }
 }
 
-/** Groups cells by activity into classes of about equal size. @param {Float64Array} activity @param {number} count */
-function groupByActivity(activity, count) {
+/** Groups cells by activity into classes of about equal size. @param {Float64Array} activity */
+function groupByActivity(activity) {
   const n = activity.length;
   const ascending = activity.slice().sort();
   const classes = new Uint8Array(n);
-  for (let i = 1; i < count; i++) {
-    const bound = ascending[Math.floor((i * n) / count)];
+  for (let i = 1; i < CLASSES; i++) {
+    const bound = ascending[Math.floor((i * n) / CLASSES)];
     for (let p = 0; p < n; p++) if (activity[p] >= bound) classes[p]++;
   }
-  return groupByClass(classes, count);
+  return groupByClass(classes, CLASSES);
 }
 
 /** Per cell the sum over the nine cells around it; beyond the border the border's cells count again.
@@ -147,12 +123,8 @@ function sumOfNine(values, height, width) {
 /** 11.3, in place: residuals of a channel become samples. Each is checked before others are predicted from it, so that a
  * sum stays small. @param {Int32Array} samples @param {PlaneShape} shape */
 function restore(samples, { width, predictor }) {
-  if (!predictor) {
-    for (let at = 0; at < samples.length; at++) check(samples[at]);
-    return;
-  }
   check(samples[0]);
-  // every predictor gives W in row 0 and N in column 0
+  // both predictors give W in row 0 and N in column 0
   for (let at = 1; at < width; at++) check((samples[at] += samples[at - 1]));
   for (let row = width; row < samples.length; row += width) {
     check((samples[row] += samples[row - width]));
@@ -160,10 +132,7 @@ function restore(samples, { width, predictor }) {
     let nw = samples[row - width];
     for (let at = row + 1; at < row + width; at++) {
       const n = samples[at - width];
-      let k = samples[at];
-      if (predictor === 1) k += w;
-      else if (predictor === 2) k += n;
-      else k += median(w, n, w + n - nw);
+      const k = samples[at] + (predictor ? median(w, n, w + n - nw) : n);
       check(k);
       samples[at] = w = k;
       nw = n;
