@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+CLASSES = 8  #: of the cells of a plane by their activity
 EXACT = 1 << 53  #: binary64 holds every integer up to here
 
 
@@ -73,9 +74,9 @@ def relative_magnitude(residuals: np.ndarray) -> np.ndarray:
     return total
 
 
-def activity_classes(activity: np.ndarray, count: int) -> np.ndarray:
-    """Returns classes uint8 [n], 0..count-1, of about equal size of places by their activity [n]."""
-    at = np.arange(1, count) * len(activity) // count
+def activity_classes(activity: np.ndarray) -> np.ndarray:
+    """Returns classes uint8 [n], 0..CLASSES-1, of about equal size of places by their activity [n]."""
+    at = np.arange(1, CLASSES) * len(activity) // CLASSES
     classes = np.zeros(len(activity), np.uint8)
     for bound in np.sort(activity)[at]:  # sort takes a tenth of the time of np.partition; a search of 7, several times
         classes += (activity >= bound).view(np.uint8)

@@ -16,14 +16,12 @@ from pd4dgs_codec.entropy.fitting import histogram
 from pd4dgs_codec.entropy.tables import BIT, frequency_costs, symbol_counts
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import Malformed
-from pd4dgs_codec.format.classes import Places, activity_classes, relative_magnitude
+from pd4dgs_codec.format.classes import CLASSES, Places, activity_classes, relative_magnitude
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, magnitude
 
 PlaneShape = tuple[int, int, int]  #: of a plane: channels, rows, columns
 Array = np.ndarray
 
-#: Channel 2 and all that follow are split into this many classes of cells.
-CLASSES = 8
 #: Largest difference in cells between the positions of two renderers, which round coordinates differently.
 CELL_SLACK = 0.02
 
@@ -263,7 +261,7 @@ def _stages(planes: Sequence[Array], shapes: Sequence[PlaneShape]) -> Iterator[l
         for plane, activity, shape in zip(planes, activities, shapes, strict=True):
             places = Places.whole(plane.shape[1])
             if stage:
-                places = Places.by(activity_classes(_around(activity, shape), CLASSES), CLASSES)
+                places = Places.by(activity_classes(_around(activity, shape)), CLASSES)
             groups.append((plane[first:end], places))
         yield groups
         if end < len(planes[0]):

@@ -5,29 +5,29 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pd4dgs_codec.entropy.priors import K_MAX
-from pd4dgs_codec.format.classes import Places, activity_classes, relative_magnitude
+from pd4dgs_codec.format.classes import CLASSES, Places, activity_classes, relative_magnitude
 
 
 def test_the_check_values_of_the_specification():
     assert relative_magnitude(np.array([[3, -1, 0, 4]])).tolist() == [341, 113, 0, 455]
-    assert activity_classes(np.array([5, 1, 5, 9, 1, 7]), 3).tolist() == [1, 0, 1, 2, 0, 2]
+    assert activity_classes(np.array([5, 1, 5, 9, 1, 7])).tolist() == [5, 2, 5, 7, 2, 6]
 
 
-@given(st.lists(st.integers(0, 2**40) | st.integers(0, 3), min_size=1, max_size=30), st.integers(1, 8))
-def test_the_class_of_a_place_is_the_number_of_bounds_it_reaches(activity, count):
+@given(st.lists(st.integers(0, 2**40) | st.integers(0, 3), min_size=1, max_size=30))
+def test_the_class_of_a_place_is_the_number_of_bounds_it_reaches(activity):
     ascending = sorted(activity)
-    bounds = [ascending[i * len(activity) // count] for i in range(1, count)]
-    classes = activity_classes(np.array(activity), count)
+    bounds = [ascending[i * len(activity) // CLASSES] for i in range(1, CLASSES)]
+    classes = activity_classes(np.array(activity))
     assert classes.tolist() == [sum(bound <= a for bound in bounds) for a in activity]
-    places, channels = Places.by(classes, count), np.arange(2 * len(activity)).reshape(2, -1)
+    places, channels = Places.by(classes, CLASSES), np.arange(2 * len(activity)).reshape(2, -1)
     parts, back = list(places.parts(channels)), np.zeros_like(channels)
-    assert [part.tolist() for part in parts] == [c[classes == k].tolist() for c in channels for k in range(count)]
+    assert [part.tolist() for part in parts] == [c[classes == k].tolist() for c in channels for k in range(CLASSES)]
     places.put(np.concatenate(parts), back)
     np.testing.assert_array_equal(back, channels)
 
 
 def test_different_activities_make_classes_of_about_equal_size():
-    places = Places.by(activity_classes(np.random.default_rng(0).permutation(100), 8), 8)
+    places = Places.by(activity_classes(np.random.default_rng(0).permutation(100)), CLASSES)
     assert set(places.sizes) <= {12, 13}
 
 
