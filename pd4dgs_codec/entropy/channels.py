@@ -81,13 +81,12 @@ def encode_channels(
         raise EncodeError(f"expected priors best or gauss and effort 1..9, found {priors!r} and {effort}")
     arrays = check_channels(channels)
     histograms = [histogram(a) for a in arrays if len(a)]
-    rounds = 0 if effort < 3 else (effort + 1) // 2
-    richer = priors == "best" and effort > 1
+    share, richer = effort > 2, priors == "best" and effort > 1
     fit: Fit = (lambda h: fit_best(h, effort)) if richer else (lambda h: h.gauss)
-    best = _encode(arrays, plan_priors(histograms, fit, rounds, known), known)
+    best = _encode(arrays, plan_priors(histograms, fit, share, known), known)
     least = sum(h.gauss.own for h in histograms) / BIT  # estimated bits with Gaussians: sharing can save more
     if richer and (len(best[0]) < SMALL or least < 1.005 * 8 * len(best[0])):
-        other = _encode(arrays, plan_priors(histograms, lambda h: h.gauss, rounds, known), known)
+        other = _encode(arrays, plan_priors(histograms, lambda h: h.gauss, share, known), known)
         best = min(best, other, key=lambda encoded: len(encoded[0]))
     payload, defined = best
     return CodedChannels(payload, sum(h.rate_bits for h in histograms), defined)

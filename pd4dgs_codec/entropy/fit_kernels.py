@@ -374,13 +374,12 @@ def cost_matrix(
 
 
 @_compiled
-def assign(costs: np.ndarray, prices: np.ndarray) -> tuple[np.ndarray, int]:
-    """Removes priors one by one while that saves bits: (prior of each channel int64 [channels], total cost).
+def assign(costs: np.ndarray, prices: np.ndarray) -> np.ndarray:
+    """Removes priors one by one while that saves bits. Returns the prior of each channel, int64 [channels].
 
     costs: int64 [channels, priors]; prices: int64 [priors], of the descriptions.
     """
     channels, priors = costs.shape
-    none = np.int64(1) << 62
     is_open = np.ones(priors, np.bool_)
     first, second = np.empty(channels, np.int64), np.empty(channels, np.int64)
     stale = np.ones(channels, np.bool_)
@@ -410,13 +409,7 @@ def assign(costs: np.ndarray, prices: np.ndarray) -> tuple[np.ndarray, int]:
         left -= 1
         for c in range(channels):
             stale[c] = first[c] == closed or second[c] == closed
-    total = np.int64(0)
-    for c in range(channels):
-        total += costs[c, first[c]]
-    for p in range(priors):
-        if is_open[p]:
-            total += prices[p]
-    return first, total if total < none else none
+    return first
 
 
 @_compiled

@@ -3,8 +3,8 @@
 Costs are in units of 2^-20 bits and exact, from the integer table and the prior's description; only the cost of
 exceptions is an estimate. Files are the same with and without numba.
 
-Sharing starts with one prior per channel, removes priors whose description costs more than their channels lose under
-other priors, refits the rest to the channels they now serve, and repeats: k-means with a cost per centre.
+Sharing starts with one prior per channel and one for all, and removes priors whose description costs more than their
+channels lose under other priors.
 """
 
 from __future__ import annotations
@@ -99,26 +99,34 @@ def costs_of(histograms: Sequence[Histogram], priors: Sequence[Fitted]) -> np.nd
 
 
 def fit_gauss(h: Histogram) -> Fitted:
-    """Fits const and Gaussian priors in several windows; returns the cheapest."""
+    """Returns the cheaper of a constant and a Gaussian."""
     if len(h.values) == 1:
         return _const(h, 0)
-    candidates = [_fit_gauss_in(h, w) for w in _windows(h)]
+    window = _fullest_window(h)
+    mu8, si, cost, costs = loops().gauss(_dense(h, window))
+    found = _fitted(Gauss(window, Normal(mu8, si)), costs, cost + _beside(h, window))
     mode = int(h.counts.argmax())
-    if h.total - int(h.counts[mode]) <= 8:
-        candidates.append(_const(h, mode))
-    return _cheapest(candidates)
+    return min(found, _const(h, mode), key=_total) if h.total - int(h.counts[mode]) <= 8 else found
 
 
 def fit_best(h: Histogram, effort: int) -> Fitted:
-    """Fits priors of all families in the Gaussian's best window; returns the cheapest."""
-    found = h.gauss
-    if found.prior.window.n == 1:
+    """Returns the cheaper of `fit_gauss` and a mixture in its window, which is not tried where the empirical entropy
+    shows that it cannot gain."""
+    found, window = h.gauss, h.gauss.prior.window
+    if window.n == 1:
         return found
-    return _cheapest([found, *_mixtures(h, found, effort)])
+    dense, beside = _dense(h, window), _beside(h, window)
+    seen = dense[dense > 0]
+    spare = (found.own - beside) / BIT - order0_bits(seen)
+    if spare <= 40 + 0.72 * len(seen):  # a mixture takes five more bytes; a sample's entropy is low by log2(e) / 2 each
+        return found
+    mu1, si1, mu2, si2, weight, cost, costs = loops().mixture(dense, effort)
+    mixture = Mixture(window, Normal(mu1, si1), Normal(mu2, si2), weight)
+    return min(found, _fitted(mixture, costs, cost + beside), key=_total)
 
 
-def _cheapest(priors: Sequence[Fitted]) -> Fitted:
-    return min(priors, key=lambda p: p.own + p.price) if len(priors) > 1 else priors[0]
+def _total(fitted: Fitted) -> int:
+    return fitted.own + fitted.price
 
 
 def _const(h: Histogram, mode: int) -> Fitted:
@@ -126,27 +134,10 @@ def _const(h: Histogram, mode: int) -> Fitted:
     return _fitted(Const(window), np.zeros(1, np.int64), _beside(h, window))
 
 
-def _fit_gauss_in(h: Histogram, window: Window) -> Fitted:
-    mu8, si, cost, costs = loops().gauss(_dense(h, window))
-    return _fitted(Gauss(window, Normal(mu8, si)), costs, cost + _beside(h, window))
-
-
 def _fitted(prior: Prior, costs: np.ndarray, own: int) -> Fitted:
     out = bytearray()
     prior.write(out)
     return Fitted(prior, costs, 8 * BIT * len(out), own)
-
-
-def _mixtures(h: Histogram, found: Fitted, effort: int) -> list[Fitted]:
-    """Fits a mixture in the window found, unless the empirical entropy shows that it cannot gain."""
-    window = found.prior.window
-    dense, beside = _dense(h, window), _beside(h, window)
-    seen = dense[dense > 0]
-    spare = (found.own - beside) / BIT - order0_bits(seen)
-    if spare <= 40 + 0.72 * len(seen):  # a mixture takes five more bytes; a sample's entropy is low by log2(e) / 2 each
-        return []
-    mu1, si1, mu2, si2, weight, cost, costs = loops().mixture(dense, effort)
-    return [_fitted(Mixture(window, Normal(mu1, si1), Normal(mu2, si2), weight), costs, cost + beside)]
 
 
 def _dense(h: Histogram, window: Window) -> np.ndarray:
@@ -168,34 +159,15 @@ def _beside(h: Histogram, window: Window) -> int:
     return int(costs_of([h], [free])[0, 0])
 
 
-def _windows(h: Histogram) -> list[Window]:
-    """Returns the full range, or the fullest window of the largest size, and narrower windows without its outliers.
-
-    An outlier costs 20 bits inside the window and at least 24 as an exception: trimming gains only for wide windows.
-    """
+def _fullest_window(h: Histogram) -> Window:
+    """Returns the full range of the symbols, or the fullest window of the largest size; others become exceptions."""
     low, high = int(h.values[0]), int(h.values[-1])
-    if high - low < 512:
-        return [_window(low, high)]
     if high - low >= MAX_WINDOW:
         ends = np.searchsorted(h.values, h.values + MAX_WINDOW)  # of a window that begins at each value
         inside = np.diff(np.concatenate([[0], np.cumsum(h.counts)])[np.stack([np.arange(len(ends)), ends])], axis=0)
         fullest = int(inside.argmax())
         low, high = int(h.values[fullest]), int(h.values[ends[fullest] - 1])
-    windows = [_window(low, high)]
-    below = np.cumsum(h.counts)
-    median = h.values[np.searchsorted(below, below[-1] / 2)]
-    order = np.argsort(-np.abs(h.values - median))  # farthest first
-    trimmed = np.cumsum(h.counts[order])
-    m = 1
-    while m <= h.total // 16:
-        cut = int(np.searchsorted(trimmed, m, side="right"))  # at most m symbols are trimmed
-        if cut:
-            kept = h.values[order[cut:]]
-            narrower = _window(int(kept.min()), int(kept.max()))
-            if 2 * (narrower.end - narrower.kmin) < windows[-1].end - windows[-1].kmin:
-                windows.append(narrower)
-        m *= 2
-    return windows
+    return _window(low, high)
 
 
 def _window(low: int, high: int) -> Window:
@@ -209,9 +181,9 @@ def _window(low: int, high: int) -> Window:
 Fit = Callable[[Histogram], Fitted]
 
 
-def plan_priors(histograms: Sequence[Histogram], fit: Fit, rounds: int, known: Sequence[Fitted] = ()) -> list[Fitted]:
-    """Returns the prior of each channel; channels that share one get the same object. rounds: of sharing at most.
-    known: priors that were described earlier, at no cost now."""
+def plan_priors(histograms: Sequence[Histogram], fit: Fit, share: bool, known: Sequence[Fitted] = ()) -> list[Fitted]:
+    """Returns the prior of each channel; channels that share one get the same object. share: whether channels may share
+    new priors. known: priors that were described earlier, at no cost now."""
     plan = [fit(h) for h in histograms]
     free = [replace(fitted, price=0) for fitted in known]
     if free and plan:
@@ -221,9 +193,9 @@ def plan_priors(histograms: Sequence[Histogram], fit: Fit, rounds: int, known: S
             for best in [costs.argmin()]
         ]
     narrow = [c for c, h in enumerate(histograms) if len(h.values) <= WIDE]
-    for start in range(0, len(narrow), BLOCK):
+    for start in range(0, len(narrow) if share else 0, BLOCK):
         block = narrow[start : start + BLOCK]
-        shared = _plan_block([histograms[c] for c in block], [plan[c] for c in block], free, fit, rounds)
+        shared = _plan_block([histograms[c] for c in block], [plan[c] for c in block], free, fit)
         for c, prior in zip(block, shared, strict=True):
             plan[c] = prior
     return _within_limit(histograms, plan, free, fit)
@@ -249,32 +221,11 @@ def _within_limit(histograms: Sequence[Histogram], plan: list[Fitted], free: lis
     return [replaced.get(c, p) for c, p in enumerate(plan)]
 
 
-def _plan_block(
-    histograms: Sequence[Histogram], plan: list[Fitted], free: list[Fitted], fit: Fit, rounds: int
-) -> list[Fitted]:
-    priors = [*plan, *free]
-    if rounds == 0 or len(histograms) < 2:
+def _plan_block(histograms: Sequence[Histogram], plan: list[Fitted], free: list[Fitted], fit: Fit) -> list[Fitted]:
+    if len(histograms) < 2:
         return plan
-    pooled = pool(histograms)
+    priors, pooled = [*plan, *free], pool(histograms)
     if len(pooled.values) <= 4 * max(len(h.values) for h in histograms):  # otherwise they have nothing in common
         priors.append(fit(pooled))
-    best, costs = 1 << 62, costs_of(histograms, priors)
-    for last in range(rounds - 1, -1, -1):
-        owner, total = loops().assign(costs, np.array([p.price for p in priors]))
-        if total >= best:
-            break
-        best, plan = total, [priors[p] for p in owner]
-        if last:
-            used = np.unique(owner)
-            merged = _refit(histograms, owner, fit)
-            if not merged:
-                break
-            priors = [*(priors[p] for p in used), *merged]
-            costs = np.hstack([np.ascontiguousarray(costs[:, used]), costs_of(histograms, merged)])
-    return plan
-
-
-def _refit(histograms: Sequence[Histogram], owner: np.ndarray, fit: Fit) -> list[Fitted]:
-    """For each prior that serves several channels, fits a new one to all of them."""
-    members = [np.flatnonzero(owner == p).tolist() for p in np.unique(owner)]
-    return [fit(pool([histograms[c] for c in shared])) for shared in members if len(shared) > 1]
+    owner = loops().assign(costs_of(histograms, priors), np.array([p.price for p in priors]))
+    return [priors[p] for p in owner]

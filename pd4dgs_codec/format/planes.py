@@ -5,8 +5,7 @@ N = k[i-1, j] and NW = k[i-1, j-1], and the residual k - prediction is coded. In
 column 0 W and NW are taken equal to N, and at (0, 0) all three are 0 (clause 11.3). All arithmetic is on integers.
 """
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
 from itertools import accumulate
 
 import numpy as np
@@ -26,17 +25,17 @@ Array = np.ndarray
 CELL_SLACK = 0.02
 
 
-@dataclass(frozen=True)
-class Predictor:
-    """A predictor. `restore` undoes it by running sums; None for the median, which takes a scan."""
+#: Predictors by their id in the bitstream: N (on time planes, the previous instant), or the median of W, N and
+#: W + N - NW, the LOCO-I predictor (Weinberger, Seroussi, Sapiro 2000).
+PREDICTORS = {0: "up", 1: "median"}
+UP, MEDIAN = PREDICTORS
 
-    name: str
-    predict: Callable[[Array, Array, Array], Array]  #: (W, N, NW) -> prediction
-    restore: Callable[[Array], Array] | None = None  #: int64 residuals [C, H, W] -> samples
+
+def _prediction(predictor: int, w: Array, n: Array, nw: Array) -> Array:
+    return n if predictor == UP else _median(w, n, nw)
 
 
 def _median(w: Array, n: Array, nw: Array) -> Array:
-    """The median of W, N and W + N - NW: the LOCO-I predictor (Weinberger, Seroussi, Sapiro 2000)."""
     low, high = np.minimum(w, n), np.maximum(w, n)
     median: Array = low + high
     median -= nw
@@ -45,25 +44,13 @@ def _median(w: Array, n: Array, nw: Array) -> Array:
     return median
 
 
-def _restore_up(r: Array) -> Array:
-    r[:, 0, :] = np.cumsum(r[:, 0, :], axis=1)
-    return np.cumsum(r, axis=1)
-
-
-#: Predictors by their id in the bitstream. On time planes "up" is the previous instant.
-PREDICTORS: dict[int, Predictor] = {
-    0: Predictor("up", lambda w, n, nw: n, _restore_up),
-    1: Predictor("median", _median),
-}
-
-
 def residual(predictor: int, k: Array) -> Array:
-    """Returns residuals of samples k, both int32 [C, H, W], under PREDICTORS[predictor]: up to 2 MAX_SYMBOL = K_MAX."""
+    """Returns residuals of samples k, both int32 [C, H, W], under a predictor: up to 2 MAX_SYMBOL = K_MAX."""
     w, n, nw = np.zeros_like(k), np.zeros_like(k), np.zeros_like(k)
     w[:, :, 1:], n[:, 1:, :], nw[:, 1:, 1:] = k[:, :, :-1], k[:, :-1, :], k[:, :-1, :-1]
     n[:, 0, :] = nw[:, 0, :] = w[:, 0, :]
     w[:, 1:, 0] = nw[:, 1:, 0] = n[:, 1:, 0]
-    r: Array = k - PREDICTORS[predictor].predict(w, n, nw)
+    r: Array = k - _prediction(predictor, w, n, nw)
     return r
 
 
@@ -72,16 +59,18 @@ def restore(planes: Sequence[tuple[int, Array]]) -> list[Array]:
 
     C is the same throughout. Raises Malformed if a sample's magnitude exceeds MAX_SYMBOL.
     """
-    scanned = iter(_scan([r for predictor, r in planes if PREDICTORS[predictor].restore is None]))
-    result = list[Array]()
-    for predictor, r in planes:
-        undo = PREDICTORS[predictor].restore
-        result.append(undo(r.astype(np.int64)) if undo else next(scanned))
+    scanned = iter(_scan([r for predictor, r in planes if predictor == MEDIAN]))
+    result = [next(scanned) if predictor == MEDIAN else _summed(r.astype(np.int64)) for predictor, r in planes]
     for (predictor, _), k in zip(planes, result, strict=True):
         if magnitude(k) > MAX_SYMBOL:
-            name = PREDICTORS[predictor].name
-            raise Malformed(f"plane sample over {MAX_SYMBOL} in magnitude after predictor {predictor} ({name})")
+            raise Malformed(f"plane sample over {MAX_SYMBOL} in magnitude after predictor {PREDICTORS[predictor]}")
     return [k.astype(np.int32, copy=False) for k in result]
+
+
+def _summed(r: Array) -> Array:
+    """Undoes UP by running sums."""
+    r[:, 0, :] = np.cumsum(r[:, 0, :], axis=1)
+    return np.cumsum(r, axis=1)
 
 
 def _scan(planes: Sequence[Array]) -> list[Array]:
@@ -143,10 +132,10 @@ def _scan_together(planes: Sequence[Array]) -> list[Array]:
 
 def choose_predictor(k: Array) -> tuple[int, Array, float]:
     """Returns (id, int32 residuals, estimated bits) of the cheapest predictor for samples k int32 [C, H, W]."""
-    found = [(predictor, residual(predictor, k)) for predictor in PREDICTORS]
-    bits = [_estimated_bits(r) for _, r in found]
+    residuals = [residual(predictor, k) for predictor in (UP, MEDIAN)]
+    bits = [_estimated_bits(r) for r in residuals]
     best = int(np.argmin(bits))
-    return *found[best], bits[best]
+    return best, residuals[best], bits[best]
 
 
 def _estimated_bits(residuals: Array) -> float:
@@ -186,8 +175,8 @@ def fill_plane(k: Array, given: Array) -> tuple[Array, float]:
     under the predictor that then codes the plane cheapest. Returns (samples, estimated bits saved)."""
     if given.all():
         return k, 0.0
-    filled = [_filled(k, given, predictor) for predictor in PREDICTORS]
-    bits = [_estimated_bits(residual(predictor, x)) for predictor, x in zip(PREDICTORS, filled, strict=True)]
+    filled = [_filled(k, given, predictor) for predictor in (UP, MEDIAN)]
+    bits = [_estimated_bits(residual(predictor, x)) for predictor, x in enumerate(filled)]
     return filled[int(np.argmin(bits))], choose_predictor(k)[2] - min(bits)
 
 
@@ -205,7 +194,7 @@ def _filled(k: Array, given: Array, predictor: int) -> Array:
     for first, end in zip([0, *ends], ends, strict=False):
         if end > first:
             at = slice(first, end)
-            x[cell[at]] = PREDICTORS[predictor].predict(x[west[at]], x[north[at]], x[corner[at]]) if cell[first] else 0
+            x[cell[at]] = _prediction(predictor, x[west[at]], x[north[at]], x[corner[at]]) if cell[first] else 0
     return np.ascontiguousarray(x.astype(np.int32).T).reshape(k.shape)
 
 

@@ -107,10 +107,8 @@ def test_the_cost_of_exceptions_is_that_of_their_bytes(number, value):
 
 def test_channels_share_a_prior_only_if_that_saves_bits():
     costs = np.array([[10, 12, 90], [11, 10, 90], [80, 80, 10]], np.int64)
-    owner, total = fit_kernels.assign(costs, np.array([20, 20, 20]))
-    assert owner.tolist() in ([0, 0, 2], [1, 1, 2]) and total == min(10 + 11, 12 + 10) + 10 + 40
-    owner, total = fit_kernels.assign(costs, np.array([0, 0, 0]))
-    assert owner.tolist() == [0, 1, 2] and total == 30
+    assert fit_kernels.assign(costs, np.array([20, 20, 20])).tolist() == [0, 0, 2]
+    assert fit_kernels.assign(costs, np.array([0, 0, 0])).tolist() == [0, 1, 2]
 
 
 def test_pooled_histograms_count_all_symbols():
