@@ -15,7 +15,7 @@ import numpy as np
 
 from pd4dgs_codec.entropy import EFFORTS, PRIORS
 from pd4dgs_codec.entropy.ans import MAX_COUNT, AnsDecoder, ans_encode
-from pd4dgs_codec.entropy.fitting import Fit, Fitted, fit_best, histogram, plan_priors
+from pd4dgs_codec.entropy.fitting import Fit, Fitted, fit_best, fit_gauss, histogram, plan_priors
 from pd4dgs_codec.entropy.priors import (
     FIRST_REUSE,
     FREE_ENTRIES,
@@ -26,12 +26,8 @@ from pd4dgs_codec.entropy.priors import (
     make_models,
     read_prior,
 )
-from pd4dgs_codec.entropy.tables import BIT
 from pd4dgs_codec.entropy.varint import VARINT_MAX, ByteReader, put_varint
 from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
-
-#: Payloads of fewer bytes are always coded with Gaussians alone too, which is faster than estimating the result.
-SMALL = 4096
 
 
 @dataclass(frozen=True)
@@ -72,8 +68,7 @@ def encode_channels(
 ) -> CodedChannels:
     """Encodes int32 channels (1-D, any lengths, |k| <= 2**24) into one payload.
 
-    priors: "gauss" allows only const and gauss, the model of R(a). "best" allows every prior, and keeps the smaller
-    result of both if the payload has less than 4 kB or the estimate for Gaussians alone comes close.
+    priors: "gauss" allows only const and gauss, the model of R(a). "best" allows every prior.
     effort: 1..9, time spent on fitting. known: priors of earlier payloads, in order; a decoder must have them too.
     Raises EncodeError.
     """
@@ -81,14 +76,8 @@ def encode_channels(
         raise EncodeError(f"expected priors best or gauss and effort 1..9, found {priors!r} and {effort}")
     arrays = check_channels(channels)
     histograms = [histogram(a) for a in arrays if len(a)]
-    share, richer = effort > 2, priors == "best" and effort > 1
-    fit: Fit = (lambda h: fit_best(h, effort)) if richer else (lambda h: h.gauss)
-    best = _encode(arrays, plan_priors(histograms, fit, share, known), known)
-    least = sum(h.gauss.own for h in histograms) / BIT  # estimated bits with Gaussians: sharing can save more
-    if richer and (len(best[0]) < SMALL or least < 1.005 * 8 * len(best[0])):
-        other = _encode(arrays, plan_priors(histograms, lambda h: h.gauss, share, known), known)
-        best = min(best, other, key=lambda encoded: len(encoded[0]))
-    payload, defined = best
+    fit: Fit = (lambda h: fit_best(h, effort)) if priors == "best" and effort > 1 else fit_gauss
+    payload, defined = _encode(arrays, plan_priors(histograms, fit, effort > 2, known), known)
     return CodedChannels(payload, sum(h.rate_bits for h in histograms), defined)
 
 

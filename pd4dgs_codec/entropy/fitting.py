@@ -3,8 +3,8 @@
 Costs are in units of 2^-20 bits and exact, from the integer table and the prior's description; only the cost of
 exceptions is an estimate. Files are the same with and without numba.
 
-Sharing starts with one prior per channel and one for all, and removes priors whose description costs more than their
-channels lose under other priors.
+Sharing starts with one prior per channel and removes priors whose description costs more than their channels lose under
+other priors.
 """
 
 from __future__ import annotations
@@ -54,11 +54,6 @@ class Histogram:
     def rate_bits(self) -> float:
         """The sum of R(a), see `fit_kernels.gaussian_bits`."""
         return float(loops().gaussian_bits(self.values, self.counts))
-
-    @cached_property
-    def gauss(self) -> Fitted:
-        """The cheapest const or Gaussian, cached because fits with and without richer priors start from it."""
-        return fit_gauss(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +107,8 @@ def fit_gauss(h: Histogram) -> Fitted:
 def fit_best(h: Histogram, effort: int) -> Fitted:
     """Returns the cheaper of `fit_gauss` and a mixture in its window, which is not tried where the empirical entropy
     shows that it cannot gain."""
-    found, window = h.gauss, h.gauss.prior.window
+    found = fit_gauss(h)
+    window = found.prior.window
     if window.n == 1:
         return found
     dense, beside = _dense(h, window), _beside(h, window)
@@ -195,7 +191,7 @@ def plan_priors(histograms: Sequence[Histogram], fit: Fit, share: bool, known: S
     narrow = [c for c, h in enumerate(histograms) if len(h.values) <= WIDE]
     for start in range(0, len(narrow) if share else 0, BLOCK):
         block = narrow[start : start + BLOCK]
-        shared = _plan_block([histograms[c] for c in block], [plan[c] for c in block], free, fit)
+        shared = _shared([histograms[c] for c in block], [plan[c] for c in block], free)
         for c, prior in zip(block, shared, strict=True):
             plan[c] = prior
     return _within_limit(histograms, plan, free, fit)
@@ -221,11 +217,9 @@ def _within_limit(histograms: Sequence[Histogram], plan: list[Fitted], free: lis
     return [replaced.get(c, p) for c, p in enumerate(plan)]
 
 
-def _plan_block(histograms: Sequence[Histogram], plan: list[Fitted], free: list[Fitted], fit: Fit) -> list[Fitted]:
+def _shared(histograms: Sequence[Histogram], plan: list[Fitted], free: list[Fitted]) -> list[Fitted]:
     if len(histograms) < 2:
         return plan
-    priors, pooled = [*plan, *free], pool(histograms)
-    if len(pooled.values) <= 4 * max(len(h.values) for h in histograms):  # otherwise they have nothing in common
-        priors.append(fit(pooled))
+    priors = [*plan, *free]
     owner = loops().assign(costs_of(histograms, priors), np.array([p.price for p in priors]))
     return [priors[p] for p in owner]
