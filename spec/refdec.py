@@ -794,9 +794,9 @@ def cell_activity(channels, h, w):
     return [sum(magnitude[i * w + j] for i in near_i for j in near_j) for near_i in rows for near_j in columns]
 
 
-# 8.7 Classes by activity: "Lengths are varints, each the number of bytes of a stage, at most the bytes left in the
-# section, the varint's own included; their sum MUST NOT exceed the bytes that follow the last length, else Malformed.
-# The last stage takes the rest, to the section's end."
+# 8.6 The planes section: "Lengths are varints, each the number of bytes of a stage 0 .. S − 2, at most the bytes left
+# in the section, the varint's own included; their sum MUST NOT exceed the bytes that follow the last length, else
+# Malformed. The last stage takes the rest."
 def take_stages(reader, number):
     sizes = [reader.varint(reader.left) for _ in range(number - 1)]
     return [reader.take(size) for size in sizes] + [reader.take(reader.left)]
