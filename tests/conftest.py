@@ -31,18 +31,7 @@ ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT / name) for name in ("tools", "spec", "benchmarks")]
 
 #: Rooms that need the extra `train`; without it their tests are not even collected.
-NEED_TRAIN = [
-    "batch",
-    "bench",
-    "benchmarks",
-    "cli",
-    "data",
-    "interchange",
-    "model",
-    "draw",
-    "quality",
-    "train",
-]
+NEED_TRAIN = ["batch", "bench", "benchmarks", "cli", "data", "interchange", "model", "draw", "quality", "train"]
 NEED_NO_KERNEL = ["entropy", "spec"]
 collect_ignore = [] if find_spec("torch") and find_spec("numba") else NEED_TRAIN
 

@@ -259,11 +259,7 @@ def test_a_bad_upstream_gradient_does_not_hang(gradient):
 
 @pytest.mark.parametrize(
     "options, word",
-    [
-        ({"backend": "opengl"}, "backend"),
-        ({"backend": "gsplat"}, "gsplat"),
-        ({"near_plane": -1.0}, "near_plane"),
-    ],
+    [({"backend": "opengl"}, "backend"), ({"backend": "gsplat"}, "gsplat"), ({"near_plane": -1.0}, "near_plane")],
 )
 def test_options_that_are_refused(options, word):
     """Those of drawing arrays, which are checked alike, are in tests/draw/test_rasteriser.py."""

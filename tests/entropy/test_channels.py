@@ -8,14 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
-from pd4dgs_codec.entropy.priors import (
-    CONST,
-    FREE_ENTRIES,
-    GAUSS,
-    GMM2,
-    K_MAX,
-    MAX_WINDOW,
-)
+from pd4dgs_codec.entropy.priors import CONST, FREE_ENTRIES, GAUSS, GMM2, K_MAX, MAX_WINDOW
 from pd4dgs_codec.entropy.varint import put_varint
 from pd4dgs_codec.errors import EncodeError, LimitExceeded
 

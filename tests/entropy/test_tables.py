@@ -11,23 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import norm_table
 
-from pd4dgs_codec.entropy.priors import (
-    Const,
-    Gauss,
-    Mixture,
-    Normal,
-    Window,
-    _Tabled,
-    make_models,
-    normal_tables,
-)
-from pd4dgs_codec.entropy.tables import (
-    NORMAL,
-    OCTAVE,
-    SI_MAX,
-    SI_MIN,
-    TOTAL,
-)
+from pd4dgs_codec.entropy.priors import Const, Gauss, Mixture, Normal, Window, _Tabled, make_models, normal_tables
+from pd4dgs_codec.entropy.tables import NORMAL, OCTAVE, SI_MAX, SI_MIN, TOTAL
 
 
 def is_table(cum: np.ndarray, n: int) -> bool:

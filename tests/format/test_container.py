@@ -5,9 +5,7 @@ import zlib
 
 import pytest
 
-from pd4dgs_codec.errors import (
-    EncodeError,
-)
+from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format import container
 from pd4dgs_codec.format.container import (
     CHUNK_OVERHEAD,

@@ -151,15 +151,7 @@ def test_scenes_that_cannot_be_written_are_refused_in_one_line(message):
 
 
 @pytest.mark.parametrize(
-    "options",
-    [
-        {"mode": "zip"},
-        {"priors": "x"},
-        {"layers": 3},
-        {"layers": "2"},
-        {"effort": 0},
-        {"step_scale": 0},
-    ],
+    "options", [{"mode": "zip"}, {"priors": "x"}, {"layers": 3}, {"layers": "2"}, {"effort": 0}, {"step_scale": 0}]
 )
 def test_unknown_options_are_refused(options):
     with pytest.raises(EncodeError, match="expected"):

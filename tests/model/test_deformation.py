@@ -12,13 +12,7 @@ from pd4dgs_codec.model.config import DeformationConfig
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.hexplane import HexPlane, _Sample, sample_reference
 from pd4dgs_codec.model.networks import round_straight_through
-from pd4dgs_codec.model.plane_terms import (
-    TERMS,
-    proxy_bits,
-    proxy_bits_reference,
-    regularisers,
-    regularisers_reference,
-)
+from pd4dgs_codec.model.plane_terms import TERMS, proxy_bits, proxy_bits_reference, regularisers, regularisers_reference
 from pd4dgs_codec.scene import HEADS, PLANES
 
 BOX = np.array([[-1.0, -2.0, 0.5], [1.0, 3.0, 4.5]], np.float32)

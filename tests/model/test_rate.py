@@ -3,12 +3,7 @@
 import pytest
 import torch
 
-from pd4dgs_codec.model.rate import (
-    channel_moments,
-    log_probability,
-    row_bits,
-    row_bits_reference,
-)
+from pd4dgs_codec.model.rate import channel_moments, log_probability, row_bits, row_bits_reference
 
 
 def test_probabilities_of_all_symbols_sum_to_one():
