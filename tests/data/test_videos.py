@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from folders import CAMERAS, FPS, rig_views, write_synchronised
+from folders import CAMERAS, FPS, rig_views
+from test_colmap import write_synchronised
 from videos import write_video
 
 from pd4dgs_codec.data import videos as cached

@@ -1,15 +1,129 @@
-"""Blender-like folders: axes, intrinsics, times, splits, background, points, box."""
+"""Blender-like folders: axes, intrinsics, times, splits, background, points, box; written and damaged."""
 
+from __future__ import annotations
+
+import io
 import json
 import struct
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from folders import change_frames, gradient, pose
+from folders import NAN, change_frames, gradient, pose, save
 from PIL import Image
 
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.data.files import read_vertices
+
+FRAMES = [{"file_path": f"r_{i}", "time": i / 10, "transform_matrix": pose(0.2 * i)} for i in range(3)]
+XYZ = "property float x\nproperty float y\nproperty float z\n"
+
+
+def ply(form: str, body: bytes = b"", properties: str = XYZ, vertices: int = 2) -> bytes:
+    return f"ply\nformat {form} 1.0\nelement vertex {vertices}\n{properties}end_header\n".encode() + body
+
+
+def write_blender(_: object, folder: Path) -> Path:
+    """Three frames, points, depths and a distorting lens."""
+    file = {"camera_angle_x": 0.8, "w": 12, "h": 8, "k1": 0.01, "near_far_per_frame": [[1, 9]] * 3, "frames": FRAMES}
+    save(folder / "transforms.json", file | {"ply_file_path": "points.ply"})
+    save(folder / "points.ply", ply("ascii", b"0 0 0\n1 1 1\n"))
+    for i in range(3):
+        save(folder / f"r_{i}.png", gradient(12, 8, i))
+    save(folder.parent / "outside" / "r_0.png", gradient(12, 8))
+    (folder / "out").symlink_to(folder.parent / "outside")
+    return folder
+
+
+def frame(**keys: Any) -> Callable[[dict], dict]:
+    """A change of frame 0 of transforms.json."""
+    return lambda value: value | {"frames": [value["frames"][0] | keys, *value["frames"][1:]]}
+
+
+def entry(i: int, j: int, value: float) -> list:
+    """A pose with another number."""
+    matrix = np.array(pose())
+    matrix[i, j] = value
+    return matrix.tolist()
+
+
+def blank() -> bytes:
+    """A black PNG of 4 kB and 33 megapixels."""
+    stream = io.BytesIO()
+    Image.new("1", (8192, 4096)).save(stream, "png")
+    return stream.getvalue()
+
+
+def scans() -> bytes:
+    """A progressive JPEG whose last pass comes a hundred times more."""
+    stream = io.BytesIO()
+    Image.new("L", (12, 8), 128).save(stream, "jpeg", progressive=True)
+    raw = stream.getvalue()[:-2]
+    return raw + 100 * raw[raw.rindex(b"\xff\xda") :] + b"\xff\xd9"
+
+
+LAYOUTS = {"blender": write_blender}
+FAULTS = {
+    "blender": [
+        ("transforms.json", dict(fl_x=NAN), "fl_x is nan"),
+        ("transforms.json", dict(fl_x=0), "fl_x is 0, expected a number > 0"),
+        ("transforms.json", dict(fl_x=10**400), "fl_x is 1000"),
+        ("transforms.json", dict(fl_x="wide"), "fl_x is 'wide'"),
+        ("transforms.json", dict(camera_angle_x=None), "no focal length"),
+        ("transforms.json", dict(camera_angle_x=3.5), "expected radians below pi"),
+        ("transforms.json", dict(camera_model="THIN_PRISM_FISHEYE"), "THIN_PRISM_FISHEYE"),
+        ("transforms.json", frame(transform_matrix=entry(0, 0, 1.1)), "frame 0: transform_matrix is not a rot"),
+        ("transforms.json", frame(transform_matrix=entry(1, 1, -1)), "determinant -1"),
+        ("transforms.json", frame(transform_matrix=entry(0, 3, NAN)), "frame 0: transform_matrix holds NaN"),
+        ("transforms.json", frame(transform_matrix=[[1, 0], [0, 1]]), "has shape"),
+        ("transforms.json", frame(transform_matrix=None), "transform_matrix"),
+        ("transforms.json", frame(file_path=None), "frame 0 has no file_path"),
+        ("transforms.json", frame(file_path="gone/r_0"), "gone/r_0: image is missing"),
+        ("transforms.json", dict(w=16, h=8), "r_0.png: image is 12x8, expected 16x8"),
+        ("transforms.json", frame(time=NAN), "frame 0: time is nan"),
+        ("transforms.json", dict(frames=[]), "found no frames, expected a list of at least 1"),
+        ("transforms.json", dict(ply_file_path="gone.ply"), "gone.ply: cannot be read"),
+        ("transforms.json", dict(near_far_per_frame=[[3, 1]] * 3), "expected 0 < near < far"),
+        ("transforms.json", dict(near_far_per_frame=[[1, 3]]), "has shape (1, 2), expected (3, 2)"),
+        ("transforms.json", b'{\n "w": 3,\n "h": ]\n}', "transforms.json: line 3, column 7: broken JSON"),
+        ("transforms.json", b'{"a":' + b"[" * 500_000, "cannot be read as JSON"),
+        ("transforms.json", b"[1]", "found a JSON list, expected an object"),
+        ("transforms.json", b"\xff\xfe\x00", "cannot be read as JSON"),
+        ("transforms.json", b'{"fl_x": 1' + b"0" * 5000 + b"}", "transforms.json"),
+        ("r_1.png", b"", "r_1.png"),
+        ("r_1.png", b"not a png", "r_1.png"),
+        ("r_1.png", lambda data: data[: len(data) // 2], "r_1.png"),
+        ("points.ply", b"", "points.ply: not a PLY file"),
+        ("points.ply", b"ply\nformat ascii 1.0\n", "not a PLY file"),
+        ("points.ply", ply("binary_big_endian"), "expected ascii or binary_little_endian"),
+        ("points.ply", ply("binary_little_endian", bytes(23)), "23 bytes of vertices, expected 24"),
+        ("points.ply", ply("ascii", b"1 2 3\n"), "1 vertex lines, expected 2"),
+        ("points.ply", ply("ascii", b"1 2 3\n1 2\n"), "vertex lines are not 3 numbers"),
+        ("points.ply", ply("ascii", b"1\n2\n", "property float x\n"), "expected x, y, z once each"),
+        ("points.ply", ply("ascii", b"", "property list uchar int i\n"), "expected a scalar"),
+        ("points.ply", ply("ascii").replace(b"2\n", b"99999999999\n", 1), "0 vertex lines"),
+        ("transforms.json", {"camera_model": ["PINHOLE"]}, "camera_model is ['PINHOLE'], expected a name"),
+        ("transforms.json", {"camera_model": {}}, "camera_model is {}, expected a name"),
+        ("transforms.json", {"ply_file_path": "../points.ply"}, "'../points.ply' is not the name of a file in"),
+        ("transforms.json", {"ply_file_path": "/etc/passwd"}, "'/etc/passwd' is not the name of a file in"),
+        ("transforms.json", {"ply_file_path": "p\0.ply"}, "is not the name of a file in"),
+        *(
+            ("transforms.json", frame(file_path=name), "is not the name of a file in")
+            for name in ("../r_0", "/r_0", "a/../../r_0", "out/r_0", "r\0", "", ".")
+        ),
+        ("transforms.json", frame(file_path="x" * 300), "image is missing"),
+        ("transforms.json", frame(file_path="\x1b]0;x\x07" * 40), "image is missing"),
+        ("transforms.json", {"frames": FRAMES * 5, "near_far_per_frame": None}, "15 frames of 3 pictures"),
+        ("r_0.png", lambda _: blank(), "33,554,432 pixels, expected"),
+        ("r_0.png", lambda _: scans(), "scans, expected 100 at most in a JPEG"),
+        ("r_0.png", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 12 8\n", "not an image that can be read"),
+    ],
+}  # fmt: skip
+
+
+# -- reading -----------------------------------------------------------------------------------------------------------
 
 
 def test_axes_become_opencv(blender):
@@ -62,7 +176,7 @@ def test_missing_times_go_by_index(blender):
 def test_split_files_decide(blender):
     folder = blender(n=9, name="transforms_train.json")
     file = json.loads((folder / "transforms_train.json").read_text())
-    (folder / "transforms_test.json").write_text(json.dumps({**file, "frames": file["frames"][3:5]}))
+    save(folder / "transforms_test.json", {**file, "frames": file["frames"][3:5]})
     d = load(folder)
     assert len(d.train) == 9 and [v.name for v in d.test] == ["r_003", "r_004"]
     assert d.test[0].time == pytest.approx(3 / 8)
@@ -75,7 +189,7 @@ def test_alpha_goes_on_the_background(blender, color):
     rgba[:, :6] = 200, 100, 0, 255
     rgba[:, 6:9] = 200, 100, 0, 51
     for i in range(2):
-        Image.fromarray(rgba).save(folder / f"r_{i:03d}.png")
+        save(folder / f"r_{i:03d}.png", rgba)
     d, behind = load(folder, holdout=0, background=color), color or (1, 1, 1)
     assert d.background == behind
     image = d.train[0].image
@@ -89,7 +203,7 @@ def test_uniform_border_is_the_background(blender, color):
     for i in range(3):
         image = np.full((8, 12, 3), color, np.uint8)
         image[3:5, 3:9] = 77
-        Image.fromarray(image).save(folder / f"r_{i:03d}.png")
+        save(folder / f"r_{i:03d}.png", image)
     for asked in (None, (0.5, 0.5, 0.5)):  # there is no alpha to see it through
         d = load(folder, background=asked)
         assert d.background == pytest.approx([c / 255 for c in color]) and d.train[0].image[0, 0].tolist() == [*color]
@@ -102,27 +216,22 @@ def test_busy_border_means_black(blender):
 def test_binary_and_ascii_points_agree(blender):
     folder = blender()
     xyz = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
-    head = "ply\nformat {} 1.0\ncomment x\nelement vertex 50\n" + "".join(f"property float {c}\n" for c in "xyz")
-    head += "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
+    properties = f"comment x\n{XYZ}property uchar red\nproperty uchar green\nproperty uchar blue\n"
     rows = [(*p.tolist(), i, 2 * i, 255 - i) for i, p in enumerate(xyz)]
-    body = b"".join(struct.pack("<3f3B", *r) for r in rows)
-    (folder / "a.ply").write_bytes(head.format("binary_little_endian").encode() + body)
-    binary = load(folder)
-    (folder / "a.ply").write_text(head.format("ascii") + "".join(" ".join(map(repr, r)) + "\n" for r in rows))
-    text = load(folder)
-    for d in (binary, text):
+    packed = b"".join(struct.pack("<3f3B", *row) for row in rows)
+    text = "".join(" ".join(map(repr, row)) + "\n" for row in rows).encode()
+    for form, body in (("binary_little_endian", packed), ("ascii", text)):
+        save(folder / "a.ply", ply(form, body, properties, len(xyz)))
+        d = load(folder)
         np.testing.assert_array_equal(d.points, xyz)
-    inside = ((xyz >= binary.box[0]) & (xyz <= binary.box[1])).all(axis=1)
-    assert inside.mean() >= 0.95
+        assert ((xyz >= d.box[0]) & (xyz <= d.box[1])).all(axis=1).mean() >= 0.95
 
 
 def test_named_points_go_before_the_only_one(blender):
     folder = blender(ply_file_path="b.ply")
-    for name, x in (("a", 1.0), ("b", 2.0)):
-        head = "ply\nformat ascii 1.0\nelement vertex 1\n" + "".join(f"property float {c}\n" for c in "xyz")
-        (folder / f"{name}.ply").write_text(head + f"end_header\n{x} 0 0\n")
-    d = load(folder)
-    assert d.points.tolist() == [[2.0, 0.0, 0.0]]
+    for name, point in (("a", b"1 0 0\n"), ("b", b"2 0 0\n")):
+        save(folder / f"{name}.ply", ply("ascii", point, vertices=1))
+    assert load(folder).points.tolist() == [[2.0, 0.0, 0.0]]
 
 
 def test_box_and_depth_without_points(blender):
@@ -186,19 +295,16 @@ def test_pictures_are_resampled_by_the_formulas_of_opencv(tmp_path, name):
     lens, (width, height) = LENSES[name], (80, 60)
     fx, fy, cx, cy = 75.0, 74.0, 40.75, 29.4
     u, v = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
-    Image.fromarray(np.rint(_levels(u, v)).astype(np.uint8)).save(tmp_path / "0.png")
+    save(tmp_path / "0.png", np.rint(_levels(u, v)).astype(np.uint8))
     content = {"fl_x": fx, "fl_y": fy, "cx": cx, "cy": cy, "w": width, "h": height, **lens}
     content["frames"] = [{"file_path": "0.png", "transform_matrix": pose()}]
-    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    save(tmp_path / "transforms.json", content)
     view = load(tmp_path, holdout=0).train[0]
     np.testing.assert_allclose(view.K, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], rtol=1e-6)
 
     x, y = (u - cx) / fx, (v - cy) / fy
-    k, (p1, p2), r = (
-        [lens.get(f"k{i}", 0.0) for i in range(1, 5)],
-        (lens.get(f"p{i}", 0.0) for i in (1, 2)),
-        np.hypot(x, y),
-    )
+    k, r = [lens.get(f"k{i}", 0.0) for i in range(1, 5)], np.hypot(x, y)
+    p1, p2 = (lens.get(f"p{i}", 0.0) for i in (1, 2))
     if name == "fisheye":
         angle = np.arctan(r)
         scale = angle * (1 + sum(k[i] * angle ** (2 * i + 2) for i in range(4))) / r
