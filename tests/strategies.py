@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 from pd4dgs_codec import encode
 from pd4dgs_codec.entropy.tables import norm_cdf28_of_each, tables_of_each
+from pd4dgs_codec.format.info import info as info_of
 from pd4dgs_codec.format.quantise import NO_CLASSES, Grid, attribute_rows, dequantise
 from pd4dgs_codec.scene import (
     DEFAULT_WIDTHS,
@@ -239,15 +240,19 @@ def assert_same_scene(a: Scene, b: Scene) -> None:
     for x, y in zip(a.mask, b.mask, strict=True):
         np.testing.assert_array_equal(x, y)
     assert_same_networks(a.networks, b.networks)
-    for x, y in ((a.global_deformation, b.global_deformation), (a.local_deformation, b.local_deformation)):
-        assert (x is None) == (y is None)
-        if x is not None and y is not None:
-            assert_same_networks(x.networks, y.networks)
-            assert len(x.planes) == len(y.planes)
-            for p, q in zip(x.planes, y.planes, strict=True):
-                assert list(p) == list(q)
-                for name in p:
-                    np.testing.assert_array_equal(p[name], q[name], err_msg=name)
+    for layer in (1, 2):
+        assert_same_deformation(a.deformation(layer), b.deformation(layer))
+
+
+def assert_same_deformation(a: Deformation | None, b: Deformation | None) -> None:
+    """Both are absent, or have equal networks and planes."""
+    assert (a is None) == (b is None)
+    if a is not None and b is not None:
+        assert_same_networks(a.networks, b.networks)
+        for p, q in zip(a.planes, b.planes, strict=True):
+            assert list(p) == list(q)
+            for name in p:
+                np.testing.assert_array_equal(p[name], q[name], err_msg=name)
 
 
 def assert_same_networks(a: dict[str, Network], b: dict[str, Network]) -> None:
@@ -257,6 +262,30 @@ def assert_same_networks(a: dict[str, Network], b: dict[str, Network]) -> None:
         for (wa, ba), (wb, bb) in zip(a[name], b[name], strict=True):
             np.testing.assert_array_equal(wa, wb, err_msg=name)
             np.testing.assert_array_equal(ba, bb, err_msg=name)
+
+
+def assert_same_info(a: SceneInfo, b: SceneInfo) -> None:
+    """What the header says beside the steps."""
+    for name in ("voxel_size", "time_range", "background", "near", "far", "up", "unit"):
+        assert getattr(a, name) == getattr(b, name), name
+    np.testing.assert_array_equal(a.box, b.box)
+    assert (a.camera is None) == (b.camera is None)
+    if a.camera is not None and b.camera is not None:
+        np.testing.assert_array_equal(a.camera.viewmat, b.camera.viewmat)
+        np.testing.assert_array_equal(a.camera.K, b.camera.K)
+        assert (a.camera.width, a.camera.height) == (b.camera.width, b.camera.height)
+
+
+def slice_ends(data: bytes) -> list[int]:
+    """Where each slice of a file ends, as `info` says."""
+    return [part["end"] for layer in info_of(data)["layers"] for part in layer["slices"]]
+
+
+def busy(shape: tuple[int, int, int], rng: np.random.Generator) -> np.ndarray:
+    """Residuals int32 [C, H, W] that are large in some blocks of 5 by 5 cells, in all channels."""
+    _, h, w = shape
+    loudness = np.kron(np.exp(rng.normal(size=(h // 5 + 1, w // 5 + 1)) * 2), np.ones((5, 5)))[:h, :w]
+    return np.rint(rng.normal(size=shape) * loudness).astype(np.int32)
 
 
 def norm_table(n: int, mu8: int, si: int) -> np.ndarray:

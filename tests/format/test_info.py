@@ -1,15 +1,16 @@
 """info from a file's first bytes, digests of its contents, and the npz keys."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from fuzzing.mutate import Chunk, put_together, take_apart
 from strategies import make_scene, small_file
 
 from pd4dgs_codec import FORMAT_VERSION
 from pd4dgs_codec.errors import DecodeError, Truncated
-from pd4dgs_codec.format import canonical
-from pd4dgs_codec.format.container import FLAG_ANCILLARY, read_chunk, read_preamble, write_chunk, write_preamble
+from pd4dgs_codec.format.container import FLAG_ANCILLARY
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode, encode_with_report
 from pd4dgs_codec.format.info import hashes, info, metadata_of
@@ -29,10 +30,8 @@ def test_info_needs_the_header_alone():
     assert whole["format_version"] == FORMAT_VERSION == "3.0"
     assert whole["bytes"] == first["bytes"] == len(data)
     place = ("layer", "offset", "bytes", "end")
-    assert [{k: row[k] for k in place} for row in whole["layers"]] == [
-        {k: row[k] for k in place} for row in first["layers"]
-    ]
-    assert [set(row) for row in first["layers"]] == [{*place, "slices"}] * len(whole["layers"])
+    before, after = ([{k: row[k] for k in place} for row in found["layers"]] for found in (first, whole))
+    assert before == after and all(set(row) == {*place, "slices"} for row in first["layers"])
     ends = [whole["header_bytes"], *(row["end"] for row in whole["layers"])]
     assert [row["offset"] for row in whole["layers"]] == ends[:-1] and ends[-1] == len(data)
     decoded = decode(data)
@@ -81,12 +80,8 @@ def test_npz_keys_and_symbols():
 
 def test_info_names_chunks_it_does_not_know():
     data = small_file(omit="nothing")
-    preamble = read_preamble(data)
-    fields, extra = canonical.unpack(preamble.header), b"a preview"
-    fields[1].append([99, len(extra)])
-    chunk = write_chunk(99, FLAG_ANCILLARY, read_chunk(data, preamble.size).scene_id, extra)
-    front = write_preamble(canonical.pack(fields))
-    longer = front + data[preamble.size :] + chunk
+    parts = take_apart(data)
+    longer = put_together(replace(parts, chunks=[*parts.chunks, Chunk(99, FLAG_ANCILLARY, b"a preview")]))
     assert info(longer)["chunks"] == [{"type": 99, "offset": len(longer) - 29, "bytes": 29, "end": len(longer)}]
     assert [row["layer"] for row in info(longer)["layers"]] == [0, 1, 2] and hashes(longer) == hashes(data)
 

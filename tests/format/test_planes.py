@@ -1,13 +1,15 @@
-"""Plane predictors: exact inverses, and the definition itself against a scalar loop."""
+"""Planes: predictors are undone exactly and follow their definition; the section gives back the residuals, and classes
+pay where samples are large in some places."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import memory_below
+from strategies import busy, memory_below
 
+from pd4dgs_codec.entropy.channels import encode_channels
 from pd4dgs_codec.entropy.priors import K_MAX
-from pd4dgs_codec.format.planes import MEDIAN, UP, choose_predictor, residual, restore
+from pd4dgs_codec.format.planes import MEDIAN, UP, choose_predictor, read_planes, residual, restore, write_planes
 from pd4dgs_codec.format.quantise import MAX_SYMBOL
 
 shapes = st.tuples(st.integers(1, 3), st.integers(1, 9), st.integers(1, 9))
@@ -83,3 +85,52 @@ def test_the_choice_suits_the_plane():
     assert choose_predictor(rows)[0] == UP
     steps = np.cumsum(rng.integers(0, 9, (4, 30, 40), dtype=np.int32), axis=2)
     assert choose_predictor(np.cumsum(steps, axis=1))[0] == MEDIAN
+
+
+# -- the section -------------------------------------------------------------------------------------------------------
+
+
+def assert_same_planes(found, expected):
+    assert len(found) == len(expected)
+    for a, b in zip(found, expected, strict=True):
+        assert a.dtype == np.int32
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("channels", [4, 7])
+def test_classes_pay_where_cells_are_busy(channels):
+    rng = np.random.default_rng(0)
+    planes = [busy((channels, *size), rng) for size in ((40, 50), (30, 45))]
+    data, rate = write_planes(planes, "best", 5)
+    plain = encode_channels([channel.ravel() for plane in planes for channel in plane])
+    assert len(data) < 0.95 * len(plain.payload)
+    assert rate == pytest.approx(plain.rate_bits)
+    assert_same_planes(read_planes(data, [plane.shape for plane in planes]), planes)
+
+
+def test_classes_cost_little_where_cells_are_alike():
+    planes = [np.random.default_rng(0).integers(-9, 10, (4, 20, 20)).astype(np.int32)]
+    plain = encode_channels([channel.ravel() for channel in planes[0]])
+    assert len(write_planes(planes, "best", 3)[0]) < 1.05 * len(plain.payload)
+
+
+@given(
+    st.integers(1, 9),
+    st.lists(st.tuples(st.integers(1, 8), st.integers(1, 8)), min_size=1, max_size=6),
+    st.sampled_from((("best", 1), ("best", 3), ("gauss", 3))),
+    st.integers(0, 1000),
+)
+@settings(max_examples=40)
+def test_any_shapes_come_back(channels, sides, options, seed):
+    rng = np.random.default_rng(seed)
+    planes = [busy((channels, *size), rng) for size in sides]
+    shapes = [plane.shape for plane in planes]
+    assert_same_planes(read_planes(write_planes(planes, *options)[0], shapes), planes)
+
+
+@given(st.integers(0, 1000), st.sampled_from((1, 2, 5)))
+@settings(max_examples=8)
+def test_the_largest_residuals_come_back(seed, channels):
+    rng = np.random.default_rng(seed)
+    planes = [rng.choice([-K_MAX, -1, 0, K_MAX], (channels, 9, 9)).astype(np.int32)]
+    assert_same_planes(read_planes(write_planes(planes, "best", 1)[0], [planes[0].shape]), planes)

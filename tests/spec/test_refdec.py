@@ -10,7 +10,7 @@ import numpy as np
 import refdec
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import make_scene, scenes
+from strategies import busy, make_scene, scenes
 
 from pd4dgs_codec.entropy.positions import position_channels
 from pd4dgs_codec.entropy.priors import K_MAX
@@ -49,25 +49,14 @@ def test_tensors_by_name_and_prefixes():
     assert [p.tensors for p in prefix] == [p.tensors for p in layers[:2]] and len(prefix) == 2
 
 
-def busy_scene():
-    """A scene whose planes are large in some blocks, in all channels."""
+def test_hashes_of_busy_planes():
     scene, rng = make_scene(5, layers=(0, 1), anchors=50, channels=5, sides=(20, 25, 22, 4)), np.random.default_rng(6)
     planes = {
-        name: dequantise(busy(rng, plane.shape), scene.steps.planes_global)
+        name: dequantise(busy(plane.shape, rng), scene.steps.planes_global)
         for name, plane in scene.global_deformation.planes[0].items()
     }
-    return replace(scene, global_deformation=replace(scene.global_deformation, planes=(planes,)))
-
-
-def busy(rng, shape, spread=2.0):
-    """Symbols [C, H, W] that are large in some blocks of 4 by 4 places, in all channels."""
-    _, h, w = shape
-    places = np.kron(np.exp(rng.normal(size=(h // 4 + 1, w // 4 + 1)) * spread), np.ones((4, 4)))[:h, :w]
-    return np.clip(np.rint(rng.normal(size=shape) * places), -K_MAX, K_MAX).astype(np.int32)
-
-
-def test_hashes_of_busy_planes():
-    data = encode(busy_scene(), layers=2, effort=2, omit="nothing")
+    scene = replace(scene, global_deformation=replace(scene.global_deformation, planes=(planes,)))
+    data = encode(scene, layers=2, effort=2, omit="nothing")
     assert refdec.hashes(data) == hashes(data)
 
 
