@@ -20,6 +20,7 @@ from strategies import (
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format import encoder
 from pd4dgs_codec.format.decoder import decode
+from pd4dgs_codec.format.options import CHOICES
 from pd4dgs_codec.morton import morton_codes
 from pd4dgs_codec.scene import Widths
 
@@ -146,11 +147,16 @@ def test_scenes_that_cannot_be_written_are_refused_in_one_line(message):
 
 
 @pytest.mark.parametrize(
-    "options", [{"mode": "zip"}, {"priors": "x"}, {"layers": 3}, {"layers": "2"}, {"effort": 0}, {"step_scale": 0}]
+    "name, value",
+    [
+        *((name, "other") for name in CHOICES),
+        *(("step_scale", scale) for scale in (0, 0.0, -1.0, float("inf"), float("nan"))),
+        *(("layers", 3), ("layers", "2"), ("effort", 0)),
+    ],
 )
-def test_unknown_options_are_refused(options):
-    with pytest.raises(EncodeError, match="expected"):
-        encode(make_scene(0), **options)
+def test_options_out_of_range_are_named(name, value):
+    with pytest.raises(EncodeError, match=f"^{name} {value!r}, expected (one of|a positive number)"):
+        encode(make_scene(0), **{name: value})
 
 
 @pytest.mark.filterwarnings("error")

@@ -8,12 +8,11 @@ from strategies import by_voxel, make_scene
 from tiny import camera_ahead
 
 from pd4dgs_codec.data.view import View
-from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.info import hashes, info, metadata_of
 from pd4dgs_codec.format.metadata import Metadata
-from pd4dgs_codec.format.options import CHOICES, EncodeOptions
+from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.model.sensitivity import utility, without
 from pd4dgs_codec.quality import packing, target
@@ -38,18 +37,6 @@ def test_steps_are_scaled_once():
     packed = pack(scene, EncodeOptions(mode="lzma", effort=1, step_scale=2.0))
     assert packed.data == encode(scene, FAST, step_scale=2.0) == encode(packed.scene, FAST)
     assert packed.scene.steps == scene.steps.scaled(2.0)
-
-
-@pytest.mark.parametrize("name", CHOICES)
-def test_a_choice_that_is_none_is_named(name):
-    with pytest.raises(EncodeError, match=rf"^{name} 'other', expected one of \["):
-        EncodeOptions(**{name: "other"})
-
-
-@pytest.mark.parametrize("scale", [0.0, -1.0, float("inf"), float("nan")])
-def test_a_scale_that_is_none_is_named(scale):
-    with pytest.raises(EncodeError, match="step_scale .*, expected a positive number"):
-        EncodeOptions(step_scale=scale)
 
 
 SLICED = EncodeOptions(effort=1, slices=1500)
