@@ -1,6 +1,7 @@
 """What tests ask of runs: their logs, their weights, and that resuming changes nothing."""
 
 import json
+import signal
 
 import torch
 
@@ -13,11 +14,24 @@ def read_log(path) -> list[dict]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def assert_same_weights(path, other) -> None:
-    """Two checkpoints hold one model, bit for bit."""
+def assert_same_weights(path, other, rtol: float = 0.0, atol: float = 0.0) -> None:
+    """Two checkpoints hold one model, bit for bit unless said otherwise."""
     a, b = (checkpoint.load(p)[0].state_dict() for p in (path, other))
     assert a.keys() == b.keys()
-    assert all(torch.equal(a[name], b[name]) for name in a), (path, other)
+    for name in a:
+        torch.testing.assert_close(a[name], b[name], rtol=rtol, atol=atol, msg=f"{name} of {path} and {other}")
+
+
+def interrupt(trainer, number, when) -> None:
+    """The signal comes in the middle of each step in which `when()` is true."""
+    update = trainer.learner.optimiser.step
+
+    def interrupted(*at):
+        if when():
+            signal.raise_signal(number)
+        update(*at)
+
+    trainer.learner.optimiser.step = interrupted
 
 
 def run_saving(trainer, folder, cuts, **options) -> None:
@@ -31,6 +45,16 @@ def run_saving(trainer, folder, cuts, **options) -> None:
 
     trainer.learner.step = saved_before
     trainer.run(folder / "whole.pt", **options)
+
+
+def assert_goes_on_as_one_run(config, dataset, part) -> None:
+    """A run resumed at the checkpoint `part` ends as one that was never cut."""
+    resumed, whole = (Trainer(config, dataset) for _ in range(2))
+    resumed.resume(part)
+    resumed.run(part.with_name("resumed.pt"))
+    whole.run(part.with_name("uncut.pt"))
+    assert not resumed.interrupted
+    assert_same_weights(part.with_name("resumed.pt"), part.with_name("uncut.pt"))
 
 
 def assert_resumes_bit_for_bit(config, dataset, folder, cuts) -> None:

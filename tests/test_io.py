@@ -58,9 +58,7 @@ def test_a_name_with_a_colon_is_an_output(tmp_path, monkeypatch, name):
 def test_bytes_reach_the_disk_before_the_name(tmp_path, monkeypatch):
     events = []
     fsync, replace = os.fsync, os.replace
-    monkeypatch.setattr(
-        os, "fsync", lambda descriptor: (events.append(os.fstat(descriptor).st_size), fsync(descriptor))
-    )
+    monkeypatch.setattr(os, "fsync", lambda file: (events.append(os.fstat(file).st_size), fsync(file)))
     monkeypatch.setattr(os, "replace", lambda *paths: (events.append(paths[1].name), replace(*paths)))
     io.write_bytes(tmp_path / "x.bin", b"12345", overwrite=False)
     assert events == [5, "x.bin"] and (tmp_path / "x.bin").read_bytes() == b"12345"

@@ -142,10 +142,8 @@ def test_layers_are_those_of_torch(count):
     )
     x = rng.normal(size=(count, 13)).astype(np.float32)
     expected = torch.from_numpy(x)
-    for i, (weight, bias) in enumerate(layers):
-        expected = torch.nn.functional.linear(
-            expected.relu() if i else expected, *map(torch.from_numpy, (weight, bias))
-        )
+    for i, pair in enumerate(layers):
+        expected = torch.nn.functional.linear(expected.relu() if i else expected, *map(torch.from_numpy, pair))
     np.testing.assert_allclose(Layers(layers)(x), expected, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(Layers(layers, relu_last=True)(x), expected.relu(), rtol=1e-4, atol=1e-4)
     assert np.isnan(Layers(layers)(np.full_like(x, np.nan))).all()
@@ -167,8 +165,7 @@ def test_rendering_a_file_needs_no_torch_and_no_datasets(tmp_path):
     file = tmp_path / "scene.pd4"
     scene = _scene()
     file.write_bytes(encode(replace(scene, info=replace(scene.info, camera=_camera(0))), layers=2, effort=1))
-    done = subprocess.run(
-        [sys.executable, "-c", RENDER, file, tmp_path / "out.png"], cwd=ROOT, capture_output=True, text=True
-    )
+    command = [sys.executable, "-c", RENDER, file, tmp_path / "out.png"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     assert Image.open(tmp_path / "out.png").size == (48, 36)

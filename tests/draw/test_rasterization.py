@@ -76,9 +76,8 @@ def draw_with_gradients(tensors, view, backend, background=(0.0, 0.0, 0.0), **op
 
 def relative_errors(found, expected):
     """||found - expected|| / ||expected|| of every tensor of two draw_with_gradients results."""
-    return {
-        k: float((found[k] - expected[k]).norm() / expected[k].norm().clamp(min=1e-12)) for k in expected if k != "meta"
-    }
+    names = expected.keys() - {"meta"}
+    return {k: float((found[k] - expected[k]).norm() / expected[k].norm().clamp(min=1e-12)) for k in names}
 
 
 def oracle_errors(tensors, view, background=(0.0, 0.0, 0.0)):
@@ -155,9 +154,7 @@ def test_side_clamp_of_the_jacobian_matters_and_agrees():
     errors, *_ = oracle_errors(tensors, view)
     assert max(errors.values()) < LIMIT, errors
     # A view wide enough for no clamp has another covariance: the clamp was active.
-    matrices = [t.detach().double() for t in tensors[:3]] + [
-        torch.from_numpy(m).double() for m in (view.viewmat, view.K)
-    ]
+    matrices = [t.detach().double() for t in (*tensors[:3], *map(torch.from_numpy, (view.viewmat, view.K)))]
     clamped, wide = (reference.project(*matrices, size, size)[1] for size in (40, 4000))
     assert not torch.allclose(clamped[:2], wide[:2], rtol=0.1) and torch.equal(clamped[2], wide[2])
 

@@ -68,9 +68,8 @@ def test_bounds_allow_for_the_rounding_of_large_values():
     scene = make_scene(2, anchors=5, layers=(0,))
     feature = np.zeros_like(scene.feature)
     feature[0, :3] = 2**23 * step, 2.5 * step, -0.3 * step
-    data, report = encode_with_report(
-        replace(scene, steps=replace(scene.steps, feature=step), feature=feature), effort=1
-    )
+    scene = replace(scene, steps=replace(scene.steps, feature=step), feature=feature)
+    data, report = encode_with_report(scene, effort=1)
     assert report.errors[0].largest <= declared(data)["feature"]
     assert declared(data)["feature"] == pytest.approx(step / 2 + 0.03125, rel=1e-6)
 

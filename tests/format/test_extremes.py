@@ -21,10 +21,9 @@ def many(anchors, widths):
     index = np.arange(anchors)
     cells = np.stack([index % 97, index // 97 % 89, index // (97 * 89)], axis=1).astype(np.int32)
     rows = rng.permutation(anchors)
-    shapes = {name: (anchors, *shape) for name, shape in widths.attributes.items()}
-    values = {
-        name: rng.integers(-3, 4, shape) * np.float32(base.steps.attributes[name]) for name, shape in shapes.items()
-    }
+    values = {}
+    for name, shape in widths.attributes.items():
+        values[name] = rng.integers(-3, 4, (anchors, *shape)) * np.float32(base.steps.attributes[name])
     return replace(
         base,
         rows=(anchors,),

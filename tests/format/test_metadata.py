@@ -13,9 +13,7 @@ from pd4dgs_codec.format import canonical, metadata
 from pd4dgs_codec.format.metadata import Metadata, read_metadata, write_metadata
 
 PNG = metadata.STILL_SIGNATURES[0]
-FULL = Metadata(
-    "Kitchen", "a phone, twelve seconds", "CC BY 4.0", "pd4dgs-encode m.pt", {0: 24.5, 2: 31.25}, PNG + b"x"
-)
+FULL = Metadata("Kitchen", "a phone, 12 seconds", "CC BY 4.0", "pd4dgs-encode m.pt", {0: 24.5, 2: 31.25}, PNG + b"x")
 
 TEXT = st.text(st.characters(exclude_categories=("C", "Z")), max_size=40)
 

@@ -46,9 +46,8 @@ def test_no_pixel_changes():
     from pd4dgs_codec.model.convert import from_scene
     from pd4dgs_codec.model.picture import render_image
 
-    whole, less = (
-        from_scene(decode(encode(lively_scene(), layers=2, effort=1, omit=o))) for o in ("nothing", "lossless")
-    )
+    files = [encode(lively_scene(), layers=2, effort=1, omit=omit) for omit in ("nothing", "lossless")]
+    whole, less = (from_scene(decode(data)) for data in files)
     rng = np.random.default_rng(3)
     seen = 0.0
     for level in (0, 1, 2):

@@ -299,9 +299,8 @@ def test_heads_of_one_quantity_add_to_the_same_columns(monkeypatch, deep, kernel
         field, played = DeformationField.from_arrays(given, BOX), np.zeros((20, columns["scaling"].stop), np.float32)
         Field(given, BOX, columns).move(played, points, t)
         still, at = torch.zeros(played.shape), torch.from_numpy(points)
-        return played, field.moved(
-            still, lambda time: field.planes(at, time), columns, t, None, kernels
-        ).detach().numpy()
+        moved = field.moved(still, lambda time: field.planes(at, time), columns, t, None, kernels)
+        return played, moved.detach().numpy()
 
     feature, tint, both = (residuals(names) for names in (("feature",), ("tint",), ("feature", "tint")))
     for one, other, together in zip(feature, tint, both, strict=True):

@@ -156,9 +156,7 @@ def test_too_small_and_empty():
 
 RNG = np.random.default_rng(0)
 MASK = RNG.random((6, 8)) < 0.5
-VIEWS = [
-    SimpleNamespace(image=RNG.integers(0, 256, (6, 8, 3), dtype=np.uint8), mask=mask) for mask in (None, MASK, None)
-]
+VIEWS = [SimpleNamespace(image=RNG.integers(0, 256, (6, 8, 3), np.uint8), mask=mask) for mask in (None, MASK, None)]
 
 
 def wrong_by(amount: int, view) -> np.ndarray:

@@ -166,9 +166,8 @@ def test_vgg_is_called_as_3d_gaussian_splatting_calls_it(monkeypatch, tmp_path):
     given, weights = [], tmp_path / "hub" / "checkpoints" / "vgg16-x.pth"
     models, lpips = ModuleType("torchvision.models"), ModuleType("lpips")
     models.VGG16_Weights = SimpleNamespace(IMAGENET1K_V1=SimpleNamespace(url=f"https://example.org/{weights.name}"))
-    lpips.LPIPS = lambda net, spatial, verbose: (
-        lambda *z: given.extend((net, spatial, *z)) or torch.full((1,) * 4, 0.25)
-    )
+    answer = torch.full((1,) * 4, 0.25)
+    lpips.LPIPS = lambda net, spatial, verbose: lambda *z: given.extend((net, spatial, *z)) or answer
     for module in (ModuleType("torchvision"), models, lpips):
         monkeypatch.setitem(sys.modules, module.__name__, module)
     monkeypatch.setattr("importlib.metadata.version", lambda name: "0.1.4")

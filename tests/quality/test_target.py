@@ -181,9 +181,8 @@ def test_anchors_of_least_error_move_to_the_next_layer_and_out_of_the_highest(sc
 
 
 def test_a_target_out_of_reach_says_what_could_be_reached(scene):
-    with pytest.raises(
-        EncodeError, match=r"layer 2 takes at least [\d,]+ bytes \(steps up to x16.*expected at most 100$"
-    ):
+    says = r"layer 2 takes at least [\d,]+ bytes \(steps up to x16.*expected at most 100$"
+    with pytest.raises(EncodeError, match=says):
         Fitter(scene, {2: 100}, coarseness(scene), error, EncodeOptions(**FAST)).fit()
 
 

@@ -103,9 +103,8 @@ def test_the_tables_and_limits_of_the_specification():
     activity, classes = re.search(r"activities ([\d, ]+) give A = .* and classes ([\d, ]+)\.", text).groups()
     found = refdec.classes_by_activity([int(v) for v in activity.split(",")])
     assert found == [int(v) for v in classes.split(",")]
-    residuals, magnitudes = re.search(
-        r"residuals ([\d, −]+) of one channel have the relative magnitudes ([\d, ]+)\.", text
-    ).groups()
+    sentence = r"residuals ([\d, −]+) of one channel have the relative magnitudes ([\d, ]+)\."
+    residuals, magnitudes = re.search(sentence, text).groups()
     found = refdec.relative_magnitude([[int(v.replace("−", "-")) for v in residuals.split(",")]], 4)
     assert found == [int(v) for v in magnitudes.split(",")]
 
@@ -126,9 +125,8 @@ def test_the_annotated_file():
     for offset, cell in re.findall(r"^\| (\d+) \| (`[^|]*) \|", appendix, flags=re.M):
         assert int(offset) == len(data)
         repeated = re.fullmatch(r"`(..) × (\d+)`", cell)
-        data += (
-            bytes.fromhex(repeated[1]) * int(repeated[2]) if repeated else bytes.fromhex(re.sub("`|<br>", " ", cell))
-        )
+        written, times = (repeated[1], int(repeated[2])) if repeated else (re.sub("`|<br>", " ", cell), 1)
+        data += bytes.fromhex(written) * times
     assert f"{len(data)} bytes" in appendix
     (found,) = refdec.hashes(data)
     assert [found] == hashes(data)

@@ -22,9 +22,7 @@ def test_bytes_rise_with_the_dial(dataset, tmp_path, monkeypatch):
         trainer = Trainer(TrainConfig(preset="tiny", iterations=60, **at_quality(quality)), dataset)
         trainer.run(tmp_path / "m.pt")
         model = trainer.model
-        levels = level_psnr(
-            lambda level, v, m=model: render_image(m, level, v.time, v.camera), [0, 1, 2], dataset.train
-        )
+        levels = level_psnr(lambda i, v, m=model: render_image(m, i, v.time, v.camera), [0, 1, 2], dataset.train)
         data, report = encode_with_report(to_scene(model), effort=1, omit="nothing")
         streams = [stream for layer in report.layers for stream in layer.streams]
         files.append(len(data))

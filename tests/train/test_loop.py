@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from runs import assert_same_weights, read_log
+from runs import assert_goes_on_as_one_run, assert_same_weights, interrupt, read_log
 
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import DataError, TrainError
@@ -140,14 +140,7 @@ def test_a_time_limit_is_kept_and_the_schedule_completes(dataset, tmp_path, monk
 def test_a_resumed_timed_run_spends_what_is_left(dataset, tmp_path, monkeypatch, clock):
     limit = 1.5 * LIMIT
     first = timed(dataset, monkeypatch, clock, "quiet")
-    update = first.learner.optimiser.step
-
-    def interrupted(*at):
-        if first.seconds > 0.5 * LIMIT:
-            signal.raise_signal(signal.SIGINT)
-        update(*at)
-
-    monkeypatch.setattr(first.learner.optimiser, "step", interrupted)
+    interrupt(first, signal.SIGINT, lambda: first.seconds > 0.5 * LIMIT)
     first.run(tmp_path / "m.pt")
     assert first.interrupted and 0.5 * LIMIT < first.seconds < 0.6 * LIMIT
     clock.now += 1e4  # between the runs
@@ -177,9 +170,7 @@ def test_a_pause_beyond_the_limit_leaves_a_cut_run_that_says_so(dataset, tmp_pat
 
 
 @pytest.mark.parametrize("iterations, limit, done", [(30, 5.5, 6), (None, 0.5, 1)])
-def test_a_run_is_cut_at_its_limit_and_leaves_a_checkpoint(
-    dataset, tmp_path, monkeypatch, clock, iterations, limit, done
-):
+def test_a_run_is_cut_at_its_limit_and_leaves_a_file(dataset, tmp_path, monkeypatch, clock, iterations, limit, done):
     trainer = Trainer(TrainConfig(preset="tiny", iterations=iterations, max_seconds=limit), dataset)
     step = trainer.learner.step
     monkeypatch.setattr(trainer.learner, "step", lambda: setattr(clock, "now", clock.now + 1) or step())
@@ -190,25 +181,15 @@ def test_a_run_is_cut_at_its_limit_and_leaves_a_checkpoint(
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_the_first_signal_ends_the_run_after_a_whole_step(dataset, tmp_path, monkeypatch, number):
-    trainer = Trainer(TrainConfig(preset="tiny", iterations=8), dataset)
-    update, before = trainer.learner.optimiser.step, signal.getsignal(number)
-
-    def interrupted(*at):
-        if trainer.iteration == 2:
-            signal.raise_signal(number)  # in the middle of a step
-        update(*at)
-
-    monkeypatch.setattr(trainer.learner.optimiser, "step", interrupted)
+def test_the_first_signal_ends_the_run_after_a_whole_step(dataset, tmp_path, number):
+    config = TrainConfig(preset="tiny", iterations=8)
+    trainer = Trainer(config, dataset)
+    before = signal.getsignal(number)
+    interrupt(trainer, number, lambda: trainer.iteration == 2)
     trainer.run(tmp_path / "m.pt")
     assert trainer.interrupted and trainer.iteration == 3 == checkpoint.load(tmp_path / "m.pt")[1]["iteration"]
     assert signal.getsignal(number) is before
-    resumed, whole = (Trainer(TrainConfig(preset="tiny", iterations=8), dataset) for _ in range(2))
-    resumed.resume(tmp_path / "m.pt")
-    resumed.run(tmp_path / "resumed.pt")
-    whole.run(tmp_path / "whole.pt")
-    assert not resumed.interrupted
-    assert_same_weights(tmp_path / "resumed.pt", tmp_path / "whole.pt")
+    assert_goes_on_as_one_run(config, dataset, tmp_path / "m.pt")
 
 
 def test_a_second_signal_ends_it_at_once_and_saves_nothing(dataset, tmp_path, monkeypatch):

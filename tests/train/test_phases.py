@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from runs import assert_resumes_bit_for_bit, assert_same_weights, read_log, run_saving
+from runs import assert_goes_on_as_one_run, assert_resumes_bit_for_bit, interrupt, read_log, run_saving
 from tiny import TINY, disc
 from trainer_rate import train_rate_bits
 
@@ -146,40 +146,36 @@ def moved(before: dict, model) -> bool:
     return any(not torch.equal(value, before[name]) for name, value in model.state_dict().items())
 
 
+def times_of(field) -> list[np.ndarray]:
+    """The planes with a time axis."""
+    return [plane for scale in field.arrays().planes for name, plane in scale.items() if name.endswith("t")]
+
+
 @pytest.mark.usefixtures("short_runs_have_phases")
 def test_steps_while_time_opens_leave_planes_linear_between_few_instants(dataset, monkeypatch):
     monkeypatch.setattr(opening, "_predicted", lambda state: opening.MIN_GAIN)
     field = trainer_of(dataset, 100, 20).model.global_deformation
-    times = [plane for scale in field.arrays().planes for name, plane in scale.items() if name.endswith("t")]
+    times = times_of(field)
     assert any(np.ptp(plane) > 1e-3 for plane in times)
     field.planes.confine(3)
-    for before, after in zip(
-        times, (p for s in field.arrays().planes for n, p in s.items() if n[1] == "t"), strict=True
-    ):
+    for before, after in zip(times, times_of(field), strict=True):
         np.testing.assert_allclose(after, before, atol=1e-5)
 
 
 @pytest.mark.usefixtures("short_runs_have_phases")
-def test_a_signal_ends_a_trial_which_comes_again(dataset, tmp_path, monkeypatch):
-    config = TrainConfig(preset="tiny", iterations=30)
-    trainer, whole, resumed = (Trainer(config, dataset) for _ in range(3))
-    update, updates = trainer.learner.optimiser.step, []
+def test_a_signal_ends_a_trial_which_comes_again(dataset, tmp_path):
+    config, updates = TrainConfig(preset="tiny", iterations=30), []
+    trainer = Trainer(config, dataset)
 
-    def interrupted(*at):
-        if trainer.learner.practising:
-            updates.append(trainer.iteration)
-            if len(updates) == 2:
-                signal.raise_signal(signal.SIGTERM)
-        update(*at)
+    def in_the_second_update_of_the_trial():
+        updates.extend([trainer.iteration] * trainer.learner.practising)
+        return trainer.learner.practising and len(updates) == 2
 
-    monkeypatch.setattr(trainer.learner.optimiser, "step", interrupted)
+    interrupt(trainer, signal.SIGTERM, in_the_second_update_of_the_trial)
     trainer.run(tmp_path / "part.pt")
     assert trainer.interrupted and updates == [trainer.learner.schedule.coarse_end] * 2
     assert trainer.iteration == trainer.learner.schedule.coarse_end
-    resumed.resume(tmp_path / "part.pt")
-    resumed.run(tmp_path / "resumed.pt")
-    whole.run(tmp_path / "whole.pt")
-    assert_same_weights(tmp_path / "resumed.pt", tmp_path / "whole.pt")
+    assert_goes_on_as_one_run(config, dataset, tmp_path / "part.pt")
 
 
 # -- pruning -----------------------------------------------------------------------------------------------------------
@@ -368,9 +364,7 @@ def test_a_timed_run_on_a_busy_machine_keeps_its_levels(dataset, share, steps, d
 @pytest.mark.usefixtures("short_runs_have_phases")
 def test_a_removed_level_stays_away(dataset, tmp_path, monkeypatch):
     """From the model, its optimiser, the log, the file and a resumed run."""
-    monkeypatch.setattr(
-        levels.SelectLevels, "_gain", lambda self, state, level, views, above: (0.0 if level == 2 else 9.0, 1.0)
-    )
+    monkeypatch.setattr(levels.SelectLevels, "_gain", lambda *at: (0.0 if at[2] == 2 else 9.0, 1.0))
     views = replace(dataset, train=dataset.train * 12)
     config = TrainConfig(preset="tiny", iterations=30)
     trainer = Trainer(config, views)

@@ -9,8 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
-from runs import read_log
+from runs import assert_same_weights, read_log
 from tiny import TINY, write_views
 
 from pd4dgs_codec.cli import train
@@ -72,20 +71,12 @@ def _alone(program: Path, output: str, *options: object) -> int:
         return train.main(_arguments(program.parent, output, *options))
 
 
-def _same_model(first: Path, second: Path) -> None:
-    a, b = (checkpoint.load(path)[0].state_dict() for path in (first, second))
-    assert a.keys() == b.keys()
-    for name in a:
-        assert a[name].shape == b[name].shape, name
-        assert torch.allclose(a[name].float(), b[name].float(), rtol=1e-3, atol=1e-4), name
-
-
 def test_two_workers_learn_what_one_process_learns(program):
     done = _together(program, "two.pt", "--iterations", STEPS, "--views-per-step", 2, "--json", "--log", "two.jsonl")
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)  # the first worker alone speaks
     assert told["iterations"] == STEPS and told["finished"]
-    _same_model(program.with_name("one.pt"), program.with_name("two.pt"))
+    assert_same_weights(program.with_name("one.pt"), program.with_name("two.pt"), rtol=1e-3, atol=1e-4)
     single, double = (read_log(program.parent / name) for name in ("one.jsonl", "two.jsonl"))
     assert len(double) == STEPS
     assert sum(record.get("grown", 0) for record in single) > 0  # else nothing was decided
@@ -98,7 +89,7 @@ def test_a_run_goes_on_with_another_number_of_workers(program):
     begun = int(checkpoint.load(program.parent / "cut.pt")[1]["iteration"])
     assert 0 < begun < STEPS
     assert _alone(program, "cut.pt", "--resume", program.with_name("cut.pt"), "--max-seconds", "1000") == 0
-    _same_model(program.with_name("one.pt"), program.with_name("cut.pt"))
+    assert_same_weights(program.with_name("one.pt"), program.with_name("cut.pt"), rtol=1e-3, atol=1e-4)
 
 
 def test_workers_that_cannot_share_the_views_evenly_are_named(monkeypatch):
