@@ -4,15 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from fuzzing.mutate import Chunk, Parts, put_together
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import LAYER_SETS, assert_same_scene, flipped, scenes, small_file
 
 from pd4dgs_codec import decode, encode, open_stream
 from pd4dgs_codec.errors import BadSignature, ChecksumMismatch, DecodeError, Malformed, Truncated
-from pd4dgs_codec.format.container import write_chunk, write_preamble
+from pd4dgs_codec.format.canonical import unpack
+from pd4dgs_codec.format.container import read_preamble
 from pd4dgs_codec.format.decoder import decode_partial, read_layers
-from pd4dgs_codec.format.header import pack_header, scene_id_of
+from pd4dgs_codec.format.header import pack_header
 from pd4dgs_codec.format.info import hashes, info
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.payload import write_layer
@@ -121,23 +123,17 @@ def faults_by_every_door(data):
 def test_of_two_faults_every_door_names_that_of_the_earlier_layer(first, later):
     """Values that are not finite, sums of masks and voxels taken twice, which a payload alone does not show."""
     header, symbols = read_layers(small_file())
-    layers = symbols.layers
-    payloads = [write_layer(layer, EncodeOptions(effort=1))[0] for layer in layers]
-    steps, which = header.grid.steps, 1
+    layers, steps, which = list(symbols.layers), header.grid.steps, 1
     if first == "value":
         steps, which = {**steps, "offset": 2.0**127}, 0
     elif first == "mask code":
-        full = replace(layers[1], mask_increase=np.full_like(layers[1].mask_increase, 255))
-        payloads[1] = write_layer(full, EncodeOptions(effort=1))[0]
+        layers[1] = replace(layers[1], mask_increase=np.full_like(layers[1].mask_increase, 255))
     else:
-        taken = replace(layers[1], anchor_q=layers[0].anchor_q[: len(layers[1].anchor_q)])
-        payloads[1] = write_layer(taken, EncodeOptions(effort=1))[0]
-    chunks = tuple((i, len(payload)) for i, payload in enumerate(payloads))
-    packed = pack_header(replace(header, grid=replace(header.grid, steps=steps), chunks=chunks))
-    scene_id = scene_id_of(packed)
-    framed = [write_chunk(i, 0, scene_id, payload) for i, payload in enumerate(payloads)]
-    front = write_preamble(packed)
-    data = bytearray(b"".join([front, *framed]))
+        layers[1] = replace(layers[1], anchor_q=layers[0].anchor_q[: len(layers[1].anchor_q)])
+    fields = unpack(pack_header(replace(header, grid=replace(header.grid, steps=steps))))
+    chunks = [Chunk(i, 0, write_layer(layer, EncodeOptions(effort=1))[0]) for i, layer in enumerate(layers)]
+    data = bytearray(put_together(Parts(fields, chunks)))
+    front = data[: read_preamble(data).size]
     if later == "damaged":
         data[-9] ^= 1
     elif later == "cut":
@@ -146,7 +142,7 @@ def test_of_two_faults_every_door_names_that_of_the_earlier_layer(first, later):
     assert len(found) == 1
     error, _, chunk, offset = found.pop()
     assert (error, chunk) == (Malformed, which)
-    assert offset == info(front)["layers"][which]["offset"]
+    assert offset == info(bytes(front))["layers"][which]["offset"]
 
 
 def test_a_stream_that_ends_early_says_so():
