@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import tracemalloc
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
@@ -274,6 +274,13 @@ def assert_same_info(a: SceneInfo, b: SceneInfo) -> None:
         np.testing.assert_array_equal(a.camera.viewmat, b.camera.viewmat)
         np.testing.assert_array_equal(a.camera.K, b.camera.K)
         assert (a.camera.width, a.camera.height) == (b.camera.width, b.camera.height)
+
+
+def assert_same_symbols(found: Sequence[np.ndarray], expected: Sequence[np.ndarray]) -> None:
+    """As many arrays, each int32 and equal."""
+    for a, b in zip(found, expected, strict=True):
+        assert a.dtype == np.int32
+        np.testing.assert_array_equal(a, b)
 
 
 def slice_ends(data: bytes) -> list[int]:

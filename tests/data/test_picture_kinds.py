@@ -45,7 +45,7 @@ def deep(wide: np.ndarray, path: Path) -> None:
 
 def linear_profile() -> bytes:
     """An RGB profile of sRGB's primaries whose channels are linear in light: sRGB's own with its curves replaced."""
-    data = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
+    data = bytearray(srgb_profile())
     curve = b"curv" + bytes(8)  # a curve of no points is the identity
     for i in range(int.from_bytes(data[128:132], "big")):
         entry = 132 + 12 * i

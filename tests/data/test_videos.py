@@ -78,16 +78,12 @@ def test_a_full_disk_keeps_no_part_of_a_video(folder, monkeypatch, cache):
 def test_a_cache_that_is_lost_or_broken_is_reported_and_made_anew(folder, cache):
     view = load(folder).train[0]
     expected = view.image
-    for file in cache.glob("*.frames"):
-        file.write_bytes(bytes(file.stat().st_size))
-    with pytest.raises(DataError, match="missing or broken"):
-        _ = view.image
-    np.testing.assert_array_equal(load(folder).train[0].image, expected)
-    for file in cache.glob("*.frames"):
-        file.unlink()
-    with pytest.raises(DataError, match="missing or broken"):
-        _ = view.image
-    np.testing.assert_array_equal(load(folder).train[0].image, expected)
+    for spoil in (lambda file: file.write_bytes(bytes(file.stat().st_size)), Path.unlink):
+        for file in cache.glob("*.frames"):
+            spoil(file)
+        with pytest.raises(DataError, match="missing or broken"):
+            _ = view.image
+        np.testing.assert_array_equal(load(folder).train[0].image, expected)
 
 
 def test_training_views_are_kept_within_a_budget(scene, monkeypatch):

@@ -7,6 +7,7 @@ import struct
 import time
 from functools import cache, partial
 from pathlib import Path
+from unittest.mock import Mock
 
 import fuzz
 import pytest
@@ -213,10 +214,7 @@ class Endless(DecodeError):
     ],
 )
 def test_an_error_that_no_decoder_may_raise(monkeypatch, error, kind):
-    def raising(*args, **options):
-        raise error
-
-    monkeypatch.setattr(check, "decode", raising)
+    monkeypatch.setattr(check, "decode", Mock(side_effect=error))
     assert kinds(run_inputs(0, range(3), {})) == {kind}
 
 
