@@ -41,12 +41,8 @@ def test_orbit_keeps_the_point_in_place_and_turns_about_up(angle):
     np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-6)
     eye = -rotation.T @ moved.viewmat[:3, 3]
     before = -info.camera.viewmat[:3, :3].T @ info.camera.viewmat[:3, 3]
-    expected = centre + [
-        np.cos(angle) * (before - centre)[0] - np.sin(angle) * (before - centre)[1],
-        np.sin(angle) * (before - centre)[0] + np.cos(angle) * (before - centre)[1],
-        (before - centre)[2],
-    ]
-    np.testing.assert_allclose(eye, expected, atol=1e-5)
+    (x, y, z), c, s = before - centre, np.cos(angle), np.sin(angle)
+    np.testing.assert_allclose(eye, centre + [c * x - s * y, s * x + c * y, z], atol=1e-5)
 
 
 def test_own_frames_span_the_time_and_begin_and_end_at_the_given_camera():

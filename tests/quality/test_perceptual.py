@@ -151,30 +151,32 @@ def test_broken_package_is_one_line(monkeypatch):
     assert load_perceptual().absent["flip"] == "RuntimeError: built for another machine"
 
 
+def stand_in(monkeypatch, folder, weights):
+    """A torchvision that knows the address of these weights alone; the file that it would keep them in."""
+    models, kept = ModuleType("torchvision.models"), folder / "hub" / "checkpoints" / "weights-x.pth"
+    setattr(models, weights, SimpleNamespace(IMAGENET1K_V1=SimpleNamespace(url=f"https://example.org/{kept.name}")))
+    for module in (ModuleType("torchvision"), models):
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setenv("TORCH_HOME", str(folder))
+    return kept
+
+
 def test_lpips_without_weights_fetches_nothing(monkeypatch, tmp_path):
-    models = ModuleType("torchvision.models")
-    models.AlexNet_Weights = SimpleNamespace(IMAGENET1K_V1=SimpleNamespace(url="https://example.org/alexnet-x.pth"))
-    monkeypatch.setitem(sys.modules, "torchvision", ModuleType("torchvision"))
-    monkeypatch.setitem(sys.modules, "torchvision.models", models)
+    kept = stand_in(monkeypatch, tmp_path, "AlexNet_Weights")
     monkeypatch.setitem(sys.modules, "lpips", None)  # not even loaded
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    assert load_perceptual().absent["lpips"].endswith(str(tmp_path / "hub" / "checkpoints" / "alexnet-x.pth"))
+    assert load_perceptual().absent["lpips"].endswith(str(kept))
 
 
 def test_vgg_is_called_as_3d_gaussian_splatting_calls_it(monkeypatch, tmp_path):
     """One number for a picture in 0..1, whatever the mask; only with weights where torchvision keeps them."""
-    given, weights = [], tmp_path / "hub" / "checkpoints" / "vgg16-x.pth"
-    models, lpips = ModuleType("torchvision.models"), ModuleType("lpips")
-    models.VGG16_Weights = SimpleNamespace(IMAGENET1K_V1=SimpleNamespace(url=f"https://example.org/{weights.name}"))
-    answer = torch.full((1,) * 4, 0.25)
+    given, lpips, answer = [], ModuleType("lpips"), torch.full((1,) * 4, 0.25)
     lpips.LPIPS = lambda net, spatial, verbose: lambda *z: given.extend((net, spatial, *z)) or answer
-    for module in (ModuleType("torchvision"), models, lpips):
-        monkeypatch.setitem(sys.modules, module.__name__, module)
+    kept = stand_in(monkeypatch, tmp_path, "VGG16_Weights")
+    monkeypatch.setitem(sys.modules, "lpips", lpips)
     monkeypatch.setattr("importlib.metadata.version", lambda name: "0.1.4")
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
-    assert load_perceptual([VGG]).absent == {VGG: f"its ImageNet weights are not in {weights}"}
-    weights.parent.mkdir(parents=True)
-    weights.touch()
+    assert load_perceptual([VGG]).absent == {VGG: f"its ImageNet weights are not in {kept}"}
+    kept.parent.mkdir(parents=True)
+    kept.touch()
     a, b, _ = pair()
     distance = load_perceptual([VGG]).distances[VGG]
     assert distance(a, b) == 0.25 and given[:2] == ["vgg", False] and distance.source == "lpips 0.1.4, vgg"

@@ -170,7 +170,7 @@ def test_a_pause_beyond_the_limit_leaves_a_cut_run_that_says_so(dataset, tmp_pat
 
 
 @pytest.mark.parametrize("iterations, limit, done", [(30, 5.5, 6), (None, 0.5, 1)])
-def test_a_run_is_cut_at_its_limit_and_leaves_a_file(dataset, tmp_path, monkeypatch, clock, iterations, limit, done):
+def test_a_run_cut_at_its_limit_leaves_a_checkpoint(dataset, tmp_path, monkeypatch, clock, iterations, limit, done):
     trainer = Trainer(TrainConfig(preset="tiny", iterations=iterations, max_seconds=limit), dataset)
     step = trainer.learner.step
     monkeypatch.setattr(trainer.learner, "step", lambda: setattr(clock, "now", clock.now + 1) or step())
