@@ -17,13 +17,7 @@ from pd4dgs_codec.model.config import DeformationConfig, ModelConfig
 from pd4dgs_codec.scene import Camera, Deformation, Network, Scene, SceneInfo, Steps, Widths, plane_shapes
 
 #: The preset `tiny` with few anchors and cells.
-TINY = ModelConfig(
-    DeformationConfig(((4, 4),), 4, 8),
-    DeformationConfig(((4, 4),), 4, 8),
-    hidden=8,
-    initial_anchors=300,
-    max_anchors=600,
-)
+TINY = ModelConfig(*[DeformationConfig(((4, 4),), 4, 8)] * 2, hidden=8, initial_anchors=300, max_anchors=600)
 WIDTH, HEIGHT = 32, 24
 #: Held-out quality that `checkpoint_of` tells of.
 CURVE = [{"seconds": 2.0, "psnr": [10.0, 20.0]}, {"seconds": 4.0, "psnr": [12.0, 40.0]}]

@@ -185,15 +185,9 @@ def test_termination_stops_before_the_limit():
 
 def test_front_hides_back_whatever_the_order():
     front, back = (0.0, 0.0, 2.0), (0.0, 0.0, 4.0)
+    rest = torch.ones(2, 4), torch.full((2, 3), 0.5), torch.full((2,), 0.9), torch.eye(3)[:2]
     for means, first in (([front, back], 0), ([back, front], 1)):
-        tensors = (
-            torch.tensor(means),
-            torch.ones(2, 4),
-            torch.full((2, 3), 0.5),
-            torch.full((2,), 0.9),
-            torch.eye(3)[:2],
-        )
-        image, _, _ = rasterization(*tensors, camera(9, 9))
+        image, _, _ = rasterization(torch.tensor(means), *rest, camera(9, 9))
         assert image[4, 4, first] > 0.85 and image[4, 4, 1 - first] < 0.1
 
 

@@ -1,6 +1,7 @@
 """Layer prefixes, cut files and incremental decoding."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -33,9 +34,9 @@ def test_each_prefix_decodes_to_what_max_layer_gives(scene):
         if row["end"] < len(data):
             with pytest.raises(Truncated):
                 decode(prefix)
-        partial, complete = decode_partial(prefix)
+        found, complete = decode_partial(prefix)
         assert complete == (row["end"] == len(data))
-        assert_same_scene(partial, got)
+        assert_same_scene(found, got)
 
 
 @pytest.mark.parametrize("layers", LAYER_SETS)
@@ -97,24 +98,17 @@ def test_a_fault_stays_and_earlier_layers_remain():
     assert not stream.complete
 
 
+def streamed(data):
+    stream = open_stream()
+    stream.feed(data)
+    stream.finish()
+
+
 def faults_by_every_door(data):
     """(class, message, chunk, offset) of what each entry point raises."""
-
-    def streamed():
-        stream = open_stream()
-        stream.feed(data)
-        stream.finish()
-
-    doors = (
-        streamed,
-        lambda: decode(data),
-        lambda: decode(data, allow_partial=True),
-        lambda: read_layers(data),
-        lambda: hashes(data),
-    )
-    for door in doors:
+    for door in (streamed, decode, partial(decode, allow_partial=True), read_layers, hashes):
         with pytest.raises(DecodeError) as caught:
-            door()
+            door(data)
         yield type(caught.value), str(caught.value), caught.value.chunk, caught.value.offset
 
 

@@ -59,11 +59,8 @@ def test_without_a_camera_the_largest_come_first(scene):
 
 def test_the_files_own_camera_decides(scene):
     packed = pack(scene, SLICED)
-    assert packed.json()["slices"] == {
-        "order": "rendered gain per byte",
-        "cameras": "the file's own camera",
-        "pictures": 16,
-    }
+    told = {"order": "rendered gain per byte", "cameras": "the file's own camera", "pictures": 16}
+    assert packed.json()["slices"] == told
     whole, sliced = (decode(data) for data in (pack(scene, replace(SLICED, slices=0)).data, packed.data))
     assert sliced.rows[0] <= whole.rows[0] and sliced.rows[1] < whole.rows[1]  # anchors wait for motion
     for before, after in zip(by_voxel(whole), by_voxel(sliced), strict=True):
@@ -95,11 +92,8 @@ def test_slices_meet_target_sizes_even_if_they_take_more_than_measured(scene, mo
 
 
 def test_views_held_out_are_scored_after_each_slice(scene):
-    own = camera()
-    picture = np.full((16, 24, 3), 90, np.uint8)
-    view = View(
-        viewmat=own.viewmat, K=own.K, width=24, height=16, time=0.5, image=picture, mask=None, name="one", camera_id=0
-    )
+    own, picture = camera(), np.full((16, 24, 3), 90, np.uint8)
+    view = View(own.viewmat, own.K, 24, 16, 0.5, picture, None, "one", 0)
     packed = pack(scene, SLICED, views=Views("made up", (view,), (view,)), min_gain=0)
     slices = sum(len(row["slices"]) for row in info(packed.data)["layers"])
     assert slices > 3 and len(packed.slices["psnr"]) == slices
@@ -118,11 +112,8 @@ def test_anchors_that_show_nothing_are_worth_least(scene):
 
 
 def test_without_takes_rows_from_every_array(scene):
-    fewer = without(scene, np.array([0, 5, len(scene.anchor_q) - 1]))
+    gone = np.array([0, 5, len(scene.anchor_q) - 1])
+    fewer = without(scene, gone)
     assert fewer.rows[-1] == scene.rows[-1] - 3 == len(fewer.feature) == len(fewer.mask[-1])
-    assert (
-        fewer.rows[0]
-        == len(fewer.mask[0])
-        == scene.rows[0] - sum(r < scene.rows[0] for r in (0, 5, scene.rows[-1] - 1))
-    )
+    assert fewer.rows[0] == len(fewer.mask[0]) == scene.rows[0] - (gone < scene.rows[0]).sum()
     np.testing.assert_array_equal(fewer.anchor_q[:4], scene.anchor_q[1:5])
