@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 from folders import gradient, pose, save
+from strategies import SHARED
 
 from pd4dgs_codec.data import videos
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import DataError
 
-SHARED = Path(os.environ.get("PD4DGS_SHARED", Path(__file__).resolve().parents[2] / ".." / "shared" / "data"))
 OFFICIAL = Path(os.environ.get("PD4DGS_OFFICIAL", Path(__file__).resolve().parents[2] / ".." / "official"))
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import gzip
 import json
-import os
 import struct
 import sys
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from strategies import SHARED
 from test_formats import make_splats
 from tiny import write_views
 
@@ -72,7 +72,7 @@ def test_spz_and_4dgs_come_back_rounded(tmp_path):
 @pytest.mark.parametrize("name, count", [("guitar.compressed.ply", 90_854), ("biker.spz", 152_746)])
 def test_splat_files_of_other_programs(name, count):
     pytest.importorskip("gaussforge")
-    path = Path(os.environ.get("PD4DGS_SHARED", Path(__file__).parents[3] / "shared" / "data")) / "splats" / name
+    path = SHARED / "splats" / name
     if not path.is_file():
         pytest.skip(f"{path} is not there")
     splats = read_splats(path)

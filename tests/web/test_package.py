@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import struct
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
-from strategies import LAYER_SETS, make_scene
+from strategies import LAYER_SETS, SHARED, make_scene
 
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import DeliveryError, Malformed, Truncated
@@ -22,7 +20,7 @@ from pd4dgs_codec.web import manifests
 from pd4dgs_codec.web.manifests import Video
 from pd4dgs_codec.web.package import MPD, PLAYLIST, package
 
-SCHEMA = Path(os.environ.get("PD4DGS_SHARED", "../shared/data")) / "dash-schema" / "DASH-MPD.xsd"
+SCHEMA = SHARED / "dash-schema" / "DASH-MPD.xsd"
 NAMESPACE = {"d": "urn:mpeg:dash:schema:mpd:2011"}
 
 
