@@ -7,13 +7,11 @@ said otherwise, so that a test knows every symbol that must come back.
 from __future__ import annotations
 
 import math
-import os
 import tracemalloc
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 from hypothesis import strategies as st
@@ -38,8 +36,6 @@ from pd4dgs_codec.scene import (
     plane_shapes,
 )
 
-#: Real scenes, splats and schemas that are not part of the project.
-SHARED = Path(os.environ.get("PD4DGS_SHARED") or Path(__file__).resolve().parents[2] / "shared" / "data")
 HUGE = 1 << 23
 LAYER_SETS = ((0,), (0, 1), (0, 2), (0, 1, 2))
 #: How symbols are drawn: all equal, a few small ones, Gaussian, or spread over the whole range the format allows.

@@ -1,18 +1,15 @@
-import os
 import pickle
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from common import OFFICIAL, SHARED
 from folders import gradient, pose, save
-from strategies import SHARED
 
 from pd4dgs_codec.data import videos
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import DataError
-
-OFFICIAL = Path(os.environ.get("PD4DGS_OFFICIAL", Path(__file__).resolve().parents[2] / ".." / "official"))
 
 
 def _found(folder: Path, variable: str) -> Callable[[str], Path]:

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from strategies import SHARED
+from common import SHARED
 from test_formats import make_splats
 from tiny import write_views
 

@@ -10,7 +10,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from strategies import LAYER_SETS, SHARED, make_scene
+from common import SHARED
+from strategies import LAYER_SETS, make_scene
 
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import DeliveryError, Malformed, Truncated
