@@ -83,7 +83,10 @@ def deformation(
     networks = {"trunk": network(rng, (below + channels * scales, width), steps[1], kind)}
     for name, outputs in heads.items():
         layers = network(rng, (width, outputs), steps[1], kind)
-        layers[-1][1][0] = np.float32(steps[1])  # not all zero: such a head is not sent
+        weight, bias = layers[-1]
+        bias[0] = np.float32(steps[1])
+        if not weight.any():  # such a head is not sent where a key instant cancels the bias
+            weight[0, 0] = np.float32(steps[1])
         networks[name] = layers
     return Deformation(tuple(planes), networks, key)
 
