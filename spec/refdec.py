@@ -358,7 +358,7 @@ def check_scene_id(found, expected):
 
 
 # 3.4 Critical and ancillary chunks: "The chunk types of layers are critical: flag bit 0 MUST be zero there." "A
-# critical chunk of unknown type is an UnsupportedFeature when a decoder reaches it"
+# critical chunk that holds no layer is an UnsupportedFeature when a decoder reaches it"
 def check_critical(kind, ancillary):
     need(kind < 3 or ancillary, f"critical chunk of type {kind}", "UnsupportedFeature")
     need(kind >= 3 or not ancillary, "a layer marked as ancillary")
@@ -506,8 +506,8 @@ def check_sizes(layer, payload_bytes, before):
     need(symbols <= (1 << 22) + 256 * size, f"{symbols} symbols", "LimitExceeded")
 
 
-# 6.4 Sections: "A section MUST be present if and only if it has at least one symbol to code. Mode ans uses sections
-# 0..4, mode lzma 0 and 5."
+# 6.4 Sections: "Section 0 MUST be present if and only if n > 0, any other if and only if it has at least one symbol to
+# code. Mode ans uses sections 0..4, mode lzma 0 and 5."
 def read_sections(layer, parts):
     def part(section, count):
         need(section in parts or not count, f"section {section} is missing")
@@ -786,7 +786,7 @@ def decode_planes(data, shapes):
 
 # 8.6 The planes section: "The activity of cell (i, j), row i and column j, is the sum, over the nine cells (clip(i + a,
 # 0, H − 1), clip(j + b, 0, W − 1)) with a and b in −1..1, of their relative magnitudes (8.7) in the residuals of the
-# plane's channels in the stages before, with the plane's cells as places."
+# plane's channels in the stages before."
 def cell_activity(channels, h, w):
     magnitude = relative_magnitude(channels, h * w)
     rows = [[min(max(i + a, 0), h - 1) for a in (-1, 0, 1)] for i in range(h)]
@@ -802,9 +802,9 @@ def take_stages(reader, number):
     return [reader.take(size) for size in sizes] + [reader.take(reader.left)]
 
 
-# 8.7 Classes by activity: "Σ over channels c of (|e_c[p]| · 256·N) // (1 + s_c), s_c the sum over places q of |e_c[q]|"
+# 8.7 Classes by activity: "Σ over channels c of (|e_c[p]| · 256·N) // (1 + s_c), s_c the sum over cells q of |e_c[q]|"
 def relative_magnitude(channels, n):
-    """Of each of the n places."""
+    """Of each of the n cells."""
     magnitude = [0] * n
     for e in channels:
         s = sum(abs(v) for v in e)
@@ -812,8 +812,8 @@ def relative_magnitude(channels, n):
     return magnitude
 
 
-# 8.7 Classes by activity: "let A be the activities in ascending order. The bounds are A[(i·N) // 8] for i in 1 .. 7,
-# and the class of a place, 0..7, is the number of bounds that are at most its activity."
+# 8.7 Classes by activity: "Let A be the activities of the cells in ascending order. The bounds are A[(i·N) // 8] for i
+# in 1 .. 7, and the class of a cell, 0..7, is the number of bounds that are at most its activity."
 def classes_by_activity(activity):
     ascending = sorted(activity)
     bounds = [ascending[i * len(ascending) // 8] for i in range(1, 8)]
@@ -1108,8 +1108,8 @@ def dequantise(symbols, step):
     return list(struct.unpack(form, struct.pack(form, *products)))
 
 
-# 11.5 Dequantisation: "For an attribute, k is replaced by m + k·2^c" "It MUST lie in −2^23..2^23, else Malformed." "An
-# anchor's position is dequantised from its voxel index with the voxel size as Q."
+# 11.5 Dequantisation: "For an attribute, k is replaced by m + k·2^c" "m + k·2^c MUST lie in −2^23..2^23, else
+# Malformed." "An anchor's position is dequantised from its voxel index with the voxel size as Q."
 def dequantise_layer(layer):
     attributes = attribute_channels(layer.header)
     steps = dict(zip(attributes, layer.header[4])) | {"anchor": layer.header[5]}
