@@ -8,6 +8,7 @@ Each input is read in a process of its own; memory is the rise of its peak, afte
 
 from __future__ import annotations
 
+import argparse
 import gzip
 import io
 import json
@@ -262,12 +263,16 @@ def measure(name: str, path: Path) -> None:
 
 def main() -> None:
     """The table."""
-    if len(sys.argv) == 3:
-        measure(sys.argv[1], Path(sys.argv[2]))
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("name", nargs="?", default="", help="only rows whose name holds this text")
+    parser.add_argument("path", nargs="?", type=Path, help=argparse.SUPPRESS)  # of one row, in its own process
+    args = parser.parse_args()
+    if args.path:
+        measure(args.name, args.path)
         return
     print("| reader and input | bytes | s | µs per byte | MiB | answer |\n|---|---:|---:|---:|---:|---|")
     for name, (file, make, _) in CASES.items():
-        if sys.argv[1:] and sys.argv[1] not in name:
+        if args.name not in name:
             continue
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / file

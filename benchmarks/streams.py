@@ -10,6 +10,7 @@ one by one, and the reader gets what has arrived.
 
 from __future__ import annotations
 
+import argparse
 import contextlib
 import json
 import subprocess
@@ -154,7 +155,9 @@ ROWS = [
 
 def main() -> None:
     """The table."""
-    path = Path(sys.argv[1])
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("file", type=Path, help="a .pd4 file")
+    path = parser.parse_args().file
     names = ["1", "7", "1 KiB", "64 KiB", "whole"]
     print(f"| reader | decode | {' | '.join(names)} |\n|---|---|{'---:|' * len(names)}")
     for name, measure, way in ROWS:

@@ -8,6 +8,7 @@ bytes, quality of the packed file against the run's own pictures from held-out c
 
 from __future__ import annotations
 
+import argparse
 import itertools
 import tempfile
 import time
@@ -240,6 +241,7 @@ def fit(model: FourD | Deformable, steps: int = FIT_STEPS) -> None:
 
 def main() -> None:
     """The table."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     torch.manual_seed(0)
     print("| run | bytes of the run | .pd4 bytes | held-out dB | processor minutes |\n" + "| - " * 5 + "|")
     for name, model in (("4DGaussians", FourD(ball())), ("Deformable-3DGS", Deformable(ball(), is_blender=True))):
