@@ -65,7 +65,9 @@ def read_tensors(raw: bytes, where: str, made: Callable[[np.ndarray], Any] = lam
         raise DataError(f"{where}: refused: {error}; expected tensors alone") from None
     except Exception as error:  # zipfile, pickletools and a broken pickle raise many kinds
         reason = one_line(f"{type(error).__name__}: {error}", 120)
-        raise DataError(f"{where}: not a zip archive of tensors as torch writes it ({reason})") from None
+        cut = isinstance(error, zipfile.BadZipFile) and raw.startswith(b"PK")
+        what = "damaged or cut short" if cut else "not a zip archive of tensors as torch writes it"
+        raise DataError(f"{where}: {what} ({reason})") from None
 
 
 class _Machine:

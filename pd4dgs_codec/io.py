@@ -108,8 +108,10 @@ def check_source(path: str | Path) -> None:
 
 
 def read_source(path: str | Path) -> bytes:
-    """All bytes of a file, or of a pipe until its writer closes it. Raises as `check_source` does."""
+    """All bytes of a file, or of a pipe until its writer closes it. Raises as `check_source` does, and for a folder."""
     check_source(path)
+    if os.path.isdir(path):
+        raise DataError(f"{path}: is a folder, expected a file")
     return Path(path).read_bytes()
 
 

@@ -61,14 +61,9 @@ class Widths:
         return dict(zip(ATTRIBUTES, ((self.feature,), (SCALING_DIM,), (self.slots, 3)), strict=True))
 
     @property
-    def predicted(self) -> int:
-        """Number of scalars of an anchor before its offsets: D + 6."""
-        return self.feature + SCALING_DIM
-
-    @property
     def channels(self) -> int:
         """Number of scalars of an anchor: D + 6 + 3 G."""
-        return self.predicted + 3 * self.slots
+        return self.feature + SCALING_DIM + 3 * self.slots
 
     @property
     def inputs(self) -> dict[str, int]:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 DETAILS = """\
 Without -o, pd4dgs-decode only checks the file and prints a summary.
-A .npz output holds the float32 arrays anchor, feature, scaling_log, offset, mask_L, mlp.*, planes.* and meta_*.
+A .npz output holds anchor, feature, scaling_log, offset, mask_L, mlp.*, planes.* and meta_*.
 A .pt output is a checkpoint for encode, render and eval.
 From a URL (http, https), only the requested layers are fetched; interrupted transfers resume.
 
@@ -46,7 +46,7 @@ def parser() -> options.Parser:
         help="decode only the slices within the first SIZE bytes, such as 50k",
     )
     add("--symbols", action="store_true", help="add quantised integers (NAME_q) and steps (NAME_step) to the .npz")
-    add("--allow-partial", action="store_true", help="decode the complete layers of a truncated file, with exit code 3")
+    add("--allow-partial", action="store_true", help="decode the complete slices of a truncated file, with exit code 3")
     p.add_common()
     return p
 

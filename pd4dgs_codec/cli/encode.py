@@ -27,8 +27,10 @@ that ends with a layer can be shown. Parts without visible effect are omitted an
 takes a minute or more, on renderings from --data or else the file's own camera, and longer with --slices.
 
 --slices 50k lets the first frame appear after 50 kB and improve with each further slice. The anchors that matter most
-in renderings come first; without target sizes others pass to a higher layer, so that motion need not wait for them. It
-takes minutes, too.
+in renderings come first; without target sizes others pass to a higher layer, so that motion need not wait for them.
+Ordering the anchors takes up to some minutes.
+
+In the report, payload/ΣR is the ratio of coded bits to the sum of R(a), the rate model of training.
 
 {options.SOURCES}
 

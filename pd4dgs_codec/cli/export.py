@@ -128,10 +128,7 @@ def _player(args: argparse.Namespace) -> Player:
     from pd4dgs_codec.draw.player import Player
     from pd4dgs_codec.format.decoder import decode
 
-    data = common.read_bytes(args.input)
-    if not common.is_pd4(data):
-        raise DataError(f"{args.input}: is not a .pd4 file; pd4dgs-encode makes one from a checkpoint")
-    return Player(decode(data, max_layer=args.level))
+    return Player(decode(common.read_bytes(args.input), max_layer=args.level))
 
 
 def _eyes(args: argparse.Namespace, player: Player) -> Eyes:

@@ -152,7 +152,8 @@ def _slice_lines(result: dict[str, Any]) -> list[str]:
 
 
 def _text(result: dict[str, Any]) -> str:
-    cut = "" if result["available"] >= result["bytes"] else f", truncated to {result['available']:,}"
+    rest = result["available"] - result["bytes"]
+    cut = f", truncated to {result['available']:,}" if rest < 0 else f", {rest:,} more behind its end" if rest else ""
     low, high = result["time_range"]
     left_out = result["left_out"]
     lines = [

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 DETAILS = """\
 DIR then holds scene.pd4 and index.html, a page that plays the scene from any static web server. For other players there
-are index.json (byte ranges and SHA-256 of the layers), scene.mp4 with scene.mpd (DASH: each layer is a fragment in an
+are index.json (byte ranges and SHA-256 of the slices), scene.mp4 with scene.mpd (DASH: each slice is a fragment in an
 AdaptationSet of its own, with dependencyId) and scene.m3u8 (HLS, with index.json as session data).
 
 DASH clients with support for dependencyId can fetch the layers, but need a .pd4 decoder to show them. Other DASH and

@@ -2,10 +2,20 @@
 
 import argparse
 import contextlib
+from pathlib import Path
 from urllib.parse import quote
 
 from pd4dgs_codec.cli import options
-from pd4dgs_codec.cli.common import OK, Console, check_other_file, checkpoint_scene, command, is_pd4, read_bytes
+from pd4dgs_codec.cli.common import (
+    OK,
+    Console,
+    UsageError,
+    check_other_file,
+    checkpoint_scene,
+    command,
+    is_pd4,
+    read_bytes,
+)
 from pd4dgs_codec.cli.serve import add_link, set_by_signals
 from pd4dgs_codec.io import check_output, temporary_folder, write_bytes
 
@@ -52,6 +62,8 @@ def _view(args: argparse.Namespace, console: Console) -> int:
     options.conditional(args, not args.output, "has no effect with -o", port=0, rate=None, latency=0.0)
     if args.output:
         check_other_file(args.input, args.output)
+        if Path(args.output).suffix.lower() not in (".html", ".htm"):
+            raise UsageError(f"found -o {args.output}, expected a name that ends in .html")
         check_output(args.output, args.overwrite)
         content = args.input if is_url(args.input) else _packed(args.input, console)
         write_bytes(args.output, page(content).encode(), args.overwrite)

@@ -52,7 +52,7 @@ class Reader:
 COLMAP = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 READERS = (
     Reader(
-        "iPhone/DyCheck, Nerfies, HyperNeRF", "iphone:read_iphone", (("camera",),), "camera/, rgb/ and splits/",
+        "iPhone/DyCheck, Nerfies, HyperNeRF", "iphone:read_iphone", (("camera",),), "camera/ and rgb/",
         "split files name the held-out views",
     ),
     Reader("Blender, D-NeRF, nerfstudio", "transforms:read_transforms", (("transforms*.json",),), "transforms*.json"),

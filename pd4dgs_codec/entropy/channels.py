@@ -38,7 +38,7 @@ class CodedChannels:
 
     @property
     def payload_bits(self) -> int:
-        """Bits of symbols, prior parameters, tables and exceptions."""
+        """Bits of symbols, prior parameters and exceptions."""
         return 8 * len(self.payload)
 
 

@@ -97,9 +97,8 @@ def read_preamble(data: Buffer) -> Preamble:
     with memoryview(data) as view:  # an open view in a traceback would keep a stream's buffer from growing
         start = bytes(view[: len(SIGNATURE)])
         if not SIGNATURE.startswith(start):
-            raise BadSignature(
-                f"not a .pd4 file: it begins with {start.hex(' ')}, expected {SIGNATURE.hex(' ')}", offset=0
-            )
+            found = start.hex(" ") + (" (a checkpoint? pd4dgs-encode takes one)" if start.startswith(b"PK") else "")
+            raise BadSignature(f"not a .pd4 file: it begins with {found}, expected {SIGNATURE.hex(' ')}", offset=0)
         _need(view, PREAMBLE_SIZE, "the preamble")
         _, major, minor, length = _PREAMBLE.unpack_from(view)
         if major != MAJOR:

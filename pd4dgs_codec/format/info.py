@@ -32,14 +32,14 @@ def info(data: bytes) -> dict[str, Any]:
     others, offset, declared = [], preamble.size, Declared()
     layers: list[dict[str, Any]] = []
     metadata: dict[str, Any] | None = None
-    for chunk_type, length in header.chunks:
+    for index, (chunk_type, length) in enumerate(header.chunks):
         size = CHUNK_OVERHEAD + length
         kind = BY_CHUNK_TYPE.get(chunk_type)
         place: dict[str, Any] = {"offset": offset, "bytes": size, "end": offset + size}
         if kind is None:
             others.append({"type": chunk_type, **place})
             if chunk_type == CHUNK_TYPE and metadata is None and offset + size <= len(data):
-                metadata = _about(read_chunk(data, offset, type=chunk_type, length=length).payload)
+                metadata = _about(read_chunk(data, offset, type=chunk_type, length=length, index=index).payload)
         else:
             later = bool(layers) and layers[-1]["layer"] == kind.layer
             if not later:
@@ -48,7 +48,7 @@ def info(data: bytes) -> dict[str, Any]:
             row["slices"].append(place)
             row |= {"bytes": row["bytes"] + size, "end": place["end"]}
             if offset + size <= len(data):
-                payload = read_chunk(data, offset, type=chunk_type, length=length).payload
+                payload = read_chunk(data, offset, type=chunk_type, length=length, index=index).payload
                 meta, _, declared = read_parameters(payload, kind, header.grid.widths, declared, later)
                 place["anchors"] = meta.rows
                 row["anchors"] = row.get("anchors", 0) + meta.rows

@@ -72,7 +72,8 @@ def load(path: str | Path | BinaryIO) -> tuple[Model, dict[str, Any]]:
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise DataError(f"{path}: cannot be read: {getattr(error, 'strerror', error)}") from None
     if not raw.startswith(b"PK"):  # a zip archive, as torch writes it
-        raise DataError(f"{path}: not a readable checkpoint; expected a {FORMAT} file")
+        found = f"a file that begins with {raw[:8]!r}" if raw else "an empty file"
+        raise DataError(f"{path}: found {found}, expected a .pd4 file or a {FORMAT}")
     content = read_tensors(raw, str(path), lambda array: torch.from_numpy(np.array(array)))
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise DataError(f"{path}: not a {FORMAT}; found {_describe(content)}")

@@ -124,8 +124,10 @@ def _lpips_network(net: str, url: str, *, spatial: bool) -> tuple[str, Any]:
 
 def _stlpips() -> Distance:
     # The package imports these modules but does not use them for the shift-tolerant AlexNet. sys.modules is restored,
-    # so that no other code gets the stand-ins.
+    # so that no other code gets the stand-ins; torch must not be imported a second time after that.
     from unittest import mock  # importing it takes a tenth of a second
+
+    import torch  # noqa: F401
 
     names = {"torchvision": "models", "IPython": "embed", "torchsummary": "summary"}
     unused = {module: SimpleNamespace(**{name: None}) for module, name in names.items()}

@@ -52,7 +52,7 @@ def test_lines_that_fail_are_named_with_their_logs_and_the_others_go_on(cli, tmp
     assert done.code == 1 and done.json["done"] == 1 and done.json["retried"] == 1
     rows = {row["line"]: row for row in done.json["failures"]}
     assert set(rows) == {2, 3, 4, 5} and len(done.error_lines) == 4
-    assert "not a readable checkpoint" in rows[2]["message"] and "tried 2 times" in rows[2]["message"]
+    assert "expected a .pd4 file or a pd4dgs-checkpoint" in rows[2]["message"] and "tried 2 times" in rows[2]["message"]
     assert "checkpoint" in (tmp_path / rows[2]["log"]).read_text()
     assert "--effort" in rows[3]["message"] and "invalid JSON" in rows[4]["message"] and "line 2" in rows[5]["message"]
     assert len(decode((tmp_path / "out" / "a.pd4").read_bytes()).layers) == 3

@@ -53,6 +53,7 @@ def test_pipes_and_repacking_give_the_same_file(cli, model_pt, scene_pd4):
     again = cli("encode", "-", "-o", "-", "--effort", 1, stdin=piped.out)
     assert again.code == 0 and again.out == piped.out
     summary = cli("decode", "-", "--json", stdin=piped.out)
+    assert b", 2 more behind its end" in cli("info", "-", stdin=piped.out + b"no").out
     assert summary.json["complete"] is True and summary.json["bytes"] == len(piped.out)
 
 

@@ -57,7 +57,7 @@ def test_no_file_of_a_folder_is_a_link_out_of_it(layout, scene, tmp_path, refuse
 
 def test_other_faults_of_folders(tmp_path, blender, refused):
     refused(tmp_path / "gone", "gone: found nothing, expected a dataset folder")
-    refused(tmp_path, "found an empty folder, expected camera/, rgb/ and splits/ (iPhone")
+    refused(tmp_path, "found an empty folder, expected camera/ and rgb/ (iPhone")
     (tmp_path / "readme.txt").write_text("x")
     refused(tmp_path, "found other files")
     refused(tmp_path / "readme.txt", "found a file")

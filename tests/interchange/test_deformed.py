@@ -168,7 +168,7 @@ def test_broken_networks_are_one_line(tmp_path, kind, file, change, message):
         ("cfg_args", OFF + b", static_mlp=True)", "has no tensor deformation_net.static_mlp.1.weight"),
         ("cfg_args", OFF + b", no_dshs=False)", r"shs_deform.3.weight has shape \(48, 32\), expected \(12, 32\)"),
         (DEFORMATION, None, "deformation.pth: cannot be read"),
-        (DEFORMATION, b"PK\x03\x04", "not a zip archive of tensors"),
+        (DEFORMATION, b"PK\x03\x04", "damaged or cut short"),
         (PLY, b"ply\n", "point_cloud.ply"),
     ],
 )  # fmt: skip

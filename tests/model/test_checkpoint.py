@@ -81,7 +81,7 @@ def test_a_pickle_that_wants_to_run_code_is_refused_unrun(path, tmp_path, zipped
     content = torch.load(path, weights_only=True)
     content["training"] = Trap(target)
     torch.save(content, path, _use_new_zipfile_serialization=zipped)
-    refusal(path, "refused" if zipped else "not a readable checkpoint")
+    refusal(path, "refused" if zipped else "expected a .pd4 file or a pd4dgs-checkpoint")
     assert not target.exists()
     torch.load(path, weights_only=False)  # the trap works
     assert target.exists()
@@ -240,7 +240,7 @@ def test_other_versions(path, version):
 
 def test_text_is_not_called_pickled_code(tmp_path):
     (tmp_path / "m.pt").write_text("hello")
-    assert "pickled" not in refusal(tmp_path / "m.pt", "not a readable checkpoint")
+    assert "pickled" not in refusal(tmp_path / "m.pt", "found a file that begins with")
 
 
 def test_a_folder_that_is_not_there(tmp_path):
