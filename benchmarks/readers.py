@@ -29,9 +29,9 @@ from pd4dgs_codec import decode
 from pd4dgs_codec.archives import read_tensors
 from pd4dgs_codec.batch.job import OPS, Manifest
 from pd4dgs_codec.data import colmap
+from pd4dgs_codec.data.captures import _panoptic_points
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.data.files import image_info, read_image, read_npy
-from pd4dgs_codec.data.rigs import _panoptic_points
 from pd4dgs_codec.data.videos import open_video
 from pd4dgs_codec.errors import Pd4Error
 from pd4dgs_codec.format import canonical

@@ -17,12 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.data.cameras import Lens, UnreadView, checked_rotation, world_to_camera
 from pd4dgs_codec.data.dataset import COLMAP
 from pd4dgs_codec.data.files import LARGEST, Color, inside, last_numbers, number, read_file, whole_number
 from pd4dgs_codec.data.posed import LARGEST_TIME, held_out, posed_dataset
-from pd4dgs_codec.data.videos import synchronised_dataset, video_size
-from pd4dgs_codec.data.view import Dataset
+from pd4dgs_codec.data.videos import open_video, synchronised_dataset
+from pd4dgs_codec.data.view import Dataset, Lens, UnreadView, checked_rotation, world_to_camera
 from pd4dgs_codec.errors import DataError
 
 #: Camera models in the order of their numbers in binary files, with the names of their parameters.
@@ -86,7 +85,7 @@ def _video_of(model: Path, camera: UnreadView, videos: dict[str, Path]) -> Path:
 
 
 def _with_video(model: Path, camera: UnreadView, video: Path, i: int) -> UnreadView:
-    size, lens = video_size(video), camera.lens
+    size, lens = open_video(video).size, camera.lens
     if size != (lens.width, lens.height):
         found = f"is {size[0]}x{size[1]}, and its camera in {model} {lens.width}x{lens.height}"
         raise DataError(f"{video}: {found}, expected the same size")

@@ -7,7 +7,7 @@ row. This module imports the standard library alone, so that `--help` loads neit
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from pkgutil import resolve_name
@@ -41,28 +41,22 @@ class Reader:
         """Whether the folder has this layout."""
         return any(all(any(folder.glob(mark)) for mark in marks) for marks in self.marks)
 
-    @property
-    def read(self) -> Callable[[Path, int, int, Color | None], Dataset]:
-        """The function, called with folder, downscale, holdout and background (see `load`)."""
-        function: Callable[[Path, int, int, Color | None], Dataset] = resolve_name(f"pd4dgs_codec.data.{self.function}")
-        return function
-
 
 #: The places of a COLMAP model in a folder, in the order of the search.
 COLMAP = ("sparse/0", "sparse", "colmap/sparse/0", ".")
 READERS = (
     Reader(
-        "iPhone/DyCheck, Nerfies, HyperNeRF", "iphone:read_iphone", (("camera",),), "camera/ and rgb/",
+        "iPhone/DyCheck, Nerfies, HyperNeRF", "captures:read_iphone", (("camera",),), "camera/ and rgb/",
         "split files name the held-out views",
     ),
     Reader("Blender, D-NeRF, nerfstudio", "transforms:read_transforms", (("transforms*.json",),), "transforms*.json"),
     Reader(
-        "Neu3D", "rigs:read_neu3d", (("poses_bounds.npy",),), "poses_bounds.npy and a video cam*.mp4 per camera",
+        "Neu3D", "captures:read_neu3d", (("poses_bounds.npy",),), "poses_bounds.npy and a video cam*.mp4 per camera",
         "the first camera is held out",
     ),
-    Reader("Panoptic Studio", "rigs:read_panoptic", (("train_meta.json",),), "train_meta.json and ims/"),
+    Reader("Panoptic Studio", "captures:read_panoptic", (("train_meta.json",),), "train_meta.json and ims/"),
     Reader(
-        "Record3D", "iphone:read_record3d",
+        "Record3D", "captures:read_record3d",
         tuple((meta, pictures) for meta in ("metadata", "metadata.json") for pictures in ("rgbd", "rgb")),
         "metadata and rgbd/",
     ),
@@ -133,7 +127,9 @@ def _read(source: str | Path, downscale: int, holdout: int, background: Color | 
         if reader.recognises(folder):
             try:
                 with staying_inside(folder):
-                    return reader.read(folder, downscale, holdout, background)
+                    read = resolve_name(f"pd4dgs_codec.data.{reader.function}")
+                    dataset: Dataset = read(folder, downscale, holdout, background)
+                    return dataset
             except (DataError, ImportError, MemoryError):
                 raise
             except Exception as error:  # faults of foreign files that no check foresaw

@@ -6,9 +6,8 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from pd4dgs_codec.data.cameras import UnreadView, read_view
 from pd4dgs_codec.data.files import WHITE, Color, check_pixels, image_info
-from pd4dgs_codec.data.view import Dataset, View
+from pd4dgs_codec.data.view import Dataset, UnreadView, View, read_view
 from pd4dgs_codec.errors import DataError
 
 #: Files hold the first and the last time as binary32; their difference may change by SPAN_TOLERANCE.
@@ -164,7 +163,7 @@ def cameras_box(frames: Sequence[UnreadView], depth: tuple[float, float] | None 
 def depth_range(views: Sequence[np.ndarray], box: np.ndarray, points: np.ndarray | None) -> tuple[float, float]:
     """(near, far): half the nearest and 1.5 times the farthest depth of the points, else of the box's corners, over
     cameras with the world-to-camera matrices `views` [4, 4]."""
-    if points is None or not len(points):
+    if points is None:
         points = np.stack(np.meshgrid(*box.T.astype(np.float64)), axis=-1).reshape(-1, 3)
     axes = np.stack([view[2] for view in views])
     depths = points[:: max(1, len(points) // 2000)] @ axes[:, :3].T + axes[:, 3]

@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from pd4dgs_codec.data.bodies import MOTIONS, NO_BODY, THINGS, Body, Eye, bodies, material, normal, place, shade
-from pd4dgs_codec.data.cameras import Lens, shrunk_view, world_to_camera
 from pd4dgs_codec.data.dataset import SYNTHETIC
 from pd4dgs_codec.data.files import check_downscale, split_options
-from pd4dgs_codec.data.view import Dataset, View
+from pd4dgs_codec.data.view import Dataset, Lens, View, shrunk_view, world_to_camera
 from pd4dgs_codec.errors import DataError
 
 SUPERSAMPLING = 2

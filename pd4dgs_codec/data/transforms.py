@@ -7,14 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.data.cameras import (
-    OPENGL_TO_OPENCV,
-    ROTATION_TOLERANCE,
-    Lens,
-    UnreadView,
-    check_rotation,
-    world_to_camera,
-)
 from pd4dgs_codec.data.files import (
     Color,
     array,
@@ -28,7 +20,15 @@ from pd4dgs_codec.data.files import (
     whole_number,
 )
 from pd4dgs_codec.data.posed import LARGEST_TIME, held_out, posed_dataset
-from pd4dgs_codec.data.view import Dataset
+from pd4dgs_codec.data.view import (
+    OPENGL_TO_OPENCV,
+    ROTATION_TOLERANCE,
+    Dataset,
+    Lens,
+    UnreadView,
+    check_rotation,
+    world_to_camera,
+)
 from pd4dgs_codec.errors import DataError, one_line
 
 PINHOLE_MODELS = {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}

@@ -16,16 +16,15 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
-from pd4dgs_codec.data.cameras import UnreadView, rectify
 from pd4dgs_codec.data.files import check_downscale, check_pixels, check_regular, shrink_image, shrink_mask
 from pd4dgs_codec.data.posed import geometry, without_first_camera
-from pd4dgs_codec.data.view import Dataset, View
+from pd4dgs_codec.data.view import Dataset, UnreadView, View, rectify
 from pd4dgs_codec.errors import DamageWarning, DataError, one_line
 from pd4dgs_codec.io import temporary_folder
 
@@ -85,11 +84,6 @@ def open_video(path: Path, *, grey: bool = False, output: Sequence[str] = ()) ->
     check_pixels(width * height, [path], str(path))
     shape = (height, width) if grey else (height, width, 3)
     return Video(path, (width, height), fps, _pictures(path, shape, output, seconds * fps))
-
-
-def video_size(path: Path) -> tuple[int, int]:
-    """(width, height) of a video as displayed."""
-    return open_video(path).size
 
 
 def _pictures(path: Path, shape: tuple[int, ...], output: Sequence[str], promised: float) -> Iterator[np.ndarray]:
@@ -228,7 +222,7 @@ def _store(video: Video, target: Path, treat: Callable[[np.ndarray], np.ndarray]
     except OSError as error:
         what = "the disk is full" if error.errno == errno.ENOSPC else error.strerror or str(error)
         raise DataError(f"{target.parent}: cannot keep the frames of {video.path.name}: {what}") from None
-    return StoredFrames(target, frames.offsets, frames.shape, frames.fps)
+    return replace(frames, path=target)
 
 
 def _compress(video: Video, file: Path, cache: Path, treat: Callable[[np.ndarray], np.ndarray]) -> StoredFrames:

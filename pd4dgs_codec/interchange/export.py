@@ -15,8 +15,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pd4dgs_codec.data.cameras import rotation_matrix
-from pd4dgs_codec.data.view import View
+from pd4dgs_codec.data.view import View, rotation_matrix
 from pd4dgs_codec.draw.gaussians import LEAST_NEAR, MIN_OPACITY, near_plane
 from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.draw.rasteriser import Geometry, backward, composite, project

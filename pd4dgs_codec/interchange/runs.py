@@ -29,8 +29,8 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.archives import read_tensors
-from pd4dgs_codec.data.cameras import ROTATION_TOLERANCE, rotation_matrix, world_to_camera
 from pd4dgs_codec.data.files import LARGEST, WHITE, Color, read_file
+from pd4dgs_codec.data.view import ROTATION_TOLERANCE, rotation_matrix, world_to_camera
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.formats import activated, checked, finite_rows, read_parameters
 from pd4dgs_codec.interchange.splats import Splats, principal_axes, quaternions, unit

@@ -5,8 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pd4dgs_codec.data.cameras import downscaled_matrix
-from pd4dgs_codec.data.view import View
+from pd4dgs_codec.data.view import View, downscaled_matrix
 from pd4dgs_codec.errors import RenderError
 from pd4dgs_codec.scene import Camera, SceneInfo
 

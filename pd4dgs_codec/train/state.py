@@ -12,8 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.data.cameras import shrunk_view
-from pd4dgs_codec.data.view import Dataset, View
+from pd4dgs_codec.data.view import Dataset, View, shrunk_view
 from pd4dgs_codec.model.config import PRESETS, ModelConfig
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.networks import EXACT, Noise, Rounding

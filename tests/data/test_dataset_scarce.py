@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from folders import change_frames, pose
-from test_iphone import write_iphone
+from test_captures import write_iphone
 
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.errors import DataError

@@ -14,7 +14,7 @@ from test_formats import make_splats
 from tiny import TINY
 from torch import nn
 
-from pd4dgs_codec.data.cameras import rotation_matrix
+from pd4dgs_codec.data.view import rotation_matrix
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange import runs
 from pd4dgs_codec.interchange.teacher import load_source, read_model

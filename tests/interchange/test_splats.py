@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from tiny import camera_ahead
 
-from pd4dgs_codec.data.cameras import rotation_matrix
+from pd4dgs_codec.data.view import rotation_matrix
 from pd4dgs_codec.interchange.splats import SH_C0, Splats, camera_eye, harmonics, picture, quaternions, unit
 
 
