@@ -19,8 +19,8 @@ from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.entropy.tables import entropy_bits
 from pd4dgs_codec.errors import LimitExceeded, Malformed
 from pd4dgs_codec.format import canonical, deformation
-from pd4dgs_codec.format.attributes import by_class, check_classes, read_attributes, write_attributes
 from pd4dgs_codec.format.canonical import Fields
+from pd4dgs_codec.format.classes import by_class, check_classes, read_attributes, write_attributes
 from pd4dgs_codec.format.deformation import Scale, Shape
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, NO_CLASSES, magnitude
