@@ -247,13 +247,6 @@ def _seen_from(anchors: Array, eye: Array, features: int) -> tuple[Array, Array]
     return x, distance
 
 
-def seen(opacity: Array, mask: Array, faintest: float) -> Array:
-    """Returns int64 [K]: the slots whose opacity [n, G] times mask [n] is at least `faintest`."""
-    keep = np.empty(opacity.size, np.int64)
-    found: Array = keep[: _seen(keep, opacity, mask, faintest)].copy()
-    return found
-
-
 def finished(gaussians: Array, gates: Array) -> tuple[Array, ...]:
     """Returns means, quats, scales, opacities and colors of gaussians [K, 14]; gates multiply scales and opacities."""
     parts = np.split(gaussians, (SCALE, QUAT, OPACITY, COLOR), axis=1)
@@ -344,14 +337,15 @@ def inputs_backward(tasks: Tasks, g_anchors: Array, g: Array, out: Array, distan
 
 
 @kernel()
-def _seen(keep: Array, opacity: Array, mask: Array, faintest: float) -> int:
-    """Writes to `keep` the slots whose opacity [n, G] times mask [n] is at least `faintest`; returns their number."""
-    count, slots = 0, opacity.shape[1]
+def seen(opacity: Array, mask: Array, faintest: float) -> Array:
+    """Returns int64 [K]: the slots whose opacity [n, G] times mask [n] is at least `faintest`."""
+    keep, count, slots = np.empty(opacity.size, np.int64), 0, opacity.shape[1]
     for n in range(len(mask)):
         for o in range(slots):
             keep[count] = n * slots + o
             count += opacity[n, o] * mask[n] >= opacity.dtype.type(faintest)
-    return count
+    found: Array = keep[:count].copy()
+    return found
 
 
 def by_slot(weight: Array, bias: Array, slots: int) -> tuple[Array, Array]:
