@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from pd4dgs_codec.bench.stability import BOX, CAMERA, HEIGHT, WIDTH, Found, Promise, largest, refusal, small_scene
-from pd4dgs_codec.draw.deformation import Field
 from pd4dgs_codec.draw.gaussians import near_plane
+from pd4dgs_codec.draw.hexplane import Field
 from pd4dgs_codec.errors import EncodeError, NotFinite, RenderError
 from pd4dgs_codec.format import decoder, encoder
 from pd4dgs_codec.interchange.teacher import load_source

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pd4dgs_codec.draw.deformation import Field, constant_network, still
 from pd4dgs_codec.draw.gaussians import (
     COLOR,
     GAUSSIAN_WIDTH,
@@ -22,8 +21,23 @@ from pd4dgs_codec.draw.gaussians import (
     near_plane,
     seen,
 )
+from pd4dgs_codec.draw.hexplane import Field
 from pd4dgs_codec.draw.rasteriser import draw
-from pd4dgs_codec.scene import MASK_STEP, MASK_THRESHOLD, SCAFFOLD_NETWORKS, Camera, Scene, SceneInfo, Steps, Widths
+from pd4dgs_codec.draw.simd import LANES
+from pd4dgs_codec.scene import (
+    MASK_STEP,
+    MASK_THRESHOLD,
+    PLANES,
+    SCAFFOLD_NETWORKS,
+    TRUNK,
+    Camera,
+    Deformation,
+    Network,
+    Scene,
+    SceneInfo,
+    Steps,
+    Widths,
+)
 
 
 class Player:
@@ -175,6 +189,8 @@ def warm_up() -> None:
     imports this module and calls this function in a thread while it receives the first layer."""
     widths, box = Widths(), np.array([[-1, -1, 1], [1, 1, 3]], np.float32)
     camera = Camera(np.eye(4, dtype=np.float32), np.array([[16, 0, 8], [0, 16, 8], [0, 0, 1]], np.float32), 16, 16)
+    planes = {name: np.ones((LANES, 2, 2), np.float32) for name, _, _ in PLANES}
+    still = Deformation((planes,), {TRUNK: _constant(LANES, LANES), "position": _constant(LANES, 3)})  # residuals of 0
     scene = Scene(
         info=SceneInfo(1.0, box, (0.0, 1.0), (0.0, 0.0, 0.0), 0.1, 100.0, (0.0, -1.0, 0.0), 0.0, camera),
         steps=Steps(),
@@ -185,8 +201,13 @@ def warm_up() -> None:
         scaling_log=np.full((1, *widths.attributes["scaling_log"]), -2, np.float32),
         offset=np.zeros((1, widths.slots, 3), np.float32),
         mask=(np.full(1, 255, np.uint8),) * 3,
-        networks={name: constant_network(widths.inputs[name], n, 0.5) for name, n in widths.networks.items()},
-        global_deformation=still("position", 3),
-        local_deformation=still("position", 3),
+        networks={name: _constant(widths.inputs[name], n, 0.5) for name, n in widths.networks.items()},
+        global_deformation=still,
+        local_deformation=still,
     )
     Player(scene).picture(camera, 0.5)
+
+
+def _constant(inputs: int, outputs: int, value: float = 0.0) -> Network:
+    """Returns a network of one layer whose outputs are all `value`."""
+    return ((np.zeros((outputs, inputs), np.float32), np.full(outputs, value, np.float32)),)

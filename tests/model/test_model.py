@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from pd4dgs_codec import decode, encode
-from pd4dgs_codec.draw.deformation import Field
+from pd4dgs_codec.draw.hexplane import Field
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.model import checkpoint, fused
 from pd4dgs_codec.model.config import DeformationConfig
