@@ -163,10 +163,6 @@ def _fullest_window(h: Histogram) -> Window:
         inside = np.diff(np.concatenate([[0], np.cumsum(h.counts)])[np.stack([np.arange(len(ends)), ends])], axis=0)
         fullest = int(inside.argmax())
         low, high = int(h.values[fullest]), int(h.values[ends[fullest] - 1])
-    return _window(low, high)
-
-
-def _window(low: int, high: int) -> Window:
     if low == high:  # a table has at least two entries, and both must be symbols
         return Window(min(low, K_MAX - 1), 2)
     return Window(low, high - low + 1)

@@ -16,12 +16,7 @@ from typing import Any, ClassVar, TypeVar, get_args
 import numpy as np
 
 from pd4dgs_codec.entropy.ans import Model, model_of, models_of_each
-from pd4dgs_codec.entropy.tables import (
-    SI_MAX,
-    SI_MIN,
-    norm_cdf28_of_each,
-    tables_of_each,
-)
+from pd4dgs_codec.entropy.tables import SI_MAX, SI_MIN, norm_cdf28_of_each, tables_of_each
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
 from pd4dgs_codec.errors import Malformed, UnsupportedFeature
 
