@@ -113,7 +113,7 @@ def _output_kind(args: argparse.Namespace) -> str | None:
 def _npz(scene: Scene, symbols: bool) -> bytes:
     import numpy as np
 
-    from pd4dgs_codec.format.npz import to_npz_dict
+    from pd4dgs_codec.format.info import to_npz_dict
 
     stream = io.BytesIO()
     np.savez(stream, **to_npz_dict(scene, symbols))  # type: ignore[arg-type]

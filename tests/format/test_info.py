@@ -13,9 +13,8 @@ from pd4dgs_codec.errors import DecodeError, Truncated
 from pd4dgs_codec.format.container import FLAG_ANCILLARY
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode, encode_with_report
-from pd4dgs_codec.format.info import hashes, info, metadata_of
+from pd4dgs_codec.format.info import hashes, info, metadata_of, to_npz_dict
 from pd4dgs_codec.format.metadata import Metadata
-from pd4dgs_codec.format.npz import to_npz_dict
 
 VECTORS = Path(__file__).parents[2] / "spec" / "vectors" / "uncommon"
 SCENE = make_scene(7, anchors=20)
