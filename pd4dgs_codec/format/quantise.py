@@ -192,10 +192,8 @@ class Grid:
 
     def dequantise(self, symbols: np.ndarray, classes: np.ndarray) -> dict[str, np.ndarray]:
         """The inverse of `quantise`: float32 [n, *shape] by attribute, C-contiguous."""
-        values = {}
+        values, spacing = {}, self._spacing(classes)
         for name, own, centre in self._with_centres(symbols):
-            found = np.empty(own.shape[::-1], np.float32)
-            for rows in row_blocks(own.shape[1]):
-                found[rows] = dequantise(own[:, rows], self.steps[name], centre, self._spacing(classes[rows])).T
+            found = np.ascontiguousarray(dequantise(own, self.steps[name], centre, spacing).T)
             values[name] = found.reshape(-1, *self.widths.attributes[name])
         return values
