@@ -28,7 +28,7 @@ class LayerReader:
         self._scene_id = b""
         self._declared = Declared()
         self._taken = TakenVoxels()
-        self._past: Past[Prior] | None = None  # copied for each slice, so that a fault leaves it unchanged
+        self._past = Past[Prior]()  # copied for each slice, so that a fault leaves it unchanged
 
     @property
     def complete(self) -> bool:
@@ -119,14 +119,14 @@ class LayerReader:
 
     def _read_slice(self, chunk: Chunk, kind: LayerKind, header: Header) -> LayerSymbols:
         later = kind.layer == self._layer
-        past = self._past.copy() if later and self._past else Past[Prior]() if chunk.more else None
+        past = self._past.copy() if later else Past[Prior]()
         part, declared = read_layer(chunk.payload, kind, header.grid.widths, self._declared, header.mode, later, past)
         check_slice(part, self.scene.codes, header.info.voxel_size, header.grid)
         missing = [name for name in part.steps if name not in header.error_bounds]
         if missing:
             raise Malformed(f"layer {kind.layer}: no error bound of {missing[0]} in the header, expected one")
         self._taken.take(part.anchor_q)
-        self._declared, self._past = declared, past
+        self._declared, self._past = declared, past if chunk.more else Past()
         self._layer, self._number, self.count = kind.layer, chunk.slice, self.count + 1
         self.scene.add(part, not later)
         if self._following[self._index + 1] != kind.layer:

@@ -241,12 +241,13 @@ def read_layer(
     past: priors of the layer's earlier slices, to which those of this one are added. Raises subclasses of DecodeError;
     nothing is allocated for a count beyond the limits or the payload.
     """
+    past = past or Past()
     parameters, start, declared = read_parameters(payload, kind, widths, before, later)
     sections = _Sections(payload, start, parameters.sections, kind)
     data = sections.take(Section.POSITIONS, parameters.rows)
-    anchor_q = decode_positions(data, parameters.rows, past.positions if past else None)
-    read = _read_lzma if mode == "lzma" else _read_ans
-    increase, own, classes, attributes, tensors = read(sections, parameters, past)
+    anchor_q = decode_positions(data, parameters.rows, past.positions)
+    content = _read_lzma(sections, parameters) if mode == "lzma" else _read_ans(sections, parameters, past)
+    increase, own, classes, attributes, tensors = content
     sections.check_empty()
     for name, codes, low in (("rise of a mask code", increase, 0), ("mask code", own, MASK_MIN_CODE)):
         if codes.size and not (low <= codes.min() and codes.max() <= 255):
@@ -286,19 +287,19 @@ class _Sections:
 Content = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, Deformation]
 
 
-def _read_ans(sections: _Sections, parameters: Parameters, past: Past[Prior] | None) -> Content:
+def _read_ans(sections: _Sections, parameters: Parameters, past: Past[Prior]) -> Content:
     rows, widths = parameters.rows, parameters.widths
     sizes = [parameters.rises, rows]
     masks = sections.take(Section.MASKS, sum(sizes))
-    increase, own = decode_channels(masks, sizes, past.masks if past else None)
+    increase, own = decode_channels(masks, sizes, past.masks)
     data = sections.take(Section.ATTRIBUTES, rows)
     classes, attributes = NO_CLASSES, np.zeros((widths.channels, 0), np.int32)
     if data:
-        classes, attributes = read_attributes(data, widths, rows, past.attributes if past else None)
+        classes, attributes = read_attributes(data, widths, rows, past.attributes)
     return increase, own, classes, attributes, deformation.read_sections(sections.take, parameters.shape)
 
 
-def _read_lzma(sections: _Sections, parameters: Parameters, past: Past[Prior] | None) -> Content:
+def _read_lzma(sections: _Sections, parameters: Parameters) -> Content:
     widths, (planes, weights) = parameters.widths, deformation.channel_sizes(parameters.shape)
     first = 2 + widths.graded
     last = first + widths.channels
