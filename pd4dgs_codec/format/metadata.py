@@ -58,7 +58,7 @@ def write_metadata(metadata: Metadata) -> bytes:
         fields[SLICES] = [float(np.float32(db)) for db in metadata.slices]
     content = canonical.pack(fields)
     try:
-        _checked(Fields(canonical.unpack(content), "metadata", set(range(TITLE, SLICES + 1))))
+        _unpack(content)
     except (Malformed, LimitExceeded) as error:
         raise EncodeError(str(error)) from None
     compressor = zstandard.ZstdCompressor(level=COMPRESSION_LEVEL, write_content_size=True, write_checksum=False)
@@ -81,7 +81,7 @@ def read_metadata(data: bytes) -> Metadata:
         content = zstandard.ZstdDecompressor().decompress(data, allow_extra_data=False)
     except zstandard.ZstdError as error:
         raise Malformed(f"metadata: not one whole zstd frame: {error}") from None
-    return _checked(Fields(canonical.unpack(content), "metadata", set(range(TITLE, SLICES + 1))))
+    return _unpack(content)
 
 
 def _check_size(what: str, size: int, limit: int, error: type[EncodeError] | type[LimitExceeded]) -> None:
@@ -89,7 +89,8 @@ def _check_size(what: str, size: int, limit: int, error: type[EncodeError] | typ
         raise error(f"metadata: {size} bytes {what}, expected at most {limit}")
 
 
-def _checked(fields: Fields) -> Metadata:
+def _unpack(content: bytes) -> Metadata:
+    fields = Fields(canonical.unpack(content), "metadata", set(range(TITLE, SLICES + 1)))
     return Metadata(
         **{name: _text(fields, key, name) for name, key in TEXTS.items()},
         quality=_quality(fields),
