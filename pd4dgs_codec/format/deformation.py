@@ -1,8 +1,8 @@
 """A layer's planes and networks for the rest of the codec: symbols, checks, parameters, sections.
 
 Only this module and `planes`, which no other module imports, know the parts of a deformation: planes, a trunk, and a
-network per residual head. The rest of the codec passes on a `Deformation`, float32 in a scene and int32 symbols in a
-layer. Layer 0 has networks and no planes.
+network per residual head, which `plan` may drop. The rest of the codec passes on a `Deformation`, float32 in a scene
+and int32 symbols in a layer. Layer 0 has networks and no planes.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ from pd4dgs_codec.scene import (
     PLANES,
     TRUNK,
     Deformation,
+    Network,
     Planes,
     Steps,
     Widths,
@@ -67,15 +68,20 @@ def arrays_of(tensors: Deformation, kind: LayerKind) -> Iterator[tuple[str, str,
     linear layer of each network, by ascending number. Names are like "planes.0.xy" and "mlp.trunk.weight.0"."""
     for s, scale in enumerate(tensors.planes):
         yield from ((str(kind.planes_step), f"planes.{s}.{name}", scale[name]) for name, _, _ in PLANES)
-    for name in (name for name in kind.network_ids if name in tensors.networks):
-        for i, (weight, bias) in enumerate(tensors.networks[name]):
+    for name, network in _by_number(tensors, kind):
+        for i, (weight, bias) in enumerate(network):
             yield kind.weights_step, f"mlp.{name}.weight.{i}", weight
             yield kind.weights_step, f"mlp.{name}.bias.{i}", bias
 
 
+def _by_number(tensors: Deformation, kind: LayerKind) -> list[tuple[str, Network]]:
+    """Returns (name, network) in the order of the networks' numbers."""
+    return [(name, tensors.networks[name]) for name in kind.network_ids if name in tensors.networks]
+
+
 def with_arrays(tensors: Deformation, kind: LayerKind, arrays: Iterable[np.ndarray]) -> Deformation:
     """Returns a deformation with the structure of `tensors` and these arrays, in the order of `arrays_of`."""
-    depths = {name: len(tensors.networks[name]) for name in kind.network_ids if name in tensors.networks}
+    depths = {name: len(network) for name, network in _by_number(tensors, kind)}
     return _assembled(len(tensors.planes), depths, tensors.key, iter(arrays))
 
 
@@ -128,27 +134,12 @@ def check_tensors(tensors: Deformation, kind: LayerKind, widths: Widths, below: 
     shape = Shape.of(tensors, kind, widths, below.channels if below else 0)
     for (_, name, array), expected in zip(arrays_of(tensors, kind), shape.planes + shape.weights, strict=True):
         expect_array(f"{own} {name}", array, np.float32, expected)
-    for name, outputs in (shape.networks or {}).items():
+    for name, outputs in shape.networks.items():
         wanted = kind.heads(widths).get(name, outputs[-1])
         expect(outputs[-1] == wanted, f"{own} network {name}: {outputs[-1]} outputs, expected {wanted}")
 
 
-# -- heads -------------------------------------------------------------------------------------------------------------
-
-
-def heads_of(tensors: Deformation) -> list[str]:
-    """Returns the names of a deformation's residual heads."""
-    return [name for name in tensors.networks if name != TRUNK]
-
-
-def with_heads(tensors: Deformation, heads: Iterable[str]) -> Deformation:
-    """Returns the deformation with only the given heads."""
-    return replace(tensors, networks={k: v for k, v in tensors.networks.items() if k == TRUNK or k in [*heads]})
-
-
-def head_alone(tensors: Deformation, head: str) -> Deformation:
-    """Returns a deformation of one head's network alone, without planes and trunk."""
-    return Deformation((), {head: tensors.networks[head]})
+# -- parts without effect ----------------------------------------------------------------------------------------------
 
 
 def is_zero(tensors: Deformation, head: str) -> bool:
@@ -194,18 +185,17 @@ class Shape:
     widths of layer 0's networks by name; None for a deformation, where they follow from the planes and the trunk.
     key: as in Deformation. below: number of features of the planes in the layers below."""
 
-    scales: tuple[Scale, ...] = ()
-    networks: dict[str, tuple[int, ...]] | None = None
-    inputs: dict[str, int] | None = None
-    key: int | None = None
-    below: int = 0
+    scales: tuple[Scale, ...]
+    networks: dict[str, tuple[int, ...]]
+    inputs: dict[str, int] | None
+    key: int | None
+    below: int
 
     @staticmethod
     def of(tensors: Deformation, kind: LayerKind, widths: Widths, below: int) -> Shape:
         """Returns the shape of a deformation, without predictors."""
         scales = tuple(Scale(len(scale["xy"]), plane_sides(scale), ()) for scale in tensors.planes)
-        names = [name for name in kind.network_ids if name in tensors.networks]
-        networks = {name: tuple(len(bias) for _, bias in tensors.networks[name]) for name in names}
+        networks = {name: tuple(len(bias) for _, bias in network) for name, network in _by_number(tensors, kind)}
         return Shape(scales, networks, None if kind.layer else widths.inputs, tensors.key, below)
 
     @property
@@ -222,10 +212,9 @@ class Shape:
     def weights(self) -> list[tuple[int, ...]]:
         """Shapes of weight, bias, weight, bias ... of all networks in order."""
         shapes: list[tuple[int, ...]] = []
-        networks = self.networks or {}
-        for name, widths in networks.items():
+        for name, widths in self.networks.items():
             read = self.below + self.channels
-            width = self.inputs[name] if self.inputs else read if name == TRUNK else networks[TRUNK][-1]
+            width = self.inputs[name] if self.inputs else read if name == TRUNK else self.networks[TRUNK][-1]
             for outputs in widths:
                 shapes += [(outputs, width), (outputs,)]
                 width = outputs
@@ -233,7 +222,7 @@ class Shape:
 
     def json(self) -> dict[str, Any]:
         """planes: [C, x, y, z, t] per scale. networks: output widths by name. key_instant: normalised time, if any."""
-        networks = {name: list(widths) for name, widths in (self.networks or {}).items()}
+        networks = {name: list(widths) for name, widths in self.networks.items()}
         found = {"planes": [[scale.channels, *scale.sides] for scale in self.scales], "networks": networks}
         return found if self.key is None else found | {"key_instant": instant(self.key)}
 
@@ -419,5 +408,5 @@ def _restored(shape: Shape, residuals: Sequence[np.ndarray], weights: Sequence[n
     predictors = [predictor for scale in shape.scales for predictor in scale.predictors]
     samples = restore(list(zip(predictors, residuals, strict=True)))
     reshaped = [weight.reshape(one) for weight, one in zip(weights, shape.weights, strict=True)]
-    depths = {name: len(widths) for name, widths in (shape.networks or {}).items()}
+    depths = {name: len(widths) for name, widths in shape.networks.items()}
     return _assembled(len(shape.scales), depths, shape.key, iter([*samples, *reshaped]))

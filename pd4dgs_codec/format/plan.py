@@ -19,7 +19,7 @@ from pd4dgs_codec.format.quantise import dequantise
 from pd4dgs_codec.format.registry import LAYER_KINDS, LayerKind
 from pd4dgs_codec.format.symbols import LayerSymbols, SceneSymbols, first_duplicate
 from pd4dgs_codec.morton import morton_order
-from pd4dgs_codec.scene import Deformation, Scene, Steps, Widths
+from pd4dgs_codec.scene import TRUNK, Deformation, Scene, Steps, Widths
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,16 +124,18 @@ def _drop_heads(scene: Scene, kind: LayerKind) -> tuple[Scene, list[LeftOut]]:
     if given is None:
         return scene, []
     symbols = deformation.quantise_tensors(given, kind, scene.steps)
-    heads = deformation.heads_of(given)
+    heads = [name for name in given.networks if name != TRUNK]
     zero = [name for name in heads if deformation.is_zero(symbols, name)]
     if len(zero) == len(heads) and any(map(scene.deformation, range(kind.layer + 1, 3))):
         zero = zero[1:]  # a deformation has at least one head
     why = "zero after quantisation" if heads else "no heads"
     if len(zero) == len(heads):
         return scene.with_tensors(kind.layer, None), [LeftOut(kind.name, why, kind, given)]
-    rest = deformation.with_heads(given, [name for name in heads if name not in zero])
-    gone = [LeftOut(f"{kind.name} head {name}", why, kind, deformation.head_alone(given, name)) for name in zero]
-    return scene.with_tensors(kind.layer, rest), gone
+    rest = {name: network for name, network in given.networks.items() if name not in zero}
+    gone = [
+        LeftOut(f"{kind.name} head {name}", why, kind, Deformation((), {name: given.networks[name]})) for name in zero
+    ]
+    return scene.with_tensors(kind.layer, replace(given, networks=rest)), gone
 
 
 def passed(scene: Scene, index: int, rows: np.ndarray) -> Scene:
