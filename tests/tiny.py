@@ -150,7 +150,7 @@ def random_deformation(
 def checkpoint_of(scene: Scene, path: Path) -> Path:
     """Writes a checkpoint of the preset tiny that was evaluated twice."""
     from pd4dgs_codec.model import checkpoint
-    from pd4dgs_codec.model.convert import from_scene
+    from pd4dgs_codec.model.model import from_scene
 
     checkpoint.save(path, from_scene(scene), {"curve": json.dumps(CURVE), "config": json.dumps({"preset": "tiny"})})
     return path

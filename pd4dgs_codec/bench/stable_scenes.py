@@ -22,9 +22,8 @@ from pd4dgs_codec.format import decoder, encoder
 from pd4dgs_codec.interchange.teacher import load_source
 from pd4dgs_codec.model import checkpoint, hexplane
 from pd4dgs_codec.model.config import DeformationConfig, ModelConfig
-from pd4dgs_codec.model.convert import from_scene, to_scene
 from pd4dgs_codec.model.deformation import DeformationField
-from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.model.model import Model, from_scene, to_scene
 from pd4dgs_codec.model.picture import rasterization, render
 from pd4dgs_codec.scene import PLANES, Camera, Deformation, Network, deformation_unit, plane_shapes
 from pd4dgs_codec.train.config import LearningRates, TrainConfig

@@ -174,7 +174,7 @@ class _Stdin(io.BytesIO):
 def checkpoint_scene(path: str, data: bytes) -> Scene:
     """Loads the scene of the checkpoint at `path`, or of its bytes `data` if the path is `-`. Needs torch."""
     from pd4dgs_codec.model import checkpoint
-    from pd4dgs_codec.model.convert import to_scene
+    from pd4dgs_codec.model.model import to_scene
 
     model, _ = checkpoint.load(path if path != STDIO else _Stdin(data))
     return to_scene(model)
@@ -183,7 +183,7 @@ def checkpoint_scene(path: str, data: bytes) -> Scene:
 def write_checkpoint(path: str, scene: Scene, overwrite: bool) -> None:
     """Writes a scene as a checkpoint, whole or not at all."""
     from pd4dgs_codec.model import checkpoint
-    from pd4dgs_codec.model.convert import from_scene
+    from pd4dgs_codec.model.model import from_scene
 
     model = from_scene(scene)
     check_output(path, overwrite)  # it may have appeared meanwhile

@@ -21,9 +21,8 @@ from pd4dgs_codec.archives import read_tensors
 from pd4dgs_codec.errors import DataError, one_line
 from pd4dgs_codec.format.check import check_scene
 from pd4dgs_codec.io import read_source, write_bytes
-from pd4dgs_codec.model.convert import check_finite, from_scene
 from pd4dgs_codec.model.deformation import DeformationField
-from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.model.model import Model, check_finite, from_scene
 from pd4dgs_codec.model.networks import MLP
 from pd4dgs_codec.scene import SCAFFOLD_NETWORKS, Camera, Deformation, Grading, Scene, SceneInfo, Steps
 
@@ -76,7 +75,10 @@ def load(path: str | Path | BinaryIO) -> tuple[Model, dict[str, Any]]:
         raise DataError(f"{path}: found {found}, expected a .pd4 file or a {FORMAT}")
     content = read_tensors(raw, str(path), lambda array: torch.from_numpy(np.array(array)))
     if not isinstance(content, dict) or content.get("format") != FORMAT:
-        raise DataError(f"{path}: not a {FORMAT}; found {_describe(content)}")
+        found = (
+            f"dict with keys {sorted(map(str, content))[:4]}" if isinstance(content, dict) else type(content).__name__
+        )
+        raise DataError(f"{path}: not a {FORMAT}; found a {found}")
     version = content.get("version")
     if type(version) is not int or version != VERSION:  # True is an int too, and equal to 1
         raise DataError(f"{path}: {FORMAT} version {version!r}, expected {VERSION}")
@@ -165,9 +167,3 @@ def _info_from_plain(plain: dict[str, Any]) -> SceneInfo:
         )
     tuples = {k: tuple(plain[k]) for k in ("time_range", "background", "up")}
     return SceneInfo(**dict(plain, box=np.array(plain["box"], np.float32), camera=camera, **tuples))
-
-
-def _describe(content: Any) -> str:
-    if isinstance(content, dict):
-        return f"a dict with keys {sorted(map(str, content))[:4]}"
-    return f"a {type(content).__name__}"

@@ -110,7 +110,8 @@ class DeformationField(nn.Module):
         if not self.heads:
             return rows
         add = self._added if kernels else self._added_reference
-        for time, sign in self._signed(t):
+        times = [(t, 1.0)] if self.key is None else [(t, 1.0), (scene.instant(self.key), -1.0)]
+        for time, sign in times:
             rows = add(rows, features(time), columns, sign, weight_step)
         return rows
 
@@ -134,10 +135,6 @@ class DeformationField(nn.Module):
         settings = own, 2 * len(self.trunk.layers), step
         found: Tensor = _AddNetworks.apply(rows, features, settings, *parameters)  # type: ignore[no-untyped-call]
         return found
-
-    def _signed(self, t: float) -> list[tuple[float, float]]:
-        """Returns the times at which F is evaluated, each with its sign."""
-        return [(t, 1.0)] if self.key is None else [(t, 1.0), (scene.instant(self.key), -1.0)]
 
     def _named_heads(self) -> list[tuple[str, MLP]]:
         """Returns the heads present, in the registry's order."""

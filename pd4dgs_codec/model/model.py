@@ -1,4 +1,4 @@
-"""The layered model: one graph for training and inference.
+"""The layered model: one graph for training and inference, and its conversion from and to a `Scene` of numpy arrays.
 
 Render_0    = R(MLP(A))
 Render_1(t) = R(MLP(A + F_global(A, t)))
@@ -12,6 +12,7 @@ The gate m^(level) multiplies each Gaussian's opacity and scale.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -20,10 +21,23 @@ import torch
 from torch import Tensor, nn
 
 from pd4dgs_codec.draw.gaussians import OFFSET_REACH, SIGMA_REACH, in_view
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.format.quantise import mask_codes
 from pd4dgs_codec.model import fused, reference
 from pd4dgs_codec.model.deformation import DeformationField
-from pd4dgs_codec.model.networks import EXACT, MLP, Quantisation, Rounding, level_mask
-from pd4dgs_codec.scene import MASK_THRESHOLD, SCAFFOLD_NETWORKS, Camera, SceneInfo, Steps, Widths
+from pd4dgs_codec.model.networks import EXACT, MLP, Quantisation, Rounding, level_mask, mask_logits
+from pd4dgs_codec.scene import (
+    ATTRIBUTES,
+    MASK_STEP,
+    MASK_THRESHOLD,
+    SCAFFOLD_NETWORKS,
+    Camera,
+    Grading,
+    Scene,
+    SceneInfo,
+    Steps,
+    Widths,
+)
 
 #: Range over which the opacity biases of an anchor's Gaussians, which start at one place, are spread at the start: some
 #: but not all of them are visible everywhere.
@@ -153,12 +167,11 @@ class Model(nn.Module):
 
     def _picked(self, rows: Tensor, rounding: Rounding) -> tuple[Any, ...]:
         """Returns the arguments of `pick` for the anchors `rows`: attributes, positions, rows and quantisation."""
+        steps, centres, names = self.steps.attributes, self.centres, ("feature", "offset", "scaling_log")
         noise = None
         if rounding.noise is not None and not rounding.attributes:
-            taken = self.feature, self.scaling_log, self.offset  # in the order in which they take noise
-            draws = [rounding.noise.draw(torch.Size((len(rows), x[0].numel()))) for x in taken]
-            noise = draws[0], draws[2], draws[1]
-        steps, centres, names = self.steps.attributes, self.centres, ("feature", "offset", "scaling_log")
+            draws = {n: rounding.noise.draw(torch.Size((len(rows), centres[n].numel()))) for n in ATTRIBUTES}
+            noise = [draws[name] for name in names]
         quantisation = Quantisation(
             [steps[n] for n in names], [centres[n] for n in names], self.spacing, noise, rounding.attributes
         )
@@ -211,3 +224,75 @@ def fresh_networks(widths: Widths, hidden: int) -> dict[str, MLP]:
     with torch.no_grad():  # random biases could hide anchors for good
         networks["opacity"].layers[-1].bias.copy_(torch.linspace(*START_OPACITY, widths.slots))
     return networks
+
+
+# -- from and to the arrays that the codec packs -----------------------------------------------------------------------
+
+
+def check_finite(state: Mapping[str, torch.Tensor]) -> None:
+    """Raises DataError naming a tensor that holds a NaN or an infinity."""
+    for name, tensor in state.items():
+        if not torch.isfinite(tensor).all():
+            raise DataError(f"tensor {name} holds a NaN or an infinity; expected finite numbers")
+
+
+def to_scene(model: Model) -> Scene:
+    """Returns an unplanned scene of every anchor of the model: rows (N, ...), masks of inactive anchors 0.
+
+    Raises DataError as `check_finite` does.
+    """
+    check_finite(model.state_dict())
+    deformations = {layer: field.arrays() for layer, field in model.deformations.items()}
+    layers = (0, *deformations)
+    n = len(model.anchor_q)
+    with torch.no_grad():
+        masks = tuple(mask_codes(model.masks(layer).cpu().numpy()) for layer in layers)
+    return Scene(
+        info=model.info,
+        steps=model.steps,
+        layers=layers,
+        rows=(n,) * len(layers),
+        anchor_q=_numpy(model.anchor_q),
+        feature=_numpy(model.feature),
+        scaling_log=_numpy(model.scaling_log),
+        offset=_numpy(model.offset),
+        mask=masks,
+        networks={name: model.network(name).arrays() for name in SCAFFOLD_NETWORKS},
+        global_deformation=deformations.get(1),
+        local_deformation=deformations.get(2),
+        grading=Grading(_numpy(model.step_class), _numpy(model.centre)) if model.step_class.any() else None,
+    )
+
+
+def from_scene(scene: Scene) -> Model:
+    """Returns the model that renders `scene`, with anchors in the scene's order.
+
+    A level whose layer is absent equals the level below it; masks are reproduced to within 1e-6.
+    """
+    n = len(scene.anchor_q)
+    masks = np.zeros((n, 3), np.float64)
+    for level in range(3):
+        present = [i for i, layer in enumerate(scene.layers) if layer <= level]
+        codes = scene.mask[present[-1]]
+        masks[: len(codes), level] = codes * np.float64(MASK_STEP)
+    box = scene.info.box
+    fields = (scene.global_deformation, scene.local_deformation)
+    global_field, local_field = (None if f is None else DeformationField.from_arrays(f, box) for f in fields)
+    return Model(
+        scene.info,
+        scene.steps,
+        torch.from_numpy(scene.anchor_q.astype(np.int32)),
+        torch.from_numpy(np.array(scene.feature, np.float32)),
+        torch.from_numpy(np.array(scene.scaling_log, np.float32)),
+        torch.from_numpy(np.array(scene.offset, np.float32)),
+        torch.from_numpy(mask_logits(masks)),
+        {name: MLP.from_arrays(net) for name, net in scene.networks.items()},
+        global_field,
+        local_field,
+        *(() if scene.grading is None else map(torch.from_numpy, (scene.grading.classes, scene.grading.centre))),
+    )
+
+
+def _numpy(tensor: torch.Tensor) -> np.ndarray:
+    array: np.ndarray = tensor.detach().cpu().numpy().copy()
+    return array

@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from pd4dgs_codec.format.symbols import layer_symbols
-from pd4dgs_codec.model.convert import from_scene
-from pd4dgs_codec.model.model import Gaussians, Model
+from pd4dgs_codec.model.model import Gaussians, Model, from_scene
 from pd4dgs_codec.model.networks import EXACT, Rounding
 from pd4dgs_codec.model.picture import draw, render_image
 from pd4dgs_codec.scene import ATTRIBUTES, Camera, Scene

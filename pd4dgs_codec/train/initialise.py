@@ -55,7 +55,7 @@ def fresh_model(
         fresh = None if field is None else DeformationField.fresh(field, info.box, widths.heads, key_code, below)
         fields.append(fresh)
         below += field.features if field else 0
-    model = Model(
+    return Model(
         info,
         steps,
         anchor_q,
@@ -64,14 +64,9 @@ def fresh_model(
         torch.zeros(n, widths.slots, 3),
         fresh_mask_logits(n, min(config.level, max_layer)),
         fresh_networks(widths, config.hidden),
-        fields[0],
-        fields[1],
+        fields[0] if max_layer > 0 else None,
+        fields[1] if max_layer > 1 else None,
     )
-    if max_layer < 2:
-        model.local_deformation = None
-    if max_layer < 1:
-        model.global_deformation = None
-    return model
 
 
 def fresh_mask_logits(n: int, level: int) -> Tensor:

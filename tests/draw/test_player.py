@@ -17,7 +17,7 @@ from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.errors import RenderError
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
-from pd4dgs_codec.model.convert import from_scene
+from pd4dgs_codec.model.model import from_scene
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.scene import SCAFFOLD_NETWORKS, Camera, Deformation, Scene, Widths, instant
 

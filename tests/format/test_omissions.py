@@ -43,7 +43,7 @@ def test_no_pixel_changes():
     pytest.importorskip("numba")
     from tiny import camera_around
 
-    from pd4dgs_codec.model.convert import from_scene
+    from pd4dgs_codec.model.model import from_scene
     from pd4dgs_codec.model.picture import render_image
 
     files = [encode(lively_scene(), layers=2, effort=1, omit=omit) for omit in ("nothing", "lossless")]

@@ -16,7 +16,7 @@ from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.interchange.scaffold_gs import Choices, read_scaffold_gs
 from pd4dgs_codec.model import checkpoint
-from pd4dgs_codec.model.convert import from_scene, to_scene
+from pd4dgs_codec.model.model import from_scene, to_scene
 
 F, K, N, PICTURES, APPEARANCE = 32, 10, 40, 5, 8
 

@@ -16,7 +16,7 @@ from tiny import Trap
 
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.model import checkpoint
-from pd4dgs_codec.model.convert import from_scene
+from pd4dgs_codec.model.model import from_scene
 
 
 def model(layers=(0, 1, 2), **options):

@@ -14,9 +14,8 @@ from pd4dgs_codec.draw.hexplane import Field
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.model import checkpoint, fused
 from pd4dgs_codec.model.config import DeformationConfig
-from pd4dgs_codec.model.convert import from_scene, to_scene
 from pd4dgs_codec.model.deformation import DeformationField
-from pd4dgs_codec.model.model import Model, fresh_networks
+from pd4dgs_codec.model.model import Model, fresh_networks, from_scene, to_scene
 from pd4dgs_codec.model.networks import EXACT, level_mask, mask_logits
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.scene import (

@@ -14,7 +14,7 @@ from tiny import camera_ahead
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import RenderError
 from pd4dgs_codec.format.info import info
-from pd4dgs_codec.model.convert import from_scene
+from pd4dgs_codec.model.model import from_scene
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.scene import Camera, Deformation, Scene
 

@@ -16,8 +16,7 @@ import torch
 from torch import Tensor
 
 from pd4dgs_codec.data.view import View
-from pd4dgs_codec.model.convert import to_scene
-from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.model.model import Model, to_scene
 from pd4dgs_codec.model.sensitivity import utility, without
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train import workers
