@@ -5,8 +5,7 @@ Images are rounded to 8 bits first, as in a written picture. Masks are bool [H, 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -168,13 +167,3 @@ def mean_scores(
             scores[name].append(metric(picture, view.image, view.mask))
         step()
     return {name: float(np.mean(values)) for name, values in scores.items()}
-
-
-def level_psnr(
-    draw: Callable[[int, View], np.ndarray],
-    levels: Iterable[int],
-    views: Sequence[View],
-    step: Callable[[], None] = lambda: None,
-) -> dict[int, float]:
-    """Returns per level the mean mPSNR of draw(level, view) over `views`, dB, infinite for equal pictures."""
-    return {level: mean_scores(partial(draw, level), views, {"mpsnr": mpsnr}, step)["mpsnr"] for level in levels}

@@ -1,4 +1,4 @@
-"""Measures packed scenes: the error of their pictures, and the gain of their layers."""
+"""Measures scenes by their pictures for packing: errors, the gain of layers, and the order of anchors in slices."""
 
 from __future__ import annotations
 
@@ -10,33 +10,72 @@ import torch
 
 from pd4dgs_codec.data.view import View
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
-from pd4dgs_codec.format.plan import LeftOut, plan, tensor_bytes
+from pd4dgs_codec.format.plan import LeftOut, in_file_order, passed, plan, tensor_bytes
 from pd4dgs_codec.format.registry import LAYER_KINDS
-from pd4dgs_codec.model.convert import from_scene
+from pd4dgs_codec.format.symbols import layer_symbols
+from pd4dgs_codec.model.model import Model, from_scene
+from pd4dgs_codec.model.networks import EXACT, Rounding
 from pd4dgs_codec.model.picture import render_image
-from pd4dgs_codec.model.sensitivity import omission_error
-from pd4dgs_codec.quality.frames import Frame
-from pd4dgs_codec.quality.image import level_psnr
+from pd4dgs_codec.model.sensitivity import Viewpoint, omission_error, smaller, utility, without
+from pd4dgs_codec.quality.image import mean_scores, mpsnr
 from pd4dgs_codec.scene import Scene
+
+#: A layer's bytes are divided into so many parts; the next layer may begin after any of them.
+PARTS = 16
+
+
+def pictures(
+    model: Model, level: int, viewpoints: Sequence[Viewpoint], step: Callable[[], None] = lambda: None
+) -> list[np.ndarray]:
+    """Renders float32 [H, W, 3] in 0..1 at `level` from each viewpoint. step is called after each picture."""
+    found = []
+    for camera, time in viewpoints:
+        found.append(render_image(model, level, time, camera))
+        step()
+    return found
+
+
+def level_psnr(
+    model: Model,
+    level: int,
+    views: Sequence[View],
+    step: Callable[[], None] = lambda: None,
+    rounding: Rounding = EXACT,
+) -> float:
+    """Returns the mean mPSNR of a level over `views`, dB, infinite for equal pictures. step is called after each."""
+
+    def draw(view: View) -> np.ndarray:
+        return render_image(model, level, view.time, view.camera, rounding)
+
+    return mean_scores(draw, views, {"mpsnr": mpsnr}, step)["mpsnr"]
+
+
+def true_psnr(scene: Scene, views: Sequence[View], step: Callable[[], None] = lambda: None) -> dict[int, float]:
+    """Returns `level_psnr` by level of a decoded scene."""
+    model = from_scene(scene)
+    return {level: level_psnr(model, level, views, step) for level in scene.layers}
+
+
+# -- errors of a quantised scene ---------------------------------------------------------------------------------------
 
 
 class RenderedLoss:
-    """The error of decoded scenes in the pictures of `frames`, relative to the unquantised `scene`, at its levels.
+    """The error of decoded scenes in the pictures at `viewpoints`, relative to the unquantised `scene`, at its levels.
 
     step is called after each picture.
     """
 
-    def __init__(self, scene: Scene, frames: Sequence[Frame], step: Callable[[], None] = lambda: None):
-        self.frames, self.levels, self.step = frames, scene.layers, step
-        self.references = self._pictures(scene)
+    def __init__(self, scene: Scene, viewpoints: Sequence[Viewpoint], step: Callable[[], None] = lambda: None):
+        self.viewpoints, self.step, model = viewpoints, step, from_scene(scene)
+        self.references = {level: pictures(model, level, viewpoints, step) for level in scene.layers}
 
     def mse(self, scene: Scene) -> dict[int, float]:
         """Returns per level the mean squared error over all pictures, colours in 0..1."""
-        pictures = self._pictures(scene)
-        return {
-            level: float(np.mean([np.square(a - b).mean() for a, b in zip(pictures[level], references, strict=True)]))
-            for level, references in self.references.items()
-        }
+        model, found = from_scene(scene), {}
+        for level, references in self.references.items():
+            pairs = zip(pictures(model, level, self.viewpoints, self.step), references, strict=True)
+            found[level] = float(np.mean([np.square(a - b).mean() for a, b in pairs]))
+        return found
 
     def mean_mse(self, scene: Scene) -> float:
         """Returns the mean of `mse` over the levels."""
@@ -48,34 +87,15 @@ class RenderedLoss:
         model = from_scene(scene)
         total, met = np.zeros(len(scene.anchor_q)), np.zeros(len(scene.anchor_q), bool)
         generator = torch.Generator().manual_seed(0)
-        for frame in self.frames:
-            error, near, _ = omission_error(model, level, frame.time, frame.camera, generator)
+        for camera, time in self.viewpoints:
+            error, near, _ = omission_error(model, level, time, camera, generator)
             total += error.numpy()
             met |= near.numpy()
             self.step()
         return np.where(met, total, np.inf)
 
-    def _pictures(self, scene: Scene) -> dict[int, list[np.ndarray]]:
-        model = from_scene(scene)
-        pictures: dict[int, list[np.ndarray]] = {}
-        for level in self.levels:
-            pictures[level] = []
-            for frame in self.frames:
-                pictures[level].append(render_image(model, level, frame.time, frame.camera))
-                self.step()
-        return pictures
 
-
-def true_psnr(
-    scene: Scene, views: Sequence[View], step: Callable[[], None] = lambda: None, *, levels: Sequence[int] | None = None
-) -> dict[int, float]:
-    """Returns the mean mPSNR over views, dB, by level of a decoded scene; `levels` defaults to all."""
-    model = from_scene(scene)
-
-    def draw(level: int, view: View) -> np.ndarray:
-        return render_image(model, level, view.time, view.camera)
-
-    return level_psnr(draw, scene.layers if levels is None else levels, views, step)
+# -- the gain of layers ------------------------------------------------------------------------------------------------
 
 
 def leave_out_low_gain(
@@ -94,18 +114,19 @@ def leave_out_low_gain(
     The steps of `scene` are binary32.
     """
     left_out: list[LeftOut] = []
-    present = None
+    present = None  #: (highest level, its PSNR) of the scene
     for kind in reversed(LAYER_KINDS[1:]):
         deformation = scene.deformation(kind.layer)
         if deformation is None:
             continue
         if present is None:
-            present = _measure(scene, views, options, step)
-        if kind.layer not in present:  # without effect: the plan leaves it out and reports why
+            present = _highest_psnr(scene, views, options, step)
+        level, psnr = present
+        if level != kind.layer:  # without effect: the plan leaves it out and reports why
             continue
-        without = scene.with_tensors(kind.layer, None)
-        remaining = _measure(without, views, options, step)
-        gain = present[max(present)] - remaining[max(remaining)]
+        rest = scene.with_tensors(kind.layer, None)
+        remaining = _highest_psnr(rest, views, options, step)
+        gain = psnr - remaining[1]
         size = tensor_bytes(deformation, kind, scene.steps, options)
         if gain * 1e6 >= min_gain * size:
             break
@@ -114,10 +135,79 @@ def leave_out_low_gain(
             f"{gain * 1e6 / size:.2f} dB per MB, expected at least {min_gain:,g}"
         )
         left_out.append(LeftOut(kind.name, why, kind, deformation))
-        scene, present = without, remaining
+        scene, present = rest, remaining
     return scene, left_out
 
 
-def _measure(scene: Scene, views: Sequence[View], options: EncodeOptions, step: Callable[[], None]) -> dict[int, float]:
-    planned = plan(scene, replace(options, layers="auto", omit="nothing"))
-    return true_psnr(planned.symbols.scene(), views, step)
+def _highest_psnr(
+    scene: Scene, views: Sequence[View], options: EncodeOptions, step: Callable[[], None]
+) -> tuple[int, float]:
+    """Returns the highest level of the scene once it is quantised and planned, and its mPSNR over the views, dB."""
+    packed = plan(scene, replace(options, layers="auto", omit="nothing")).symbols.scene()
+    return packed.level, level_psnr(from_scene(packed), packed.level, views, step)
+
+
+# -- the order of anchors in a sliced file -----------------------------------------------------------------------------
+
+
+def in_order(
+    scene: Scene,
+    viewpoints: Sequence[Viewpoint],
+    options: EncodeOptions,
+    step: Callable[[], None] = lambda: None,
+    *,
+    passing: bool = True,
+) -> tuple[Scene, np.ndarray]:
+    """Orders the anchors of a planned scene. Returns the scene in file order, with some anchors passed to the next
+    layer, and float64 [N], the utility of each anchor in its layer, see `utility`.
+
+    A layer keeps its most useful anchors until the next layer's planes and networks improve the pictures at
+    `viewpoints` more per byte than its own next anchors; with `passing` the other anchors pass. The highest level is
+    unchanged. step is called after each round of `utility`.
+    """
+    viewpoints = [(smaller(camera), time) for camera, time in viewpoints]
+    whole, found = pictures(from_scene(scene), scene.level, viewpoints), list[np.ndarray]()
+    for index, layer in enumerate(scene.layers):
+        own = utility(scene.prefix(layer), viewpoints, step)
+        if passing and layer < scene.level:
+            order = np.argsort(-own, kind="stable")
+            first = scene.rows[index] - len(own)
+            kept, others = np.split(order, [_enough(scene, index, first + order, viewpoints, whole, options)])
+            scene, rows = in_file_order(passed(scene, index, first + others), scene.layers)
+            own = own[rows[first : first + len(kept)] - first]
+        found.append(own)
+    return scene, np.concatenate(found)
+
+
+def _enough(
+    scene: Scene,
+    index: int,
+    order: np.ndarray,
+    viewpoints: Sequence[Viewpoint],
+    whole: Sequence[np.ndarray],
+    options: EncodeOptions,
+) -> int:
+    """Returns how many anchors of scene.layers[index] come before the next layer. order: int64 [n], its rows, the most
+    useful one first. whole: the pictures of the highest level."""
+    level, above = scene.layers[index : index + 2]
+
+    def error(level: int, count: int) -> float:
+        """Returns the pictures' squared error at `level` with `count` of the anchors and none of later layers."""
+        prefix = scene.prefix(level)
+        later = np.arange(scene.rows[index], prefix.rows[-1])
+        model = from_scene(without(prefix, np.concatenate([order[count:], later])))
+        shown = pictures(model, level, viewpoints)
+        return float(sum(np.square(a - b).sum() for a, b in zip(shown, whole, strict=True)))
+
+    motion = tensor_bytes(scene.tensors(above), LAYER_KINDS[above], scene.steps, options)
+    size = np.cumsum(layer_symbols(scene, index).bits_per_row()[order - (scene.rows[index] - len(order))]) / 8
+    parts = np.linspace(0.0, size[-1] if len(size) else 0.0, PARTS + 1)
+    counts = np.searchsorted(size, parts, side="right")
+    start = 1 if index == 0 else 0  # a picture needs anchors
+    before = error(level, counts[start])
+    for i in range(start, PARTS):
+        after, moved = error(level, counts[i + 1]), error(above, counts[i])
+        if (before - moved) * (parts[i + 1] - parts[i]) > (before - after) * motion:
+            return int(counts[i])
+        before = after
+    return len(order)

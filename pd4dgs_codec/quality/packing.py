@@ -15,8 +15,8 @@ from pd4dgs_codec.format.metadata import Metadata, write_metadata
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.plan import LeftOut, plan
 from pd4dgs_codec.quality import ENCODE_MIN_DB_PER_MEGABYTE
-from pd4dgs_codec.quality.frames import Frame, dataset_frames, own_frames
-from pd4dgs_codec.scene import Scene
+from pd4dgs_codec.quality.frames import own_frames
+from pd4dgs_codec.scene import Camera, Scene
 
 if TYPE_CHECKING:
     import numpy as np
@@ -91,13 +91,13 @@ def pack(
     slices and the gain of layers. Without views the pictures are of the file's own camera, 1/downscale as wide and
     high, and layers are kept whatever their gain. min_gain: dB of mPSNR per megabyte below which a layer is left out,
     if options.layers is "auto"; 0 keeps all. metadata: stored in the file. With options.slices anchors are ordered by
-    the pictures' gain per byte, and without target sizes some pass to later layers, see `slicing.in_order`. Without
+    the pictures' gain per byte, and without target sizes some pass to later layers, see `measure.in_order`. Without
     views or a camera the largest anchors come first.
 
     Only views, target sizes and slices need torch. Raises EncodeError, RenderError for target sizes without a camera.
     """
     if not isinstance(source, Scene):
-        from pd4dgs_codec.model.convert import to_scene
+        from pd4dgs_codec.model.model import to_scene
 
         source = to_scene(source)
     scene, options = options.apply_scale(source)
@@ -132,10 +132,11 @@ class _Pictures:
     def cameras(self) -> str:
         return "the file's own camera" if self.views is None else f"training views of {self.views.source}"
 
-    def frames(self, scene: Scene) -> list[Frame]:
-        if self.views is None:
-            return own_frames(scene.info, OWN_PICTURES, OWN_ORBIT, self.downscale)
-        return dataset_frames(self.views.fitting)
+    def viewpoints(self, scene: Scene) -> list[tuple[Camera, float]]:
+        if self.views is not None:
+            return [(view.camera, view.time) for view in self.views.fitting]
+        frames = own_frames(scene.info, OWN_PICTURES, OWN_ORBIT, self.downscale)
+        return [(frame.camera, frame.time) for frame in frames]
 
     def fit(
         self,
@@ -151,9 +152,9 @@ class _Pictures:
 
         planned = plan(scene, options)
         scene, left_out = planned.scene, left_out + planned.left_out
-        frames = self.frames(scene)
+        viewpoints = self.viewpoints(scene)
         with self.progress("fitting sizes") as step:
-            loss = RenderedLoss(scene, frames, step)
+            loss = RenderedLoss(scene, viewpoints, step)
             fitter = Fitter(scene, target_sizes, loss.mean_mse, loss.omission_error, options)
             met = False
             while not met:
@@ -171,7 +172,7 @@ class _Pictures:
             lost = {"lost_db": before[level] - after[level]} if before else {}
             levels.append({"level": level, "error_psnr": -10.0 * math.log10(mse) if mse else math.inf, **lost})
         layers = [asdict(row) | {"bytes": added.get(row.layer, 0)} for row in fits]
-        target = {"cameras": self.cameras, "pictures": len(frames), "layers": layers, "levels": levels}
+        target = {"cameras": self.cameras, "pictures": len(viewpoints), "layers": layers, "levels": levels}
         return Packed(data, fitted, report, target, slices)
 
     def write(
@@ -187,17 +188,16 @@ class _Pictures:
         later layers."""
         if not options.slices:
             return *encode_with_report(scene, options, left_out=left_out, metadata=metadata), None
-        from pd4dgs_codec.quality.measure import true_psnr
-        from pd4dgs_codec.quality.slicing import in_order
+        from pd4dgs_codec.model.model import from_scene
+        from pd4dgs_codec.quality.measure import in_order, level_psnr
 
         about: dict[str, Any] = {"order": "gate times area", "cameras": None, "pictures": 0}
         order: Callable[[Scene], np.ndarray] | None = None
-        if frames := self.frames(scene) if self.views is not None or scene.info.camera is not None else []:
-            about = {"order": "rendered gain per byte", "cameras": self.cameras, "pictures": len(frames)}
+        if viewpoints := self.viewpoints(scene) if self.views is not None or scene.info.camera is not None else []:
+            about = {"order": "rendered gain per byte", "cameras": self.cameras, "pictures": len(viewpoints)}
             planned = plan(scene, options)
             left_out = [*left_out, *planned.left_out]
             with self.progress("ordering anchors") as step:
-                viewpoints = [(frame.camera, frame.time) for frame in frames]
                 scene, values = in_order(planned.scene, viewpoints, options, step, passing=passing)
 
             def order(_: Scene) -> np.ndarray:
@@ -207,8 +207,7 @@ class _Pictures:
         if self.held_out:
             with self.progress("measuring slices") as step:
                 about["psnr"] = [
-                    true_psnr(prefix, self.held_out, step, levels=[prefix.level])[prefix.level]
-                    for prefix in every_prefix(data)
+                    level_psnr(from_scene(prefix), prefix.level, self.held_out, step) for prefix in every_prefix(data)
                 ]
             metadata = replace(metadata or Metadata(), slices=tuple(about["psnr"]))
         if metadata is not None:

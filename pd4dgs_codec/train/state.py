@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,8 +15,7 @@ from pd4dgs_codec.data.view import Dataset, View, shrunk_view
 from pd4dgs_codec.model.config import PRESETS, ModelConfig
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.networks import EXACT, Noise, Rounding
-from pd4dgs_codec.model.picture import render_image
-from pd4dgs_codec.quality.image import level_psnr
+from pd4dgs_codec.quality.measure import level_psnr
 from pd4dgs_codec.scene import MASK_THRESHOLD, instant
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.initialise import fresh_model
@@ -210,11 +208,7 @@ class TrainState:
     def level_psnr(self, views: Sequence[View]) -> list[float]:
         """Per level of the model the mean mPSNR over `views`, dB, rounded as at this position, without noise."""
         rounding = self.rounding(noisy=False)
-
-        def draw(level: int, view: View) -> np.ndarray:
-            return render_image(self.model, level, view.time, view.camera, rounding)
-
-        return list(level_psnr(draw, range(self.model.level + 1), views).values())
+        return [level_psnr(self.model, level, views, rounding=rounding) for level in range(self.model.level + 1)]
 
     # -- changes ---------------------------------------------------------------------------------------------------
 

@@ -14,7 +14,7 @@ from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.model import checkpoint
-from pd4dgs_codec.model.convert import to_scene
+from pd4dgs_codec.model.model import to_scene
 
 ENCODE_KEYS = {"mode", "bytes", "verified", "seconds", "layers", "left_out"}
 LAYER_KEYS = {"layer", "bytes", "payload_bits", "rate_bits", "position_bits", "symbols", "anchors"}

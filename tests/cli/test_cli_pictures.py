@@ -15,7 +15,7 @@ from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import PRESETS
-from pd4dgs_codec.model.convert import from_scene
+from pd4dgs_codec.model.model import from_scene
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.quality import perceptual
 from pd4dgs_codec.quality.evaluate import TEMPORAL_FRAMES, evaluate

@@ -11,7 +11,7 @@ from pd4dgs_codec.data.view import View
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.model import sensitivity
-from pd4dgs_codec.model.convert import from_scene
+from pd4dgs_codec.model.model import from_scene
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.quality import packing, target
 from pd4dgs_codec.quality.frames import own_frames
@@ -84,7 +84,7 @@ def test_the_estimated_omission_error_is_close_to_the_measured_one(scene, monkey
     monkeypatch.setattr(sensitivity, "PROBES", 64)  # the anchors differ less here than in a trained scene
     planned = plan(scene).scene
     ground = planned.prefix(0)  # the pictures of other levels are not compared
-    loss = RenderedLoss(ground, own_frames(planned.info, 2, 20.0))
+    loss = RenderedLoss(ground, [(frame.camera, frame.time) for frame in own_frames(planned.info, 2, 20.0)])
     harm = loss.omission_error(planned, 0)
     anchors = range(planned.rows[0])
     measured = []
@@ -92,7 +92,7 @@ def test_the_estimated_omission_error_is_close_to_the_measured_one(scene, monkey
         mask = ground.mask[0].copy()
         mask[anchor] = 0
         measured.append(loss.mse(replace(ground, mask=(mask,)))[0])
-    scalars = 3 * len(loss.frames) * planned.info.camera.width * planned.info.camera.height
+    scalars = 3 * len(loss.viewpoints) * planned.info.camera.width * planned.info.camera.height
     harm, measured = harm[: len(anchors)], scalars * np.array(measured)
     assert np.isfinite(harm).all() and 0.5 < np.median(harm / measured) < 2
     ranks = np.corrcoef(harm.argsort().argsort(), measured.argsort().argsort())[0, 1]

@@ -19,7 +19,7 @@ from pd4dgs_codec.cli.train import _device
 from pd4dgs_codec.errors import TrainError
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import PRESETS
-from pd4dgs_codec.model.convert import to_scene
+from pd4dgs_codec.model.model import to_scene
 from pd4dgs_codec.scene import Widths
 from pd4dgs_codec.train.config import at_quality
 from pd4dgs_codec.train.learner import Learner

@@ -9,7 +9,6 @@ import torch
 from pd4dgs_codec.data.view import View
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.quality.image import (
-    level_psnr,
     mean_image_baseline,
     mean_scores,
     moving_regions,
@@ -179,14 +178,15 @@ def test_each_view_is_drawn_once_whatever_the_number_of_metrics():
     assert found == {"mpsnr": pytest.approx(20 * np.log10(255 / 2)), "valid": pytest.approx((96 + MASK.sum()) / 3)}
 
 
-def test_psnr_per_level_keeps_the_levels_and_honours_masks():
-    def draw(level, view):
-        picture = wrong_by(1 + level, view)
+@pytest.mark.parametrize("amount", [1, 3])
+def test_the_mean_psnr_honours_masks(amount):
+    def draw(view):
+        picture = wrong_by(amount, view)
         if view.mask is not None:
             picture[~view.mask] = 0  # not looked at
         return picture
 
-    assert level_psnr(draw, (0, 2), VIEWS) == pytest.approx({0: 20 * np.log10(255), 2: 20 * np.log10(255 / 3)})
+    assert mean_scores(draw, VIEWS, {"mpsnr": mpsnr}) == {"mpsnr": pytest.approx(20 * np.log10(255 / amount))}
 
 
 def reference_ssim(a, b):

@@ -10,7 +10,7 @@ from tiny import camera_ahead
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.model.sensitivity import utility
-from pd4dgs_codec.quality.slicing import in_order
+from pd4dgs_codec.quality.measure import in_order
 
 VIEWPOINTS = [(camera_ahead(3.0, 20.0, 24, 16), time) for time in (0.0, 0.5, 1.0)]
 OPTIONS = EncodeOptions(effort=1)

@@ -5,9 +5,8 @@ from runs import read_log
 from trainer_rate import train_rate_bits
 
 from pd4dgs_codec.format.encoder import encode_with_report
-from pd4dgs_codec.model.convert import to_scene
-from pd4dgs_codec.model.picture import render_image
-from pd4dgs_codec.quality.image import level_psnr
+from pd4dgs_codec.model.model import to_scene
+from pd4dgs_codec.quality.measure import level_psnr
 from pd4dgs_codec.train import phases
 from pd4dgs_codec.train.config import TrainConfig, at_quality
 from pd4dgs_codec.train.loop import Trainer
@@ -22,12 +21,11 @@ def test_bytes_rise_with_the_dial(dataset, tmp_path, monkeypatch):
         trainer = Trainer(TrainConfig(preset="tiny", iterations=60, **at_quality(quality)), dataset)
         trainer.run(tmp_path / "m.pt")
         model = trainer.model
-        levels = level_psnr(lambda i, v, m=model: render_image(m, i, v.time, v.camera), [0, 1, 2], dataset.train)
+        psnr.append(level_psnr(model, 2, dataset.train))
         data, report = encode_with_report(to_scene(model), effort=1, omit="nothing")
         streams = [stream for layer in report.layers for stream in layer.streams]
         files.append(len(data))
         sizes.append(sum(stream.payload_bits for stream in streams if stream.name != "weights"))
-        psnr.append(levels[2])
     assert sizes[0] < 0.9 * sizes[1]
     assert files == sorted(files)  # of which weights, that the dial leaves alone, are more than half
     assert max(psnr) - min(psnr) < 0.5, psnr  # so short a run learns little that the dial could take

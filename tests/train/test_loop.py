@@ -14,7 +14,7 @@ from runs import assert_goes_on_as_one_run, assert_same_weights, interrupt, read
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import DataError, TrainError
 from pd4dgs_codec.model import checkpoint
-from pd4dgs_codec.model.convert import to_scene
+from pd4dgs_codec.model.model import to_scene
 from pd4dgs_codec.train import loop, phases
 from pd4dgs_codec.train.config import ABLATIONS, TrainConfig
 from pd4dgs_codec.train.loop import RecordLog, Trainer

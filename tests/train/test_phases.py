@@ -16,7 +16,7 @@ from pd4dgs_codec.errors import NotFinite
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode, encode_with_report
 from pd4dgs_codec.model import checkpoint
-from pd4dgs_codec.model.convert import to_scene
+from pd4dgs_codec.model.model import to_scene
 from pd4dgs_codec.model.networks import EXACT
 from pd4dgs_codec.model.picture import render, render_image
 from pd4dgs_codec.model.sensitivity import rounding_error
