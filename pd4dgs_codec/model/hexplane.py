@@ -17,7 +17,7 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from pd4dgs_codec.draw import hexplane as kernels
-from pd4dgs_codec.draw.hexplane import TIME_AXIS, PlaneLayout
+from pd4dgs_codec.draw.hexplane import SPATIAL, TEMPORAL, PlaneLayout
 from pd4dgs_codec.draw.simd import LANES
 from pd4dgs_codec.format.deformation import plane_rate_bits
 from pd4dgs_codec.model import plane_terms
@@ -127,17 +127,19 @@ class HexPlane(nn.Module):
         return planes
 
     @torch.no_grad()
-    def start(self, generator: torch.Generator | None = None) -> None:
-        """Draws start values: time planes 1, spatial planes random in START.
+    def start(self) -> None:
+        """Draws start values from the global generator: time planes 1, spatial planes random in START.
 
         Features, products of planes, then start near 1. The range 0.1..0.5 of public code gives features of about 0.03,
         which separate places and times so slowly that some runs never learn motion. Draws are independent every SPACING
         cells and linear in between, so that cells that no anchor reaches cost few bits.
         """
         for scale in self.layout.views(self.grid.fill_(1)):
-            for name, _, b in PLANES:
-                if b != TIME_AXIS:
-                    scale[name].copy_(_start(scale[name].shape, generator))
+            for plane in (scale[name] for name, *_ in SPATIAL):
+                height, width, channels = plane.shape
+                draws = torch.empty(1, channels, -(-height // SPACING), -(-width // SPACING)).uniform_(*START)
+                field = F.interpolate(draws, size=(height, width), mode="bilinear", align_corners=True)
+                plane.copy_(field[0].permute(1, 2, 0))
 
     @property
     def fusible(self) -> bool:
@@ -173,7 +175,7 @@ class HexPlane(nn.Module):
     def _mix_times(self, cells: Tensor, instants: int, which: int) -> None:
         """Multiplies time planes of more than `instants` cells, along time, by matrix `which` of `_mixtures`."""
         for scale in self.layout.views(cells):
-            for plane in (scale[name] for name, _, b in PLANES if b == TIME_AXIS and len(scale[name]) > instants):
+            for plane in (scale[name] for name, *_ in TEMPORAL if len(scale[name]) > instants):
                 mixture = _mixtures(len(plane), instants)[which].to(plane)
                 plane.copy_((mixture @ plane.flatten(1)).view_as(plane))
 
@@ -231,11 +233,3 @@ def _mixtures(cells: int, instants: int) -> tuple[Tensor, Tensor]:
     hats = (1 - (place[:, None] - torch.arange(instants)).abs()).clamp(min=0)
     products = hats @ hats.T
     return hats @ torch.linalg.pinv(hats), products / products.sum(1).mean()
-
-
-def _start(shape: Sequence[int], generator: torch.Generator | None) -> Tensor:
-    """Draws start values [H, W, C] of a spatial plane, see `HexPlane.start`."""
-    height, width, channels = shape
-    draws = torch.empty(1, channels, -(-height // SPACING), -(-width // SPACING)).uniform_(*START, generator=generator)
-    field = F.interpolate(draws, size=(height, width), mode="bilinear", align_corners=True)
-    return field[0].permute(1, 2, 0)

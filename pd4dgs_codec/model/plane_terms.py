@@ -1,4 +1,4 @@
-"""Loss terms of a HexPlane's planes, with gradients: numba kernels, and their plain torch form.
+"""Loss terms of a HexPlane's planes, with gradients, by numba kernels.
 
 Regularisers, unweighted, each a sum over scales and planes. plane_smooth: mean squared second difference of the spatial
 planes along each of their two axes. time_smooth: mean squared second difference of the time planes along time. time_l1:
@@ -23,10 +23,11 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pd4dgs_codec.draw.hexplane import SPATIAL, TEMPORAL, TIME_AXIS, PlaneLayout
+from pd4dgs_codec.draw.hexplane import TIME_AXIS, PlaneLayout
 from pd4dgs_codec.draw.simd import (
     LANES,
     Array,
@@ -152,30 +153,16 @@ class _Regularisers(torch.autograd.Function):
 
 def regularisers(grid: Tensor, layout: PlaneLayout) -> dict[str, Tensor]:
     """Returns the three regularisers of the planes grid [cells, C], on the CPU, by name."""
-    if grid.shape[1] % LANES == 0:
-        values = _Regularisers.apply(grid, layout.lines)  # type: ignore[no-untyped-call]
-        return dict(zip(TERMS, values, strict=True))
-    return regularisers_reference(grid, layout)
+    padded = _padded(grid)
+    values = _Regularisers.apply(padded, layout.lines)  # type: ignore[no-untyped-call]
+    more = padded.shape[1] / grid.shape[1]  # the terms are means over the channels
+    return {name: value * more for name, value in zip(TERMS, values, strict=True)}
 
 
-def regularisers_reference(grid: Tensor, layout: PlaneLayout) -> dict[str, Tensor]:
-    """The plain torch form of `regularisers`."""
-
-    def bend(plane: Tensor, axis: int) -> Tensor:
-        n = plane.shape[axis]
-        if n < 3:
-            return plane.new_zeros(())
-        before, here, after = (plane.narrow(axis, first, n - 2) for first in range(3))
-        return (before - 2 * here + after).square().mean()
-
-    terms = {name: grid.new_zeros(()) for name in TERMS}
-    for scale in layout.views(grid):
-        for name, _, _ in SPATIAL:
-            terms["plane_smooth"] = terms["plane_smooth"] + bend(scale[name], 0) + bend(scale[name], 1)
-        for name, _, _ in TEMPORAL:
-            terms["time_smooth"] = terms["time_smooth"] + bend(scale[name], 0)
-            terms["time_l1"] = terms["time_l1"] + (1 - scale[name]).abs().mean()
-    return terms
+def _padded(grid: Tensor) -> Tensor:
+    """Adds channels of 1, whose terms are 0, up to whole vectors."""
+    missing = -grid.shape[1] % LANES
+    return F.pad(grid, (0, missing), value=1.0) if missing else grid
 
 
 # -- rate --------------------------------------------------------------------------------------------------------------
@@ -278,16 +265,18 @@ def _proxy_gradient(
 
 
 class _Proxy(torch.autograd.Function):
+    """(grid, layout, step, channels) -> bits; channels: of the planes, without those added by `_padded`."""
+
     @staticmethod
-    def forward(ctx: Any, grid: Tensor, layout: PlaneLayout, step: float) -> Tensor:
+    def forward(ctx: Any, grid: Tensor, layout: PlaneLayout, step: float, channels: int) -> Tensor:
         starts, sizes = _tables(layout)
         channel_sums = np.zeros((len(starts), grid.shape[1]), grid.numpy().dtype)
         cell_sums = np.zeros(len(grid), grid.numpy().dtype)
         _magnitudes(channel_sums, cell_sums, grid.numpy(), starts, sizes)
         scale, cells = 2 * math.e / step, sizes[:, 0] * sizes[:, 1]
         by_channel = 1 + scale * channel_sums / cells[:, None]
-        by_cell = 1 + scale * cell_sums / grid.shape[1]
-        bits = 0.5 * float((cells[:, None] * np.log2(by_channel)).sum() + grid.shape[1] * np.log2(by_cell).sum())
+        by_cell = 1 + scale * cell_sums / channels
+        bits = 0.5 * float((cells[:, None] * np.log2(by_channel)).sum() + channels * np.log2(by_cell).sum())
         ctx.weights = 0.5 * scale / _LN2 / by_channel, 0.5 * scale / _LN2 / by_cell
         ctx.layout = layout
         ctx.save_for_backward(grid)
@@ -295,12 +284,12 @@ class _Proxy(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, factor: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, factor: Tensor) -> tuple[Tensor, None, None, None]:
         (grid,) = ctx.saved_tensors
         grad = torch.zeros_like(grid)
         by_channel, by_cell = ((factor.item() * w).astype(grad.numpy().dtype) for w in ctx.weights)
         _proxy_gradient(grad.numpy(), grid.detach().numpy(), by_channel, by_cell, *_tables(ctx.layout))
-        return grad, None, None
+        return grad, None, None, None
 
 
 def _tables(layout: PlaneLayout) -> tuple[Array, Array]:
@@ -312,31 +301,5 @@ def _tables(layout: PlaneLayout) -> tuple[Array, Array]:
 def proxy_bits(grid: Tensor, layout: PlaneLayout, step: float) -> Tensor:
     """Returns the proxy, in bits, of planes grid [cells, C], on the CPU, at a quantisation step. Its gradient reaches
     all values."""
-    if grid.shape[1] % LANES == 0:
-        bits: Tensor = _Proxy.apply(grid, layout, step)  # type: ignore[no-untyped-call]
-        return bits
-    return proxy_bits_reference(grid, layout, step)
-
-
-def proxy_bits_reference(grid: Tensor, layout: PlaneLayout, step: float) -> Tensor:
-    """The plain torch form of `proxy_bits`."""
-    scale, total = 2 * math.e / step, grid.new_zeros(())
-    for planes in layout.views(grid):
-        for name, _, b in PLANES:
-            r = _residuals(planes[name], b == TIME_AXIS).abs()
-            cells, channels = r.shape[0] * r.shape[1], r.shape[2]
-            by_channel = torch.log2(1 + scale * r.mean((0, 1))).sum() * cells
-            by_cell = torch.log2(1 + scale * r.mean(2)).sum() * channels
-            total = total + 0.5 * (by_channel + by_cell)
-    return total
-
-
-def _residuals(x: Tensor, temporal: bool) -> Tensor:
-    """Returns the residuals of a plane [H, W, C], 0 for its first value."""
-    first_row = torch.cat([torch.zeros_like(x[:1, :1]), x[:1, 1:] - x[:1, :-1]], dim=1)
-    if temporal:
-        return torch.cat([first_row, x[1:] - x[:-1]])
-    w, n, nw = x[1:, :-1], x[:-1, 1:], x[:-1, :-1]
-    low, high = torch.minimum(w, n), torch.maximum(w, n)
-    inner = x[1:, 1:] - torch.maximum(low, torch.minimum(high, w + n - nw))
-    return torch.cat([first_row, torch.cat([x[1:, :1] - x[:-1, :1], inner], dim=1)])
+    bits: Tensor = _Proxy.apply(_padded(grid), layout, step, grid.shape[1])  # type: ignore[no-untyped-call]
+    return bits

@@ -5,14 +5,15 @@ import math
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
 from pd4dgs_codec import threads
-from pd4dgs_codec.draw.hexplane import PlaneLayout
+from pd4dgs_codec.draw.hexplane import SPATIAL, TEMPORAL, TIME_AXIS, PlaneLayout
 from pd4dgs_codec.model.config import DeformationConfig
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.hexplane import HexPlane, _Sample, sample_reference
 from pd4dgs_codec.model.networks import round_straight_through
-from pd4dgs_codec.model.plane_terms import TERMS, proxy_bits, proxy_bits_reference, regularisers, regularisers_reference
+from pd4dgs_codec.model.plane_terms import TERMS, proxy_bits, regularisers
 from pd4dgs_codec.scene import HEADS, PLANES
 
 BOX = np.array([[-1.0, -2.0, 0.5], [1.0, 3.0, 4.5]], np.float32)
@@ -86,7 +87,8 @@ def test_arrays_round_trip():
 
 def test_start_values():
     plane = HexPlane(BOX, scales((9, 10, 12, 3), (1, 2)), 8)
-    plane.start(torch.Generator().manual_seed(3))
+    torch.manual_seed(3)
+    plane.start()
     for scale in plane.arrays():
         for name, array in scale.items():
             if "t" in name:
@@ -102,7 +104,8 @@ def test_planes_draw_before_the_networks():
     torch.manual_seed(3)
     field = DeformationField.fresh(DeformationConfig(((9, 3),), 8, 4), BOX, {name: 3 for name in HEADS})
     planes = HexPlane(BOX, [(9, 9, 9, 3)], 8)
-    planes.start(torch.Generator().manual_seed(3))
+    torch.manual_seed(3)
+    planes.start()
     assert torch.equal(field.planes.grid, planes.grid)
 
 
@@ -143,7 +146,27 @@ def test_threads(multires, kernel_threads):
         assert torch.equal(one, two) if len(multires) == 2 else torch.allclose(one, two, rtol=1e-4, atol=1e-5)
 
 
-@pytest.mark.parametrize("shape", [*SHAPES, ((4, 3, 6, 3), 8, (1,))])
+def regularisers_reference(grid: Tensor, layout: PlaneLayout) -> dict[str, Tensor]:
+    """The plain torch form of `regularisers`."""
+
+    def bend(plane: Tensor, axis: int) -> Tensor:
+        n = plane.shape[axis]
+        if n < 3:
+            return plane.new_zeros(())
+        before, here, after = (plane.narrow(axis, first, n - 2) for first in range(3))
+        return (before - 2 * here + after).square().mean()
+
+    terms = {name: grid.new_zeros(()) for name in TERMS}
+    for scale in layout.views(grid):
+        for name, _, _ in SPATIAL:
+            terms["plane_smooth"] = terms["plane_smooth"] + bend(scale[name], 0) + bend(scale[name], 1)
+        for name, _, _ in TEMPORAL:
+            terms["time_smooth"] = terms["time_smooth"] + bend(scale[name], 0)
+            terms["time_l1"] = terms["time_l1"] + (1 - scale[name]).abs().mean()
+    return terms
+
+
+@pytest.mark.parametrize("shape", [*SHAPES, ((4, 3, 6, 3), 8, (1,)), ((7, 5, 9, 4), 5, (1, 2))])
 def test_regularisers_equal_reference(shape):
     plane = plane_of(*shape, dtype=torch.float32)
     results = []
@@ -201,8 +224,32 @@ def exact(values: torch.Tensor) -> torch.Tensor:
     return (values * 2**20).round() / 2**20
 
 
+def proxy_bits_reference(grid: Tensor, layout: PlaneLayout, step: float) -> Tensor:
+    """The plain torch form of `proxy_bits`."""
+    scale, total = 2 * math.e / step, grid.new_zeros(())
+    for planes in layout.views(grid):
+        for name, _, b in PLANES:
+            r = _residuals(planes[name], b == TIME_AXIS).abs()
+            cells, channels = r.shape[0] * r.shape[1], r.shape[2]
+            by_channel = torch.log2(1 + scale * r.mean((0, 1))).sum() * cells
+            by_cell = torch.log2(1 + scale * r.mean(2)).sum() * channels
+            total = total + 0.5 * (by_channel + by_cell)
+    return total
+
+
+def _residuals(x: Tensor, temporal: bool) -> Tensor:
+    """Returns the residuals of a plane [H, W, C], 0 for its first value."""
+    first_row = torch.cat([torch.zeros_like(x[:1, :1]), x[:1, 1:] - x[:1, :-1]], dim=1)
+    if temporal:
+        return torch.cat([first_row, x[1:] - x[:-1]])
+    w, n, nw = x[1:, :-1], x[:-1, 1:], x[:-1, :-1]
+    low, high = torch.minimum(w, n), torch.maximum(w, n)
+    inner = x[1:, 1:] - torch.maximum(low, torch.minimum(high, w + n - nw))
+    return torch.cat([first_row, torch.cat([x[1:, :1] - x[:-1, :1], inner], dim=1)])
+
+
 @pytest.mark.parametrize("shape", LAYOUTS)
-@pytest.mark.parametrize("channels", [8, 16])
+@pytest.mark.parametrize("channels", [8, 16, 5])
 def test_the_kernels_equal_the_reference(shape, channels):
     layout = PlaneLayout.build(LAYOUTS[shape])
     grid = grid_of(layout, channels)
