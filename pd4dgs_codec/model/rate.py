@@ -121,6 +121,12 @@ def rate_bits(a: Tensor, mu: Tensor, sigma: Tensor, q: Tensor | float) -> Tensor
     return bits
 
 
+def channel_moments(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns mean and standard deviation per column of x [n, c], n >= 1, both differentiable."""
+    mu = x.mean(0)
+    return mu, ((x - mu).square().mean(0) + MIN_VARIANCE).sqrt()
+
+
 # -- rows of anchors, in numba -----------------------------------------------------------------------------------------
 
 # `classes` int8 [N] is the step class of each anchor, -1 if inactive. Values are [N, c] of one float type, computed in
@@ -225,8 +231,6 @@ def _moments_gradient(
 
 
 class _RowBits(torch.autograd.Function):
-    """`row_bits_reference` in numba, with its gradient."""
-
     @staticmethod
     def forward(ctx: Any, classes: Tensor, rows: Tensor, steps: Sequence[float], *parts: Tensor) -> Tensor:
         of, picked, total = classes.numpy(), rows.numpy(), np.zeros(len(rows))
@@ -283,21 +287,3 @@ def row_bits(parts: Sequence[tuple[Tensor, float]], classes: Tensor, rows: Tenso
     values, steps = zip(*parts, strict=True)
     bits: Tensor = _RowBits.apply(classes, rows, steps, *values)  # type: ignore[no-untyped-call]
     return bits
-
-
-def row_bits_reference(parts: Sequence[tuple[Tensor, float]], classes: Tensor, rows: Tensor) -> Tensor:
-    """The plain torch form of `row_bits`."""
-    of_rows = classes[rows]
-    bits = parts[0][0].new_zeros(len(rows))
-    for c in sorted(set(of_rows.tolist())):
-        own = (of_rows == c).nonzero()[:, 0]
-        for values, step in parts:
-            mu, sigma = channel_moments(values[classes == c])
-            bits = bits.index_add(0, own, rate_bits(values[rows[own]], mu, sigma, step * 2.0**c).sum(1))
-    return bits
-
-
-def channel_moments(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns mean and standard deviation per column of x [n, c], n >= 1, both differentiable."""
-    mu = x.mean(0)
-    return mu, ((x - mu).square().mean(0) + MIN_VARIANCE).sqrt()
