@@ -85,8 +85,8 @@ def load_levels(
 def _read(file: str | Path) -> bytes:
     try:
         return read_source(file)
-    except OSError as error:
-        raise DataError(f"{file}: cannot be read: {error.strerror}") from None
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise DataError(f"{file}: cannot be read: {getattr(error, 'strerror', error)}") from None
 
 
 def _of_bytes(data: bytes, max_layer: int | None, max_bytes: int | None, last_only: bool) -> list[Level]:

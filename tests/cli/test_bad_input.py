@@ -369,3 +369,9 @@ def test_a_film_on_a_full_disk_is_one_line_and_no_file(cli, scene_pd4, tmp_path)
 def test_a_device_is_no_source(read):
     with pytest.raises(DataError, match="/dev/zero: is a device, expected a file"):
         read("/dev/zero")
+
+
+@pytest.mark.parametrize("read", [checkpoint.load, load_levels])
+def test_a_name_that_no_file_can_have(read):
+    with pytest.raises(DataError, match="cannot be read"):
+        read("a\0b.pd4")
