@@ -77,7 +77,13 @@ class _Absent(Exception):
 
 def load_perceptual(names: Iterable[str] = PERCEPTUAL) -> Perceptual:
     """Loads the distances `names` that are installed; this takes a second or two."""
-    loaders = {"lpips": _lpips, "stlpips": _stlpips, "flip": _flip, VGG: _lpips_vgg}
+    loaders: dict[str, Callable[[], Distance]] = {
+        "lpips": lambda: _lpips("LPIPS", "alex", "AlexNet_Weights", spatial=True),
+        "stlpips": _stlpips,
+        "flip": _flip,
+        # as 3D Gaussian Splatting's code calls it: one number, and pictures in 0..1 although the network expects -1..1
+        VGG: lambda: _lpips("LPIPS-VGG", "vgg", "VGG16_Weights", spatial=False, low=0.0),
+    }
     distances, absent = {}, {}
     for name in names:
         try:
@@ -91,35 +97,21 @@ def load_perceptual(names: Iterable[str] = PERCEPTUAL) -> Perceptual:
     return Perceptual(distances, absent)
 
 
-def _lpips() -> Distance:
-    from torchvision.models import AlexNet_Weights
-
-    source, network = _lpips_network("alex", AlexNet_Weights.IMAGENET1K_V1.url, spatial=True)
-    return Distance("LPIPS", source, _of_network(network), LPIPS_LEAST)
-
-
-def _lpips_vgg() -> Distance:
-    """As 3D Gaussian Splatting's code calls it: one number, and pictures in 0..1 although the network expects -1..1."""
-    from torchvision.models import VGG16_Weights
-
-    source, network = _lpips_network("vgg", VGG16_Weights.IMAGENET1K_V1.url, spatial=False)
-    return Distance("LPIPS-VGG", source, _of_network(network, low=0.0), LPIPS_LEAST)
-
-
-def _lpips_network(net: str, url: str, *, spatial: bool) -> tuple[str, Any]:
-    """Returns source and module of LPIPS with a network whose ImageNet weights torchvision has at `url`."""
+def _lpips(title: str, net: str, weights: str, *, spatial: bool, low: float = -1.0) -> Distance:
+    """Returns LPIPS by a network whose ImageNet weights torchvision describes as `weights`. low: see `_of_network`."""
     import torch
+    from torchvision import models
 
     # lpips would make torchvision download weights that are not in this folder
-    weights = Path(torch.hub.get_dir()) / "checkpoints" / Path(url).name
-    if not weights.is_file():
-        raise _Absent(f"its ImageNet weights are not in {weights}")
+    file = Path(torch.hub.get_dir()) / "checkpoints" / Path(getattr(models, weights).IMAGENET1K_V1.url).name
+    if not file.is_file():
+        raise _Absent(f"its ImageNet weights are not in {file}")
     import lpips
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a deprecation of torchvision
         network = lpips.LPIPS(net=net, spatial=spatial, verbose=False)
-    return f"lpips {metadata.version('lpips')}, {net}", network
+    return Distance(title, f"lpips {metadata.version('lpips')}, {net}", _of_network(network, low), LPIPS_LEAST)
 
 
 def _stlpips() -> Distance:

@@ -119,7 +119,7 @@ def test_eval_by_the_protocol_of_3dgs(cli, scene_pd4, monkeypatch):
 
     source = "synthetic:local?size=32x24&frames=4"
     options = ("--protocol", "3dgs", "--max-layer", 0)
-    monkeypatch.setattr(perceptual, "_lpips_vgg", vgg)
+    monkeypatch.setattr(perceptual, "_lpips", lambda *_, **__: vgg())
     report, plain = (cli("eval", scene_pd4, source, *o, "--json").json for o in (options, options[2:]))
     (row,), (usual,), level = report["levels"], plain["levels"], load_levels(scene_pd4, 0)[0]
     pairs = [(level.picture(v.camera, v.time), v.image) for v in load(source).test]
