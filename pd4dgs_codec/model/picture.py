@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -108,27 +108,23 @@ def rasterization(
         raise RenderError(f"backend is {backend!r}, expected one of {', '.join(BACKENDS)}")
     tensors = means, quats, scales, opacities, colors
     behind = rasteriser.check_input(
-        tensors, camera, background, near_plane, _is_floats, lambda t: float(torch.as_tensor(t).detach().float().sum())
+        tensors,
+        camera,
+        background,
+        near_plane,
+        lambda t: isinstance(t, Tensor) and t.is_floating_point(),
+        lambda t: float(torch.as_tensor(t).detach().float().sum()),
     )
     if any(t.device != means.device for t in tensors):
         raise RenderError(f"tensors are on different devices: {sorted({str(t.device) for t in tensors})}")
-    return _choose(backend, means.device)(tensors, camera, behind, near_plane)
-
-
-def _is_floats(tensor: Any) -> bool:
-    return isinstance(tensor, Tensor) and tensor.is_floating_point()
-
-
-def _choose(backend: str, device: torch.device) -> Callable[..., Drawn]:
-    """Returns the function of a backend for tensors on `device`. Raises RenderError if it cannot draw there."""
-    if device.type not in ("cpu", "cuda"):
-        raise RenderError(f"tensors are on {device.type}, expected cpu or cuda")
+    if means.device.type not in ("cpu", "cuda"):
+        raise RenderError(f"tensors are on {means.device.type}, expected cpu or cuda")
     if backend == "reference":
-        return reference.rasterize
-    own = "gsplat" if device.type == "cuda" else "cpu"
+        return reference.rasterize(tensors, camera, behind, near_plane)
+    own = "gsplat" if means.device.type == "cuda" else "cpu"
     if backend not in ("auto", own):
-        raise RenderError(f"backend {backend!r} cannot draw tensors on {device.type}")
-    return rasterize_gsplat if own == "gsplat" else rasterize_cpu
+        raise RenderError(f"backend {backend!r} cannot draw tensors on {means.device.type}")
+    return (rasterize_gsplat if own == "gsplat" else rasterize_cpu)(tensors, camera, behind, near_plane)
 
 
 # -- CPU ---------------------------------------------------------------------------------------------------------------

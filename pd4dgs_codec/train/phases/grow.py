@@ -61,9 +61,8 @@ class Grow(Phase):
         record["pruned"] = len(model.anchor_q) - len(keep)
         added = _anchors(model, *(part[: max(most - len(keep), 0)] for part in cells))
         used = statistics["visits"] >= MIN_SLOT_VISITS
-        for names, where in ((("opacity", "anchor_visits"), visited), (("pull", "visits"), used)):
-            for name in names:
-                statistics[name][where] = 0
+        for name, where in (("opacity", visited), ("anchor_visits", visited), ("pull", used), ("visits", used)):
+            statistics[name][where] = 0
         state.replace_anchors(keep.to(state.device), added)
         record["grown"] = len(added["anchor_q"])
 
