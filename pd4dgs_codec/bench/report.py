@@ -1,11 +1,10 @@
 """Times repeated work, describes the machine, formats Markdown tables and plots error against cost."""
 
-import contextlib
 import os
 import platform
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -65,16 +64,16 @@ def machine() -> dict[str, Any]:
     """Describes the machine without names or paths: CPU model, CPUs this process may use, threads, memory in bytes,
     load before the run, versions of installed packages. None: unknown on this system."""
     cpu = memory = load = None
-    with contextlib.suppress(OSError):
+    with suppress(OSError):
         lines = Path("/proc/cpuinfo").read_text().splitlines()
         cpu = next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), None)
-    with contextlib.suppress(AttributeError, OSError, ValueError):
+    with suppress(AttributeError, OSError, ValueError):
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    with contextlib.suppress(AttributeError, OSError):
+    with suppress(AttributeError, OSError):
         load = round(os.getloadavg()[0], 2)
     versions = {}
     for name in PACKAGES:
-        with contextlib.suppress(PackageNotFoundError):
+        with suppress(PackageNotFoundError):
             versions[name] = version(name)
     return {
         "cpu": cpu or platform.processor() or platform.machine(),

@@ -205,14 +205,15 @@ def _open(path: Path, what: str = "image", size: tuple[int, int] | None = None) 
         raise
     except Exception:  # Pillow raises many kinds
         raise DataError(f"{path}: not an image that can be read, expected {', '.join(FORMATS)}") from None
-    check_pixels(picture.width * picture.height, [path], str(path))
-    scans = path.read_bytes().count(SCAN) if picture.format in ("JPEG", "MPO") else 0
-    if scans > MAX_SCANS:
-        picture.close()
-        raise DataError(f"{path}: {scans:,} scans, expected {MAX_SCANS} at most in a JPEG")
-    if size is not None and picture.size != tuple(size):
-        picture.close()
-        raise DataError(f"{path}: {what} is {picture.width}x{picture.height}, expected {size[0]}x{size[1]}")
+    with contextlib.ExitStack() as refused:
+        refused.callback(picture.close)
+        check_pixels(picture.width * picture.height, [path], str(path))
+        scans = path.read_bytes().count(SCAN) if picture.format in ("JPEG", "MPO") else 0
+        if scans > MAX_SCANS:
+            raise DataError(f"{path}: {scans:,} scans, expected {MAX_SCANS} at most in a JPEG")
+        if size is not None and picture.size != size:
+            raise DataError(f"{path}: {what} is {picture.width}x{picture.height}, expected {size[0]}x{size[1]}")
+        refused.pop_all()
     return picture
 
 
@@ -285,7 +286,7 @@ def read_image(path: Path, size: tuple[int, int], *, downscale: int = 1, under: 
 
     under: RGB 0..1 on which a transparent image is laid; None drops its alpha (photographs).
     """
-    with _open(path, "image", size) as image:
+    with _open(path, size=size) as image:
         check_downscale(size, downscale, str(path))
         try:
             rgb = _rgb(image, str(path), under)
