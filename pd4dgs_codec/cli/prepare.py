@@ -49,12 +49,12 @@ def check_usage(args: argparse.Namespace) -> None:
 
 
 def _prepare(args: argparse.Namespace, console: Console) -> int:
-    from pd4dgs_codec.prepare.stages import Choices, prepare
+    from pd4dgs_codec.prepare.stages import Options, prepare
 
     check_usage(args)
-    choices = Choices(args.frames, args.fps, args.downscale, args.camera, args.threads or -1)
+    chosen = Options(args.frames, args.fps, args.downscale, args.camera, args.threads or -1)
     try:
-        report = prepare(Path(args.input), Path(args.output), choices, progress_bar, args.overwrite, console.message)
+        report = prepare(Path(args.input), Path(args.output), chosen, progress_bar, args.overwrite, console.message)
     except KeyboardInterrupt:
         raise DataError(f"interrupted; the same command resumes from {args.output}.partial") from None
     console.result({"output": args.output, **report}, _text(args.output, report))

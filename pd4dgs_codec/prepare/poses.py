@@ -8,7 +8,7 @@ motion along the epipolar line.
 from __future__ import annotations
 
 import signal
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
 from pathlib import Path
@@ -17,8 +17,10 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.errors import DataError, one_line, required
-from pd4dgs_codec.prepare.frames import Advance
 from pd4dgs_codec.signals import ENDING
+
+#: Called after each item.
+Advance = Callable[[], None]
 
 #: Pictures and pairs in a call of pycolmap, between two reports of progress.
 BATCH, PAIRS_BATCH = 4, 50

@@ -1,7 +1,8 @@
 """`prepare` turns a recording into a folder with pictures, times, a COLMAP model and a report, stage by stage.
 
 Work is done in `FOLDER.partial`, which becomes FOLDER at the end. After an interruption the same call resumes from it;
-a failure removes it.
+a failure removes it. The chosen frames are spread over the recording's time, sharp, and each different from the one
+before.
 """
 
 from __future__ import annotations
@@ -10,32 +11,35 @@ import json
 import os
 import shutil
 import stat
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.data.files import image_info
+from pd4dgs_codec.data.files import check_downscale, image_info, last_numbers, read_image, shrink_image
+from pd4dgs_codec.data.videos import open_video
 from pd4dgs_codec.errors import DataError, one_line
 from pd4dgs_codec.io import check_path, finite, write_bytes
 from pd4dgs_codec.prepare import poses
-from pd4dgs_codec.prepare.frames import (
-    FEWEST_FRAMES,
-    Choice,
-    Look,
-    Progress,
-    Recording,
-    choose,
-    look,
-    open_recording,
-    write_frames,
-)
-from pd4dgs_codec.prepare.poses import Features
+from pd4dgs_codec.prepare.poses import Advance, Features
 from pd4dgs_codec.signals import held
 from pd4dgs_codec.threads import available
 
+#: (number of items or None, their name, the stage) -> an Advance for that stage.
+Progress = Callable[[int | None, str, str], AbstractContextManager[Advance]]
+
+#: Largest width at which sharpness and change are measured, pixels.
+LOOK_WIDTH = 640
+#: A frame is blurred if its sharpness is below BLURRED times the median of AROUND frames on either side.
+BLURRED, AROUND = 0.4, 15
+#: A frame repeats the one before if their mean difference is below this, 8-bit levels. Video coding causes less.
+SAME = 0.3
+#: Most frames of a recording, an hour at 60 per second; and the fewest for a pose estimate.
+MOST_FRAMES, FEWEST_FRAMES = 216_000, 8
+PICTURES = {".png", ".jpg", ".jpeg"}
 STATE, REPORT = "prepare.json", "report.json"
 #: Thresholds of advice: share of frames, pixels of a picture 1000 wide, points a picture, degrees, share of features.
 MANY_BLURRED, MANY_LOST, LARGE_ERROR, FEW_POINTS, SMALL_ANGLE, MUCH_MOVES = 0.2, 0.05, 2.0, 50, 4.0, 0.4
@@ -44,24 +48,24 @@ POINTS, SHOWN = 2000, 6
 
 
 @dataclass(frozen=True)
-class Choices:
+class Options:
     """Options of `prepare`.
 
     frames: most frames to choose, 0 for all. fps: of a folder of frames. downscale: side of the blocks over which
     pictures are averaged, pixels. camera: COLMAP's model. threads: -1 for all cores.
     """
 
-    frames: int = 120
-    fps: float = 30.0
-    downscale: int = 1
-    camera: str = "SIMPLE_RADIAL"
-    threads: int = -1
+    frames: int
+    fps: float
+    downscale: int
+    camera: str
+    threads: int
 
 
 def prepare(
     source: Path,
     output: Path,
-    choices: Choices,
+    options: Options,
     progress: Progress,
     overwrite: bool = False,
     tell: Callable[[str], None] = lambda line: None,
@@ -70,16 +74,16 @@ def prepare(
     Raises DataError, and leaves nothing behind, if no poses are found."""
     poses.colmap()  # raises now if it is not installed
     check_folder(output, overwrite)
-    recording = open_recording(source, choices.fps)
+    recording = open_recording(source, options.fps)
     work = output.with_name(f"{output.name}.partial")
-    _begin(work, source, choices)
+    _begin(work, source, options)
     try:
-        looks, choice, times = _frames(work, recording, choices, progress)
-        cores = choices.threads if choices.threads > 0 else available()
-        width, height = (side // choices.downscale for side in recording.size)
+        looks, choice, times = _frames(work, recording, options, progress)
+        cores = options.threads if options.threads > 0 else available()
+        width, height = (side // options.downscale for side in recording.size)
         seconds = poses.estimate(len(times), (width, height), cores)
         tell(f"the poses of {len(times)} frames take up to {max(1, round(seconds / 60))} min on {cores} cores")
-        findings = _poses(work, times, choices, progress)
+        findings = _poses(work, times, options, progress)
         result = _finish(work, findings, looks, choice, times, source)
     except (DataError, OSError):
         shutil.rmtree(work, ignore_errors=True)
@@ -108,11 +112,11 @@ def check_folder(output: Path, overwrite: bool) -> None:
         raise DataError(f"{output}: no permission to write here")
 
 
-def _begin(work: Path, source: Path, choices: Choices) -> None:
-    """Keeps the work of an earlier run with the same recording and choices, else begins anew."""
+def _begin(work: Path, source: Path, options: Options) -> None:
+    """Keeps the work of an earlier run with the same recording and options, else begins anew."""
     stat = source.stat()
     asked = {"source": str(source.resolve()), "size": stat.st_size, "changed": stat.st_mtime_ns}
-    asked |= {name: value for name, value in asdict(choices).items() if name != "threads"}
+    asked |= {name: value for name, value in asdict(options).items() if name != "threads"}
     state = work / STATE
     if work.exists():
         if not state.is_file():
@@ -128,7 +132,7 @@ def _begin(work: Path, source: Path, choices: Choices) -> None:
 
 
 def _frames(
-    work: Path, recording: Recording, choices: Choices, progress: Progress
+    work: Path, recording: Recording, options: Options, progress: Progress
 ) -> tuple[list[Look], Choice, dict[str, float]]:
     """Writes the chosen frames to images/ once. Returns (measurements of all frames, choice, seconds by file name)."""
     done = work / "frames.json"
@@ -138,31 +142,31 @@ def _frames(
         return looks, Choice(*map(tuple, stored["choice"])), stored["times"]
     with progress(None, "frames", "measuring") as advance:
         looks = look(recording, advance)
-    choice = choose(looks, choices.frames)
+    choice = choose(looks, options.frames)
     if len(choice.chosen) < FEWEST_FRAMES:
         found = f"{len(choice.blurred)} blurred and {len(choice.repeated)} repeated of {len(looks)} frames"
         raise DataError(f"{recording.path}: {found} leave {len(choice.chosen)}, expected at least {FEWEST_FRAMES}")
     shutil.rmtree(work / "images", ignore_errors=True)
     (work / "images").mkdir()
     with progress(len(choice.chosen), "frames", "writing") as advance:
-        times = write_frames(recording, choice.chosen, work / "images", choices.downscale, advance)
+        times = write_frames(recording, choice.chosen, work / "images", options.downscale, advance)
     content = {"looks": [list(asdict(each).values()) for each in looks], "times": times}
     content["choice"] = list(asdict(choice).values())
     write_bytes(done, json.dumps(finite(content)).encode(), overwrite=True)
     return looks, choice, times
 
 
-def _poses(work: Path, times: dict[str, float], choices: Choices, progress: Progress) -> Findings:
+def _poses(work: Path, times: dict[str, float], options: Options, progress: Progress) -> Findings:
     """Estimates the poses and writes the model without moving features to sparse/0."""
     names, images, database = sorted(times), work / "images", work / "colmap.db"
     with progress(len(names), "frames", "features") as advance:
-        poses.extract(database, images, names, choices.camera, choices.threads, advance)
+        poses.extract(database, images, names, options.camera, options.threads, advance)
     listed = poses.pairs(len(names))
     with progress(len(listed), "pairs", "matching") as advance:
-        poses.match(database, names, listed, choices.threads, advance)
+        poses.match(database, names, listed, options.threads, advance)
     _check_moves(poses.travel(database), image_info(images / names[0])[0])
     with progress(None, "frames", "poses") as advance:
-        model = _checked(poses.reconstruct(database, images, work / "models", choices.threads, advance), len(names))
+        model = _checked(poses.reconstruct(database, images, work / "models", options.threads, advance), len(names))
     features = poses.moving_features(database, model)
     named = [image for image in model.images.values() if image.name in features]
     moving = {image.name: features[image.name].moving(image.camera.width) for image in named}
@@ -207,6 +211,165 @@ def _finish(
     for name in ("colmap.db", "frames.json", STATE):
         (work / name).unlink(missing_ok=True)
     return result
+
+
+# -- frames ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Look:
+    """Measurements of a frame.
+
+    index: in the recording. time: seconds. sharpness: variance of the Laplacian, squared 8-bit levels. change: mean
+    difference from the frame before, 8-bit levels, infinite for the first.
+    """
+
+    index: int
+    time: float
+    sharpness: float
+    change: float
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Ascending indices of the frames that are chosen, left out as blurred, and left out as repeated."""
+
+    chosen: tuple[int, ...]
+    blurred: tuple[int, ...]
+    repeated: tuple[int, ...]
+
+
+class VideoFile:
+    """A video at its mean frame rate: frame k has time k / fps. Where a phone's rate varies, ffmpeg repeats or drops
+    frames."""
+
+    def __init__(self, path: Path):
+        video = open_video(path)
+        self.path, self.size, self.fps = path, video.size, video.fps
+
+    def looks(self) -> Iterator[np.ndarray]:
+        """Yields every frame, small and grey, uint8 [h, w]."""
+        width = min(self.size[0], LOOK_WIDTH)
+        scale = f"scale={width}:{max(1, round(self.size[1] * width / self.size[0]))}:flags=area"
+        return open_video(self.path, grey=True, output=self._filters(f",{scale}")).pictures
+
+    def pictures(self, indices: Sequence[int]) -> Iterator[np.ndarray]:
+        """Yields uint8 [H, W, 3] of these frames. indices: ascending."""
+        wanted = set(indices)
+        for k, picture in enumerate(open_video(self.path, output=self._filters()).pictures):
+            if k in wanted:
+                yield picture
+            if k >= indices[-1]:
+                return
+
+    def time(self, index: int) -> float:
+        """The time of a frame, seconds."""
+        return index / self.fps
+
+    def _filters(self, more: str = "") -> list[str]:
+        """Options that select the frames nearest in time: ffmpeg's cfr may be more than a frame late."""
+        return ["-vf", f"fps={self.fps:.6f}{more}", "-fps_mode", "passthrough"]
+
+
+class FrameFolder:
+    """A folder of pictures of one size, in the order of the last number in their names, at `fps` numbers per second."""
+
+    def __init__(self, path: Path, fps: float):
+        files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in PICTURES]
+        if not files:
+            raise DataError(f"{path}: found no picture, expected frames as {', '.join(sorted(PICTURES))}")
+        numbered = dict(zip(last_numbers(files) or range(len(files)), files, strict=True))
+        if len(numbered) < len(files):
+            raise DataError(f"{path}: two pictures have the same number, expected one per frame")
+        self.numbers = sorted(numbered)
+        self.path, self.files, self.fps = path, [numbered[number] for number in self.numbers], fps
+        self.size = image_info(self.files[0])[:2]
+
+    def looks(self) -> Iterator[np.ndarray]:
+        k = max(1, -(-self.size[0] // LOOK_WIDTH))
+        for file in self.files:
+            yield read_image(file, self.size, downscale=k).mean(axis=2).astype(np.uint8)
+
+    def pictures(self, indices: Sequence[int]) -> Iterator[np.ndarray]:
+        """Yields uint8 [H, W, 3] of these frames."""
+        for k in indices:
+            yield read_image(self.files[k], self.size)
+
+    def time(self, index: int) -> float:
+        """The time of a frame after the first one, seconds."""
+        return (self.numbers[index] - self.numbers[0]) / self.fps
+
+
+Recording = VideoFile | FrameFolder
+
+
+def open_recording(path: Path, fps: float) -> Recording:
+    """Opens a video, or a folder of frames at `fps` per second. Raises DataError for anything else."""
+    if path.is_dir():
+        return FrameFolder(path, fps)
+    if not path.exists():
+        raise DataError(f"{path}: found nothing, expected a video or a folder of frames")
+    return VideoFile(path)
+
+
+def look(recording: Recording, advance: Advance) -> list[Look]:
+    """Measures every frame. Raises DataError for too few or too many."""
+    looks: list[Look] = []
+    before: np.ndarray | None = None
+    for index, small in enumerate(recording.looks()):
+        if index >= MOST_FRAMES:
+            raise DataError(f"{recording.path}: more than {MOST_FRAMES:,} frames, expected a shorter recording")
+        picture = small.astype(np.float32)
+        change = float("inf") if before is None else float(np.abs(picture - before).mean())
+        looks.append(Look(index, recording.time(index), sharpness(picture), change))
+        before = picture
+        advance()
+    if len(looks) < FEWEST_FRAMES:
+        raise DataError(f"{recording.path}: {len(looks)} frames, expected at least {FEWEST_FRAMES}")
+    return looks
+
+
+def sharpness(picture: np.ndarray) -> float:
+    """Variance of the Laplacian of float32 [h, w] (Pech-Pacheco et al., ICPR 2000)."""
+    if min(picture.shape) < 3:
+        return 0.0
+    middle = picture[1:-1, 1:-1]
+    around = picture[:-2, 1:-1] + picture[2:, 1:-1] + picture[1:-1, :-2] + picture[1:-1, 2:]
+    return float((around - 4 * middle).var())
+
+
+def choose(looks: Sequence[Look], count: int) -> Choice:
+    """Chooses the sharpest usable frame of each of `count` equal stretches; all usable frames for count 0."""
+    sharp = np.array([frame.sharpness for frame in looks])
+    usual = np.array([np.median(sharp[max(0, i - AROUND) : i + AROUND + 1]) for i in range(len(sharp))])
+    is_blurred = sharp < BLURRED * usual
+    is_repeated = np.array([frame.change < SAME for frame in looks])
+    usable = np.flatnonzero(~is_blurred & ~is_repeated)
+    stretches = np.array_split(np.arange(len(looks)), count) if 0 < count < len(usable) else usable[:, None]
+    left = [stretch[np.isin(stretch, usable)] for stretch in stretches]
+    chosen = [int(stretch[np.argmax(sharp[stretch])]) for stretch in left if len(stretch)]
+    repeated = is_repeated & ~is_blurred
+    return Choice(tuple(chosen), *(tuple(map(int, np.flatnonzero(which))) for which in (is_blurred, repeated)))
+
+
+def write_frames(
+    recording: Recording, indices: Sequence[int], folder: Path, downscale: int, advance: Advance
+) -> dict[str, float]:
+    """Writes these frames as PNG, averaged over blocks of downscale x downscale. Returns seconds by file name."""
+    from PIL import Image
+
+    check_downscale(recording.size, downscale, str(recording.path))
+    times: dict[str, float] = {}
+    for index, picture in zip(indices, recording.pictures(indices), strict=False):
+        name = f"frame_{index:06d}.png"
+        Image.fromarray(shrink_image(picture, downscale)).save(folder / name, compress_level=1)
+        times[name] = recording.time(index)
+        advance()
+    if len(times) < len(indices):
+        raise DataError(
+            f"{recording.path}: {len(times)} of {len(indices)} chosen frames could be read again, expected all"
+        )
+    return times
 
 
 # -- report ------------------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from rooms import HEIGHT, WIDTH, walk
 from videos import write_video
 
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.prepare.frames import FEWEST_FRAMES, Look, choose, look, open_recording, sharpness, write_frames
+from pd4dgs_codec.prepare.stages import FEWEST_FRAMES, Look, choose, look, open_recording, sharpness, write_frames
 
 pytest.importorskip("imageio_ffmpeg")
 FPS = 10
