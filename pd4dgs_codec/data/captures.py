@@ -30,24 +30,22 @@ from pd4dgs_codec.data.files import (
     read_only_ply,
     whole_number,
 )
-from pd4dgs_codec.data.posed import (
-    LARGEST_TIME,
-    cameras_box,
-    held_out,
-    points_box,
-    posed_dataset,
-    seconds_range,
-    without_first_camera,
-)
 from pd4dgs_codec.data.videos import open_video, synchronised_dataset
 from pd4dgs_codec.data.view import (
+    LARGEST_TIME,
     OPENGL_TO_OPENCV,
     Dataset,
     Lens,
     UnreadView,
     View,
+    cameras_box,
     check_rotation,
     checked_rotation,
+    held_out,
+    points_box,
+    posed_dataset,
+    seconds_range,
+    without_first_camera,
     world_to_camera,
 )
 from pd4dgs_codec.errors import DataError, one_line

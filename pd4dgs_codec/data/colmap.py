@@ -7,7 +7,6 @@ the order of the names.
 """
 
 import struct
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -19,9 +18,17 @@ import numpy as np
 
 from pd4dgs_codec.data.dataset import COLMAP
 from pd4dgs_codec.data.files import LARGEST, Color, inside, last_numbers, number, read_file, whole_number
-from pd4dgs_codec.data.posed import LARGEST_TIME, held_out, posed_dataset
 from pd4dgs_codec.data.videos import open_video, synchronised_dataset
-from pd4dgs_codec.data.view import Dataset, Lens, UnreadView, checked_rotation, world_to_camera
+from pd4dgs_codec.data.view import (
+    LARGEST_TIME,
+    Dataset,
+    Lens,
+    UnreadView,
+    checked_rotation,
+    held_out,
+    posed_dataset,
+    world_to_camera,
+)
 from pd4dgs_codec.errors import DataError
 
 #: Camera models in the order of their numbers in binary files, with the names of their parameters.
@@ -47,12 +54,7 @@ def read_colmap(folder: Path, downscale: int, holdout: int, background: Color | 
     model, kind = next((p, k) for p, k in places if all((p / f"{n}{k}").exists() for n in ("cameras", "images")))
     cameras, points = _registered(model, kind)
     if videos := _videos(folder):
-        files = [_video_of(model, camera, videos) for camera in cameras]
-        twice = [video.stem for video, count in Counter(files).items() if count > 1]
-        if twice:
-            raise DataError(f"{model}: two pictures are of the video {twice[0]}, expected one per camera")
-        rig = [_with_video(model, *pair, i) for i, pair in enumerate(zip(cameras, files, strict=True))]
-        return synchronised_dataset(folder, rig, points, downscale, holdout)
+        return synchronised_dataset(folder, _rig(model, cameras, videos), points, downscale, holdout)
     pictures = folder / "images" if (folder / "images").is_dir() else folder
     times = _times(folder, [camera.name for camera in cameras])
     frames = []
@@ -76,20 +78,22 @@ def _videos(folder: Path) -> dict[str, Path]:
     return {file.stem: file for file in sorted(place.iterdir()) if file.suffix in VIDEOS}
 
 
-def _video_of(model: Path, camera: UnreadView, videos: dict[str, Path]) -> Path:
-    video = videos.get(camera.image.stem) or videos.get(camera.image.parts[0])
-    if video is None:
-        where = f"{model}: {camera.name}"
-        raise DataError(f"{where}: there is no video of this name among {len(videos)}, expected one per picture")
-    return video
-
-
-def _with_video(model: Path, camera: UnreadView, video: Path, i: int) -> UnreadView:
-    size, lens = open_video(video).size, camera.lens
-    if size != (lens.width, lens.height):
-        found = f"is {size[0]}x{size[1]}, and its camera in {model} {lens.width}x{lens.height}"
-        raise DataError(f"{video}: {found}, expected the same size")
-    return replace(camera, name=video.stem, camera_id=i, image=video)
+def _rig(model: Path, cameras: list[UnreadView], videos: dict[str, Path]) -> list[UnreadView]:
+    """The cameras with their videos instead of pictures. Raises DataError unless each has its own, of its size."""
+    rig: dict[Path, UnreadView] = {}
+    for camera in cameras:
+        video = videos.get(camera.image.stem) or videos.get(camera.image.parts[0])
+        if video is None:
+            where = f"{model}: {camera.name}"
+            raise DataError(f"{where}: there is no video of this name among {len(videos)}, expected one per picture")
+        if video in rig:
+            raise DataError(f"{model}: two pictures are of the video {video.stem}, expected one per camera")
+        size, lens = open_video(video).size, camera.lens
+        if size != (lens.width, lens.height):
+            found = f"is {size[0]}x{size[1]}, and its camera in {model} {lens.width}x{lens.height}"
+            raise DataError(f"{video}: {found}, expected the same size")
+        rig[video] = replace(camera, name=video.stem, camera_id=len(rig), image=video)
+    return list(rig.values())
 
 
 def _registered(model: Path, kind: str) -> tuple[list[UnreadView], np.ndarray | None]:

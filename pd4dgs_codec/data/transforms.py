@@ -19,14 +19,16 @@ from pd4dgs_codec.data.files import (
     read_ply,
     whole_number,
 )
-from pd4dgs_codec.data.posed import LARGEST_TIME, held_out, posed_dataset
 from pd4dgs_codec.data.view import (
+    LARGEST_TIME,
     OPENGL_TO_OPENCV,
     ROTATION_TOLERANCE,
     Dataset,
     Lens,
     UnreadView,
     check_rotation,
+    held_out,
+    posed_dataset,
     world_to_camera,
 )
 from pd4dgs_codec.errors import DataError, one_line

@@ -23,8 +23,7 @@ from typing import IO, Any
 import numpy as np
 
 from pd4dgs_codec.data.files import check_downscale, check_pixels, check_regular, shrink_image, shrink_mask
-from pd4dgs_codec.data.posed import geometry, without_first_camera
-from pd4dgs_codec.data.view import Dataset, UnreadView, View, rectify
+from pd4dgs_codec.data.view import Dataset, UnreadView, View, geometry, rectify, without_first_camera
 from pd4dgs_codec.errors import DamageWarning, DataError, one_line
 from pd4dgs_codec.io import temporary_folder
 

@@ -3,8 +3,16 @@
 import numpy as np
 import pytest
 
-from pd4dgs_codec.data.posed import cameras_box, normalised_times, points_box, seconds_range
-from pd4dgs_codec.data.view import Lens, UnreadView, distort, rectify
+from pd4dgs_codec.data.view import (
+    Lens,
+    UnreadView,
+    cameras_box,
+    distort,
+    normalised_times,
+    points_box,
+    rectify,
+    seconds_range,
+)
 from pd4dgs_codec.errors import DataError
 
 

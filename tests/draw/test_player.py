@@ -154,7 +154,7 @@ import sys
 sys.modules["torch"] = None
 from pd4dgs_codec.cli.render import main
 code = main([sys.argv[1], "-o", sys.argv[2], "--frames", "1"])
-late = "data.transforms", "data.posed", "interchange.teacher", "quality.perceptual", "train", "web.client"
+late = "data.transforms", "data.captures", "interchange.teacher", "quality.perceptual", "train", "web.client"
 loaded = {f"pd4dgs_codec.{name}" for name in late} & set(sys.modules)
 assert not loaded, f"a file of its own camera waits for {loaded}"
 sys.exit(code)
