@@ -83,7 +83,7 @@ def _export(args: argparse.Namespace, console: Console) -> int:
     else:
         common.check_output(args.output, args.overwrite)
     from pd4dgs_codec.interchange.export import Export
-    from pd4dgs_codec.interchange.formats import EXTRA
+    from pd4dgs_codec.interchange.splats import EXTRA
 
     if args.to in LIBRARIES:
         required(LIBRARIES[args.to], EXTRA, f"{args.to} files")
@@ -144,7 +144,7 @@ def _write_still(args: argparse.Namespace, export: Export, console: Console) -> 
     import numpy as np
 
     from pd4dgs_codec.interchange.export import UNTURNED, upright
-    from pd4dgs_codec.interchange.formats import SPZ_STEP, glb_bytes, ply_bytes, spz_bytes
+    from pd4dgs_codec.interchange.splats import SPZ_STEP, glb_bytes, ply_bytes, spz_bytes
 
     turn = upright(export.player.info.up) if args.to in ("glb", "spz") else UNTURNED
     with progress_bar(args.refine, "steps", "refining") as step:
@@ -177,7 +177,7 @@ def frame_times(info: SceneInfo, fps: float) -> list[float]:
 
 def _write_sequence(args: argparse.Namespace, export: Export) -> dict[str, Any]:
     """Writes frames over the whole time range."""
-    from pd4dgs_codec.interchange.formats import fourdgs_bytes, ply_bytes
+    from pd4dgs_codec.interchange.splats import fourdgs_bytes, ply_bytes
 
     info, fps = export.player.info, args.fps
     seconds = info.time_range[1] - info.time_range[0]

@@ -32,8 +32,16 @@ from pd4dgs_codec.archives import read_tensors
 from pd4dgs_codec.data.files import LARGEST, WHITE, Color, read_file
 from pd4dgs_codec.data.view import ROTATION_TOLERANCE, rotation_matrix, world_to_camera
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.interchange.formats import activated, checked, finite_rows, read_parameters
-from pd4dgs_codec.interchange.splats import Splats, principal_axes, quaternions, unit
+from pd4dgs_codec.interchange.splats import (
+    Splats,
+    activated,
+    checked,
+    finite_rows,
+    principal_axes,
+    quaternions,
+    read_parameters,
+    unit,
+)
 from pd4dgs_codec.scene import Camera
 
 PLY = "point_cloud.ply"

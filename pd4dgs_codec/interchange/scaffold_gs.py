@@ -18,7 +18,7 @@ import torch
 
 from pd4dgs_codec.archives import Module
 from pd4dgs_codec.data.files import LARGEST, read_vertices
-from pd4dgs_codec.data.posed import points_box
+from pd4dgs_codec.data.view import points_box
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.runs import PLY, Config, State, iteration, network_of, read_cameras, read_torch, run_of
 from pd4dgs_codec.model.sensitivity import whitening_transform
@@ -38,8 +38,9 @@ OFF_GRID, ULPS = 1e-3, 8
 DEPTH = 4  #: most levels of nested modules
 #: The layers of each decoder, as TorchScript names them.
 LAYERS = {
-    name: ("Linear", "ReLU", "Linear", *end)
-    for name, end in (("opacity", ("Tanh",)), ("covariance", ()), ("color", ("Sigmoid",)))
+    "opacity": "Linear, ReLU, Linear, Tanh",
+    "covariance": "Linear, ReLU, Linear",
+    "color": "Linear, ReLU, Linear, Sigmoid",
 }
 
 
@@ -193,9 +194,9 @@ def _network(
     """Reads a decoder's two linear layers and adds the embedding of the chosen picture to the first bias."""
     if isinstance(decoder, Module):  # state dicts do not name the kinds of layers
         parts = [part for key, part in decoder.members.items() if key.isdigit() and isinstance(part, Module)]
-        kinds, usual_kinds = ", ".join(part.kind for part in parts), ", ".join(LAYERS[name])
-        if kinds != usual_kinds:
-            raise DataError(f"{path}: layers are {kinds[:120]}; expected {usual_kinds}")
+        kinds = ", ".join(part.kind for part in parts)
+        if kinds != LAYERS[name]:
+            raise DataError(f"{path}: layers are {kinds[:120]}; expected {LAYERS[name]}")
     tensors = _tensors(decoder)
     expected = ("0.bias", "0.weight", "2.bias", "2.weight")
     if tuple(sorted(tensors)) != expected:

@@ -2,17 +2,34 @@
 
 Real harmonics and their signs are those of its reference implementation (Kerbl et al. 2023), as in PLY, SPZ and
 KHR_gaussian_splatting. A colour is max(0, 0.5 + sum c_j Y_j(d)), d the unit vector from the eye to the mean.
+
+Files: reads PLY, SPZ and gsplat checkpoints, and writes PLY, glTF, SPZ and 4dgs. SPZ and compressed PLY need
+gaussforge, 4dgs needs fourdgs; the extra `interchange` installs both.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import ctypes
+import io
+import json
+import os
+import re
+import struct
+import sys
+import zlib
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 
+from pd4dgs_codec.archives import read_tensors
+from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, LARGEST, read_file, read_vertices
+from pd4dgs_codec.data.view import world_to_camera
 from pd4dgs_codec.draw.rasteriser import draw
+from pd4dgs_codec.errors import DataError, one_line, required
 from pd4dgs_codec.scene import Camera
 
 T = TypeVar("T")
@@ -20,6 +37,23 @@ T = TypeVar("T")
 MAX_DEGREE = 3
 #: Y_0, a constant: the factor between a colour and its first coefficient.
 SH_C0 = 0.28209479177387814
+EXTRA = "interchange"  #: the extra that installs gaussforge and fourdgs
+#: Number of coefficients of the harmonics without the constant -> degree.
+REST = {(degree + 1) ** 2 - 1: degree for degree in range(MAX_DEGREE + 1)}
+#: Bounds of opacities and scales before PLY files take their logits and logarithms.
+LEAST_OPACITY, LEAST_SCALE = 1e-6, 1e-12
+#: KHR_gaussian_splatting: linear scales and opacities, quaternions xyzw.
+#: https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting
+EXTENSION = "KHR_gaussian_splatting"
+FLOAT, POINTS = 5126, 0  #: glTF's numbers of a component type and of a primitive's mode
+TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+JSON, BINARY = 0x4E4F534A, 0x004E4942  #: types of chunks
+#: SPZ stores positions in 24 bits, 12 of them fractional: multiples of SPZ_STEP below SPZ_REACH, scene units.
+SPZ_STEP, SPZ_REACH = 1 / 4096, 2048.0
+#: SPZ's first bytes; most Gaussians, and most unpacked bytes of each: 65 with all harmonics, the rest for extensions.
+SPZ_MAGIC, SPZ_MOST, SPZ_BYTES = b"NGSP", 10_000_000, 128
+#: 4dgs files store harmonics from degree 1 on as bytes, for values from -SH_SPAN to SH_SPAN.
+SH_SPAN = 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +116,7 @@ def looking(eye: np.ndarray, ahead: np.ndarray, up: np.ndarray, like: Camera) ->
     if np.linalg.norm(right) < 1e-6:  # straight up or down: any roll will do
         right = np.cross(ahead, np.roll(ahead, 1) + np.array([1e-3, 0, 0]))
     right = unit(right)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = np.stack([right, np.cross(ahead, right), ahead])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    viewmat = world_to_camera(np.stack([right, np.cross(ahead, right), ahead]), eye)
     return replace(like, viewmat=viewmat.astype(np.float32))
 
 
@@ -152,3 +184,285 @@ def principal_axes(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     values, axes = np.linalg.eigh(np.where(finite[:, None, None], covariances, np.eye(3)))
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
     return np.where(finite[:, None], np.sqrt(np.maximum(values, 0)), np.nan), axes
+
+
+# -- reading files -----------------------------------------------------------------------------------------------------
+
+
+def checked(
+    where: str, means: np.ndarray, quats: np.ndarray, scales: np.ndarray, opacities: np.ndarray, sh: np.ndarray
+) -> Splats:
+    """Returns the arrays as Splats with unit rotations. Drops Gaussians that are huge, invalid or not finite. Raises
+    DataError for wrong shapes, or if no Gaussian is left."""
+    n = len(means) if means.ndim else 0
+    harmonics = sh.shape[-2] if sh.ndim == 3 else 1
+    shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, harmonics, 3)}
+    parts = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
+    for name, array in parts.items():
+        if array.shape != shapes[name]:
+            raise DataError(f"{where}: {name} has shape {array.shape}, expected {shapes[name]}")
+    if sh.shape[1] - 1 not in REST:
+        expected = ", ".join(str(k + 1) for k in REST)
+        raise DataError(f"{where}: {sh.shape[1]} coefficients per colour, expected {expected}")
+    good = finite_rows(parts)
+    good &= (np.linalg.norm(quats, axis=1) > 0) & (scales >= 0).all(axis=1) & (opacities >= 0) & (opacities <= 1)
+    if not good.any():
+        raise DataError(f"{where}: none of {n} Gaussians is finite with a quaternion other than 0, expected one")
+    kept = {name: np.ascontiguousarray(array[good], np.float32) for name, array in parts.items()}
+    return Splats(**kept | {"quats": unit(kept["quats"])})
+
+
+def finite_rows(parts: dict[str, np.ndarray]) -> np.ndarray:
+    """Returns bool [n]: whether a row has only numbers of magnitude up to LARGEST in all arrays [n, ...]."""
+    found = [(np.abs(array) <= LARGEST).all(axis=tuple(range(1, array.ndim))) for array in parts.values()]  # not NaN
+    return np.asarray(np.logical_and.reduce(found))
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Discards what libraries print, including from C."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    kept = [os.dup(stream) for stream in (1, 2)]
+    with open(os.devnull, "w") as nowhere:
+        try:
+            for stream in (1, 2):
+                os.dup2(nowhere.fileno(), stream)
+            yield
+        finally:
+            with contextlib.suppress(TypeError):  # Windows finds no C library by this name
+                ctypes.CDLL(None).fflush(None)  # C would write its buffers later, to the restored streams
+            for stream, old in zip((1, 2), kept, strict=True):
+                os.dup2(old, stream)
+                os.close(old)
+
+
+def read_splats(path: Path) -> Splats:
+    """Reads a PLY file of 3D Gaussian splatting, a compressed PLY or an SPZ file. Raises DataError."""
+    return checked(str(path), **activated(read_parameters(path)))
+
+
+def read_parameters(path: Path) -> dict[str, np.ndarray]:
+    """Reads the numbers that `read_splats` activates, float32, by the names of Splats: logarithms of scales, logits of
+    opacities, and quaternions of any length. Raises DataError."""
+    compressed = path.name.lower().endswith(".compressed.ply")
+    if path.suffix.lower() == ".spz" or compressed:
+        rows = read_vertices(path, _unpacked(path, "compressed.ply" if compressed else "spz"))
+    else:
+        rows = read_vertices(path)
+    names = set(rows.dtype.names or ())
+
+    def stack(*wanted: str) -> np.ndarray:
+        missing = [name for name in wanted if name not in names]
+        if missing:
+            raise DataError(f"{path}: has no property {missing[0]}, expected those of 3D Gaussian splatting")
+        return np.stack([rows[name] for name in wanted], axis=1).astype(np.float32)
+
+    rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in names)
+    if rest % 3 or rest // 3 not in REST:
+        raise DataError(f"{path}: has {rest} properties f_rest_*, expected {', '.join(str(3 * n) for n in REST)}")
+    sh = [stack(f"f_dc_{c}", *(f"f_rest_{c * rest // 3 + i}" for i in range(rest // 3))) for c in range(3)]
+    return {
+        "means": stack("x", "y", "z"),
+        "quats": stack("rot_0", "rot_1", "rot_2", "rot_3"),
+        "scales": stack("scale_0", "scale_1", "scale_2"),
+        "opacities": stack("opacity")[:, 0],
+        "sh": np.stack(sh, axis=2),
+    }
+
+
+def activated(parameters: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Returns the parameters with scales and opacities instead of their logarithms and logits."""
+    with np.errstate(over="ignore"):
+        scales, opacities = np.exp(parameters["scales"]), 1 / (1 + np.exp(-parameters["opacities"]))
+    return parameters | {"scales": scales, "opacities": opacities}
+
+
+def _unpacked(path: Path, kind: str) -> bytes:
+    """Converts an SPZ file or a compressed PLY to a PLY with gaussforge."""
+    forge = required("gaussforge", EXTRA, "SPZ files and compressed PLYs").GaussForge()
+    data = read_file(path)
+    if kind == "spz":
+        _check_spz(path, data)
+    with quiet():
+        found = forge.convert(data, kind, "ply")
+    if "error" in found or not found["data"]:
+        why = one_line(str(found.get("error", "no Gaussians were found")), 120)
+        raise DataError(f"{path}: gaussforge cannot read it: {why}")
+    return bytes(found["data"])
+
+
+def _check_spz(path: Path, data: bytes) -> None:
+    """Raises DataError unless `data` is an SPZ file that unpacks to no more bytes than its Gaussians need. gaussforge
+    has no such limit."""
+    unpacker, zipped = zlib.decompressobj(wbits=31), data[:4] != SPZ_MAGIC  # versions from 4 do not compress it
+    try:
+        head = unpacker.decompress(data, 20) if zipped else data[:20]
+        if head[:4] != SPZ_MAGIC or len(head) < 16:
+            raise DataError(f"{path}: is not an SPZ file, expected it to begin with {SPZ_MAGIC.decode()}")
+        count = int.from_bytes(head[8:12], "little")
+        if count > SPZ_MOST:
+            raise DataError(f"{path}: declares {count:,} Gaussians, expected {SPZ_MOST:,} at most")
+        size, most = len(head), min(len(head) + SPZ_BYTES * count, FREE_BYTES + INFLATES * len(data))
+        while zipped and not unpacker.eof and size <= most:
+            part = unpacker.decompress(unpacker.unconsumed_tail, 1 << 20)
+            if not part:
+                break
+            size += len(part)
+    except zlib.error as error:
+        raise DataError(f"{path}: is not an SPZ file: {error}") from None
+    if not zipped:  # a table of streams: packed and unpacked bytes of each
+        table = data[int.from_bytes(head[16:20], "little") :][: 16 * head[15]]
+        size = sum(int.from_bytes(table[i + 8 : i + 16], "little") for i in range(0, len(table), 16))
+    if size > most:
+        raise DataError(f"{path}: unpacks to more bytes than {count:,} Gaussians need, expected at most {most:,}")
+
+
+def read_gsplat(path: Path) -> Splats:
+    """Reads a checkpoint of gsplat's trainers, {"splats": state dict}. Raises DataError."""
+    content = read_tensors(read_file(path), str(path))
+    state = content.get("splats") if isinstance(content, dict) else None
+    wanted = ("means", "quats", "scales", "opacities", "sh0", "shN")
+    missing = [name for name in wanted if not isinstance(state, dict) or not isinstance(state.get(name), np.ndarray)]
+    if missing or not isinstance(state, dict):
+        raise DataError(f"{path}: has no splats.{missing[0]}; expected a checkpoint of gsplat with spherical harmonics")
+    *_, base, rest = parts = [state[name].astype(np.float32) for name in wanted]
+    sh = np.concatenate([base, rest], axis=1) if base.ndim == 3 else base
+    return checked(str(path), sh=sh, **activated(dict(zip(wanted[:4], parts, strict=False))))
+
+
+# -- writing files -----------------------------------------------------------------------------------------------------
+
+
+def properties(degree: int) -> list[str]:
+    """Names of the vertex properties in order, as 3D Gaussian splatting writes them; all are float."""
+    rest = 3 * ((degree + 1) ** 2 - 1)
+    return [
+        "x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest)),
+        "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4)),
+    ]  # fmt: skip
+
+
+def ply_bytes(splats: Splats) -> bytes:
+    """Returns a binary PLY with normals of 0, f_rest channel by channel, logits of opacities, logarithms of scales and
+    quaternions wxyz."""
+    n = len(splats.means)
+    p = np.clip(splats.opacities.astype(np.float64), LEAST_OPACITY, 1 - LEAST_OPACITY)
+    columns = (
+        splats.means,
+        np.zeros((n, 3)),
+        splats.sh[:, 0],
+        splats.rest,
+        np.log(p / (1 - p))[:, None],
+        np.log(np.maximum(splats.scales, LEAST_SCALE)),
+        splats.quats,
+    )
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
+    head += [*(f"property float {name}" for name in properties(splats.degree)), "end_header", ""]
+    return "\n".join(head).encode() + np.concatenate(columns, axis=1).astype("<f4").tobytes()
+
+
+def glb_bytes(splats: Splats) -> bytes:
+    """Returns a binary glTF 2.0 file; viewers without the extension show points. Rotate first: +y is up in glTF."""
+    attributes = {
+        "POSITION": splats.means,
+        "COLOR_0": np.concatenate([_linear(splats.base_colors), splats.opacities[:, None]], axis=1),
+        f"{EXTENSION}:ROTATION": splats.quats[:, [1, 2, 3, 0]],
+        f"{EXTENSION}:SCALE": splats.scales,
+        f"{EXTENSION}:OPACITY": splats.opacities[:, None],
+    }
+    for degree in range(splats.degree + 1):
+        for i in range(2 * degree + 1):
+            attributes[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}"] = splats.sh[:, degree * degree + i]
+    arrays = [np.ascontiguousarray(values, "<f4") for values in attributes.values()]
+    views, at = [], 0
+    for array in arrays:
+        views.append({"buffer": 0, "byteOffset": at, "byteLength": array.nbytes})
+        at += array.nbytes
+    accessors: list[dict[str, Any]] = [
+        {"bufferView": i, "componentType": FLOAT, "count": len(array), "type": TYPES[array.shape[1]]}
+        for i, array in enumerate(arrays)
+    ]
+    low, high = arrays[0].min(axis=0), arrays[0].max(axis=0)
+    accessors[0] |= {"min": [float(v) for v in low], "max": [float(v) for v in high]}
+    primitive = {
+        "attributes": {name: i for i, name in enumerate(attributes)},
+        "mode": POINTS,
+        "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
+    }
+    document = {
+        "asset": {"version": "2.0", "generator": "pd4dgs-codec"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": at}],
+    }
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + at, len(text), JSON)
+    return b"".join([head, text, struct.pack("<II", at, BINARY), *(array.tobytes() for array in arrays)])
+
+
+def _linear(colors: np.ndarray) -> np.ndarray:
+    """Converts sRGB values 0..1 (IEC 61966-2-1) to linear values, as glTF's COLOR_0 requires."""
+    light: np.ndarray = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+    return light
+
+
+def spz_bytes(splats: Splats) -> bytes:
+    """Returns an SPZ file of version 3. Raises DataError for positions beyond its fixed-point range."""
+    reach = float(np.abs(splats.means).max(initial=0))
+    if reach >= SPZ_REACH:
+        found = f"a Gaussian lies {reach:.4g} units from 0"
+        raise DataError(f"{found}, expected less than {SPZ_REACH:g} in SPZ: use --scale below 1")
+    with quiet():
+        forge = required("gaussforge", EXTRA, "SPZ files").GaussForge()
+        result = forge.convert(ply_bytes(splats), "ply", "spz", spz_version=3)
+    if "error" in result:
+        raise DataError(f"gaussforge cannot write this SPZ file: {result['error']}")
+    return bytes(result["data"])
+
+
+def fourdgs_bytes(frames: Sequence[tuple[float, Splats, np.ndarray]], seconds: float) -> bytes:
+    """Returns a .4dgs file of `seconds`. Each Gaussian is shown in its frame and moves to its slot in the next frame.
+
+    frames: (start in seconds, Gaussians, their slots int64 [N]), ascending from 0.
+    """
+    fourdgs = required("fourdgs", EXTRA, ".4dgs files")
+    starts = [start for start, _, _ in frames]
+    ends = [*starts[1:], seconds]
+    parts: dict[str, list[np.ndarray]] = {}
+    for i, (start, splats, slots) in enumerate(frames):
+        n, middle = len(slots), (start + ends[i]) / 2
+        speed = np.zeros((n, 3), np.float32)
+        if i + 1 < len(frames):
+            _, later, later_slots = frames[i + 1]
+            _, here, there = np.intersect1d(slots, later_slots, assume_unique=True, return_indices=True)
+            speed[here] = (later.means[there] - splats.means[here]) / np.float32(ends[i] - start)
+        for name, values in {
+            "positions": splats.means + speed * np.float32(middle - start),
+            "scales": splats.scales,
+            "rotations": splats.quats[:, [1, 2, 3, 0]],
+            "colors": np.concatenate([splats.base_colors, splats.opacities[:, None]], axis=1),
+            "motions": speed,
+            "mu_t": np.full(n, middle, np.float32),
+            "sigma_t": np.full(n, np.inf, np.float32),
+            "win_lo": np.full(n, start),
+            "win_hi": np.full(n, ends[i]),
+            "sh": np.clip(np.rint((splats.rest + SH_SPAN) * (255 / (2 * SH_SPAN))), 0, 255).astype(np.uint8),
+        }.items():
+            parts.setdefault(name, []).append(values)
+    columns: dict[str, Any] = {name: np.concatenate(values) for name, values in parts.items()}
+    degree = frames[0][1].degree
+    if degree == 0:
+        columns["sh"] = None
+    stream = io.BytesIO()
+    try:
+        fourdgs.write(stream, fourdgs.GaussianSet(**columns, sh_degree=degree), seconds)
+    except (fourdgs.FourdgsError, ValueError) as error:
+        raise DataError(f"fourdgs cannot write this file: {error}") from None
+    return stream.getvalue()

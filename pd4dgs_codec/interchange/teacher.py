@@ -29,12 +29,22 @@ import numpy as np
 
 from pd4dgs_codec.data.dataset import color, load
 from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, last_numbers, read_file, split_options
-from pd4dgs_codec.data.posed import depth_range, held_out, normalised_times, points_box, seconds_range
-from pd4dgs_codec.data.view import Dataset, View
+from pd4dgs_codec.data.view import Dataset, View, depth_range, held_out, normalised_times, points_box, seconds_range
 from pd4dgs_codec.errors import DataError, one_line, required
-from pd4dgs_codec.interchange.formats import EXTRA, SH_SPAN, checked, read_gsplat, read_splats
 from pd4dgs_codec.interchange.runs import read_cameras, read_deformed
-from pd4dgs_codec.interchange.splats import SH_C0, Splats, looking, picture, sphere, spread
+from pd4dgs_codec.interchange.splats import (
+    EXTRA,
+    SH_C0,
+    SH_SPAN,
+    Splats,
+    checked,
+    looking,
+    picture,
+    read_gsplat,
+    read_splats,
+    sphere,
+    spread,
+)
 from pd4dgs_codec.quality.frames import shrunk
 from pd4dgs_codec.scene import Camera
 

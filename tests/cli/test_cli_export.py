@@ -6,7 +6,7 @@ import pytest
 from tiny import sighted
 
 from pd4dgs_codec.format.encoder import encode
-from pd4dgs_codec.interchange.formats import properties
+from pd4dgs_codec.interchange.splats import properties
 
 
 def _count(path) -> int:

@@ -14,9 +14,8 @@ from teachers import Deformable, FourD
 from test_formats import make_splats
 
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.interchange.formats import fourdgs_bytes, ply_bytes, read_splats
 from pd4dgs_codec.interchange.runs import read_cameras, read_torch
-from pd4dgs_codec.interchange.splats import Splats
+from pd4dgs_codec.interchange.splats import Splats, fourdgs_bytes, ply_bytes, read_splats
 from pd4dgs_codec.interchange.teacher import PARTS, load_source, read_model
 
 CASES = 150

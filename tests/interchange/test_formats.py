@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.interchange.formats import fourdgs_bytes, glb_bytes, ply_bytes, spz_bytes
-from pd4dgs_codec.interchange.splats import Splats, unit
+from pd4dgs_codec.interchange.splats import Splats, fourdgs_bytes, glb_bytes, ply_bytes, spz_bytes, unit
 
 
 def make_splats(n: int = 40, degree: int = 3, seed: int = 0) -> Splats:

@@ -15,8 +15,7 @@ import numpy as np
 import pytest
 from test_formats import make_splats
 
-from pd4dgs_codec.interchange.formats import glb_bytes, ply_bytes
-from pd4dgs_codec.interchange.splats import Splats, harmonics, unit
+from pd4dgs_codec.interchange.splats import Splats, glb_bytes, harmonics, ply_bytes, unit
 
 MODULES = Path(os.environ.get("PD4DGS_NODE_MODULES", Path(__file__).parents[2] / "node_modules"))
 PROGRAM = MODULES / "@playcanvas" / "splat-transform" / "bin" / "cli.mjs"

@@ -17,8 +17,15 @@ from tiny import write_views
 
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.interchange.formats import fourdgs_bytes, ply_bytes, read_splats, spz_bytes
-from pd4dgs_codec.interchange.splats import Splats, camera_eye, picture
+from pd4dgs_codec.interchange.splats import (
+    Splats,
+    camera_eye,
+    fourdgs_bytes,
+    picture,
+    ply_bytes,
+    read_splats,
+    spz_bytes,
+)
 from pd4dgs_codec.interchange.teacher import load_source, read_model
 
 

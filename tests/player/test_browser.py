@@ -44,8 +44,7 @@ from pd4dgs_codec import decode, encode, show
 from pd4dgs_codec import scene as scene_module
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.format.info import info
-from pd4dgs_codec.interchange.formats import ply_bytes
-from pd4dgs_codec.interchange.splats import Splats
+from pd4dgs_codec.interchange.splats import Splats, ply_bytes
 from pd4dgs_codec.scene import Camera, Deformation, Scene, SceneInfo, Steps, Widths
 from pd4dgs_codec.web.page import page as packed_page
 from pd4dgs_codec.web.server import Link, Server
