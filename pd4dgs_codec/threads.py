@@ -24,7 +24,7 @@ import ctypes
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from functools import cache
 from importlib import import_module
 from time import perf_counter
@@ -79,24 +79,21 @@ def kernel_threads() -> int:
     return configure(None) if _kernel_threads is None else _kernel_threads
 
 
-def _limit_blas() -> Any:
-    """Limits numpy's BLAS to one thread; returns the limiter, which can undo it, or None without threadpoolctl."""
+def _limit_blas() -> AbstractContextManager[Any]:
+    """Limits numpy's BLAS to one thread if threadpoolctl is installed; a `with` block of the result undoes it."""
     try:
         from threadpoolctl import threadpool_limits
     except ImportError:
-        return None
-    return threadpool_limits(1, user_api="blas")
+        return nullcontext()
+    limits: AbstractContextManager[Any] = threadpool_limits(1, user_api="blas")
+    return limits
 
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
     """Limits numpy's BLAS to one thread within the block."""
-    limits = _limit_blas()
-    try:
+    with _limit_blas():
         yield
-    finally:
-        if limits is not None:
-            limits.restore_original_limits()
 
 
 @contextmanager
