@@ -423,8 +423,14 @@ class SceneClient:
 
     def _ready(self, max_layer: int | None, max_bytes: int) -> list[Scene]:
         """Feeds new bytes to the decoder. After a fault the transfer goes back to the end of the last valid slice."""
+        data, end = self.transfer.data, len(self.transfer.data)
         try:
-            return self._feed(max_layer, max_bytes)
+            if not self._slices:
+                self._slices = slice_ends(data)
+            if self._slices:  # the first bytes of a small file may hold more than requested
+                end = min(end, prefix_end(self._slices, max_layer, max_bytes))
+            block, self._fed = bytes(data[self._fed : end]), max(self._fed, end)
+            return self._stream.feed(block)
         except (BadSignature, UnsupportedVersion):
             raise  # not a transmission error
         except DecodeError:
@@ -435,12 +441,3 @@ class SceneClient:
             self.transfer.rewind(good)
             self._stream.rewind()
             return []
-
-    def _feed(self, max_layer: int | None, max_bytes: int) -> list[Scene]:
-        data, end = self.transfer.data, len(self.transfer.data)
-        if not self._slices:
-            self._slices = slice_ends(data)
-        if self._slices:  # the first bytes of a small file may hold more than requested
-            end = min(end, prefix_end(self._slices, max_layer, max_bytes))
-        block, self._fed = bytes(data[self._fed : end]), max(self._fed, end)
-        return self._stream.feed(block)
