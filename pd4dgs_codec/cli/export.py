@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.cli import common, options
-from pd4dgs_codec.cli.common import OK, Console, UsageError
-from pd4dgs_codec.cli.progress import progress_bar
+from pd4dgs_codec.cli.common import OK, Console, UsageError, progress_bar, say
 from pd4dgs_codec.errors import DataError, required
 from pd4dgs_codec.io import check_path, whole_files
 
@@ -82,19 +81,21 @@ def _export(args: argparse.Namespace, console: Console) -> int:
         _check_folder(args.output, args.overwrite)
     else:
         common.check_output(args.output, args.overwrite)
+    from pd4dgs_codec.draw.player import Player
+    from pd4dgs_codec.format.decoder import decode
     from pd4dgs_codec.interchange.export import Export
     from pd4dgs_codec.interchange.splats import EXTRA
 
     if args.to in LIBRARIES:
         required(LIBRARIES[args.to], EXTRA, f"{args.to} files")
-    player = _player(args)
+    player = Player(decode(common.read_bytes(args.input), max_layer=args.level))
     if args.refine is None:
         args.refine = 0 if player.shapes_are_blind else STEPS
     export = Export(player, _eyes(args, player), args.sh, args.refine)
     start = time.perf_counter()
     result = {"input": args.input, "output": args.output, "to": args.to, "level": player.level, "sh": args.sh}
     result["refine"] = args.refine
-    result |= _write_sequence(args, export) if args.to in SEQUENCES else _write_still(args, export, console)
+    result |= _write_sequence(args, export) if args.to in SEQUENCES else _write_still(args, export)
     result["seconds"] = time.perf_counter() - start
     if args.compare:
         result["cost"] = _cost(args, export)
@@ -124,13 +125,6 @@ def _check_folder(path: str, overwrite: bool) -> None:
         raise DataError(f"{path}: contains PLY files already; --overwrite removes them")
 
 
-def _player(args: argparse.Namespace) -> Player:
-    from pd4dgs_codec.draw.player import Player
-    from pd4dgs_codec.format.decoder import decode
-
-    return Player(decode(common.read_bytes(args.input), max_layer=args.level))
-
-
 def _eyes(args: argparse.Namespace, player: Player) -> Eyes:
     from pd4dgs_codec.interchange.export import eyes_of_cameras, eyes_of_scene
 
@@ -139,7 +133,7 @@ def _eyes(args: argparse.Namespace, player: Player) -> Eyes:
     return eyes_of_cameras([view.camera for view in common.read_dataset(args.data, args, player.info).train])
 
 
-def _write_still(args: argparse.Namespace, export: Export, console: Console) -> dict[str, Any]:
+def _write_still(args: argparse.Namespace, export: Export) -> dict[str, Any]:
     """Writes the Gaussians of one time."""
     import numpy as np
 
@@ -152,7 +146,7 @@ def _write_still(args: argparse.Namespace, export: Export, console: Console) -> 
     splats = _scaled(splats, args)
     if args.to == "spz" and (size := float(np.median(splats.scales.max(axis=1)))) < 4 * SPZ_STEP:
         what = f"half of the Gaussians are smaller than {size:.2g} units, and SPZ rounds positions to {SPZ_STEP:.2g}"
-        console.message(f"pd4dgs-export: warning: {what}; --scale enlarges the scene")
+        say(f"pd4dgs-export: warning: {what}; --scale enlarges the scene")
     data = {"ply": ply_bytes, "spz": spz_bytes, "glb": glb_bytes}[args.to](splats)
     common.write_bytes(args.output, data, args.overwrite)
     return {"frames": 1, "gaussians": len(splats.means), "bytes": len(data), "time": args.time}
@@ -177,7 +171,7 @@ def frame_times(info: SceneInfo, fps: float) -> list[float]:
 
 def _write_sequence(args: argparse.Namespace, export: Export) -> dict[str, Any]:
     """Writes frames over the whole time range."""
-    from pd4dgs_codec.interchange.splats import fourdgs_bytes, ply_bytes
+    from pd4dgs_codec.interchange.splats import fourdgs_bytes
 
     info, fps = export.player.info, args.fps
     seconds = info.time_range[1] - info.time_range[0]
@@ -189,7 +183,7 @@ def _write_sequence(args: argparse.Namespace, export: Export) -> dict[str, Any]:
             data = fourdgs_bytes(kept, starts[-1] + 1 / fps)
             common.write_bytes(args.output, data, args.overwrite)
             return {"frames": len(starts), "gaussians": max(len(g.means) for _, g, _ in kept), "bytes": len(data)}
-        return _write_folder(args, len(starts), (ply_bytes(splats) for splats, _ in frames))
+        return _write_folder(args, len(starts), (splats for splats, _ in frames))
 
 
 def _frames(
@@ -203,13 +197,16 @@ def _frames(
         step()
 
 
-def _write_folder(args: argparse.Namespace, count: int, frames: Iterator[bytes]) -> dict[str, Any]:
+def _write_folder(args: argparse.Namespace, count: int, frames: Iterator[Splats]) -> dict[str, Any]:
+    from pd4dgs_codec.interchange.splats import ply_bytes
+
     folder, most, total = Path(args.output), 0, 0
     names = [str(folder / f"{i:05d}.ply") for i in range(count)]
     with whole_files(names, args.overwrite) as temporaries:
-        for temporary, data in zip(temporaries, frames, strict=True):
+        for temporary, splats in zip(temporaries, frames, strict=True):
+            data = ply_bytes(splats)
             temporary.write_bytes(data)
-            most, total = max(most, int(data[: data.index(b"\nproperty")].split()[-1])), total + len(data)
+            most, total = max(most, len(splats.means)), total + len(data)
     for other in set(folder.glob("*.ply")) - {Path(name) for name in names}:
         other.unlink()
     return {"frames": count, "gaussians": most, "bytes": total}
