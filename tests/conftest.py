@@ -164,7 +164,7 @@ class Result:
 @pytest.fixture
 def cli(capfdbinary, monkeypatch) -> Callable[..., Result]:
     """cli("info", path, "--json", stdin=b"...") -> Result. No command is so slow here that it tells of its progress."""
-    monkeypatch.setattr("pd4dgs_codec.cli.progress.LINE_SECONDS", math.inf)
+    monkeypatch.setattr("pd4dgs_codec.cli.common.LINE_SECONDS", math.inf)
 
     def call(verb: str, *argv: object, stdin: bytes | None = None) -> Result:
         if stdin is not None:

@@ -1,4 +1,4 @@
-"""The commands: one thin module per verb, each with `main(argv=None) -> int`, over common, options and progress."""
+"""The commands: one thin module per verb, each with `main(argv=None) -> int`, over common and options."""
 
 import _signal  # built in and already loaded, while importing `signal` takes milliseconds
 import sys

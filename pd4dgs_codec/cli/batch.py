@@ -10,17 +10,13 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from pd4dgs_codec.batch.job import OPS, arguments
-from pd4dgs_codec.cli import options
-from pd4dgs_codec.cli.common import FAILED, OK, STDIO, Console, UsageError, check_output, run, say, write_bytes
-from pd4dgs_codec.cli.progress import progress_bar
+from pd4dgs_codec.batch.job import OPS, Job, Manifest, Outcome, arguments, scan
+from pd4dgs_codec.cli import common, options
+from pd4dgs_codec.cli.common import FAILED, OK, STDIO, Console, UsageError, progress_bar, say
 from pd4dgs_codec.errors import DataError, printable
 from pd4dgs_codec.threads import available
-
-if TYPE_CHECKING:
-    from pd4dgs_codec.batch.job import Job, Manifest, Outcome
 
 VERBS = tuple(OPS)
 ENGINES = ("local", "ray", "slurm")
@@ -102,8 +98,8 @@ def _parameter(text: str) -> tuple[str, str]:
 def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     if arguments[:1] == ["scan"]:
-        return run(scan_parser(), _scan, arguments[1:])
-    return run(parser(), _batch, arguments)
+        return common.run(scan_parser(), _scan, arguments[1:])
+    return common.run(parser(), _batch, arguments)
 
 
 def command(verb: str, argv: list[str]) -> tuple[int, str, str]:
@@ -117,11 +113,9 @@ def command(verb: str, argv: list[str]) -> tuple[int, str, str]:
 def _scan(args: argparse.Namespace, console: Console) -> int:
     if args.json and args.output == STDIO:
         raise UsageError("the manifest and --json both write to stdout, expected -o FILE")
-    check_output(args.output, args.overwrite)
-    from pd4dgs_codec.batch.job import scan
-
+    common.check_output(args.output, args.overwrite)
     lines = [json.dumps(line) + "\n" for line in scan(args.input, args.op)]
-    write_bytes(args.output, "".join(lines).encode(), args.overwrite)
+    common.write_bytes(args.output, "".join(lines).encode(), args.overwrite)
     console.result({"output": args.output, "scenes": len(lines)}, f"{len(lines)} scene{'s' * (len(lines) != 1)}")
     return OK
 
@@ -132,12 +126,10 @@ def _batch(args: argparse.Namespace, console: Console) -> int:
     options.conditional(args, args.on == "ray", "needs --on ray", address=None)
     options.conditional(args, args.on == "slurm", "needs --on slurm", slurm=[])
     cores = args.threads or available()
-    workers = args.workers if args.workers is not None else {"local": cores, "ray": 0, "slurm": 0}[args.on]
+    workers = args.workers if args.workers is not None else cores if args.on == "local" else 0
     threads = args.cpus or (max(1, cores // max(1, workers)) if args.on == "local" else 1)
     from pd4dgs_codec.batch import store
-    from pd4dgs_codec.batch.job import Job, Manifest
-    from pd4dgs_codec.batch.run import Settings
-    from pd4dgs_codec.batch.run import run as run_jobs
+    from pd4dgs_codec.batch.run import Settings, run
 
     module = import_module(f"pd4dgs_codec.cli.{args.op}")
     takes, check_usage = module.parser(), getattr(module, "check_usage", lambda args: None)
@@ -151,7 +143,7 @@ def _batch(args: argparse.Namespace, console: Console) -> int:
     manifest = Manifest(args.input, OPS[args.op], check)
     output = store.absolute(args.output)
     store.Root(output).check()
-    failures = _Failures(args, manifest)
+    failures = [_failed(args.input, number, None, message) for number, message in manifest.faults]
     jobs = (Job(line, args.op, output, threads, args.overwrite) for line in manifest.lines)
     settings = Settings(
         workers, threads, args.gpus, args.timeout or None, args.address, Path(args.logs), dict(args.slurm)
@@ -159,44 +151,36 @@ def _batch(args: argparse.Namespace, console: Console) -> int:
     with progress_bar(len(manifest.lines), "scenes", args.op) as step:
 
         def told(job: Job, outcome: Outcome, tries: int) -> None:
-            failures.see(job, outcome, tries)
+            if outcome.state == "failed":
+                log, again = _written_log(args.logs, job, outcome), f", tried {tries} times" if tries > 1 else ""
+                failures.append(_failed(args.input, job.line.number, job.line.output, outcome.message + again, log))
             step()
 
-        summary = run_jobs(jobs, command, args.on, settings, args.retries, told)
-    found = {"failed": len(failures.rows), "failures": failures.rows}
+        summary = run(jobs, command, args.on, settings, args.retries, told)
+    found = {"failed": len(failures), "failures": failures}
     result = {"output": args.output, "op": args.op, "on": args.on, **summary, **found}
     console.result(result, _text(result))
-    return FAILED if failures.rows else OK
+    return FAILED if failures else OK
 
 
-class _Failures:
-    """Collects the lines that failed; reports each at once and writes its log to a file."""
+def _failed(place: str, number: int, output: str | None, message: str, log: str | None = None) -> dict[str, Any]:
+    """Reports a line that failed. Returns its row of the result."""
+    named = f" {output}:" if output else ""
+    say(f"pd4dgs-batch: {place}, line {number}:{named} {message}" + (f" (log: {log})" if log else ""))
+    return {"line": number, "output": output, "message": message, "log": log}
 
-    def __init__(self, args: argparse.Namespace, manifest: Manifest):
-        self.prog, self.place, self.folder = "pd4dgs-batch", args.input, Path(args.logs)
-        self.rows: list[dict[str, Any]] = []
-        for number, message in manifest.faults:
-            self._add(number, None, message)
 
-    def see(self, job: Job, outcome: Outcome, tries: int) -> None:
-        """Records a job that has ended, if it failed."""
-        if outcome.state != "failed":
-            return
-        log = None
-        if outcome.log:
-            path = self.folder / f"{job.line.output}.log"
-            with contextlib.suppress(OSError, ValueError):  # a log that cannot be written must not end the batch
-                path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_text(printable(outcome.log), encoding="utf-8")
-                log = str(path)
-        again = f", tried {tries} times" if tries > 1 else ""
-        self._add(job.line.number, job.line.output, outcome.message + again, log)
-
-    def _add(self, number: int, output: str | None, message: str, log: str | None = None) -> None:
-        row = {"line": number, "output": output, "message": message, "log": log}
-        self.rows.append(row)
-        named = f" {output}:" if output else ""
-        say(f"{self.prog}: {self.place}, line {number}:{named} {message}" + (f" (log: {log})" if log else ""))
+def _written_log(folder: str, job: Job, outcome: Outcome) -> str | None:
+    """Writes the log of a failed job and returns its path; None if it has none, or it cannot be written."""
+    if not outcome.log:
+        return None
+    path = Path(folder) / f"{job.line.output}.log"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(printable(outcome.log), encoding="utf-8")
+    except (OSError, ValueError):  # which must not end the batch
+        return None
+    return str(path)
 
 
 def _text(result: dict[str, Any]) -> str:

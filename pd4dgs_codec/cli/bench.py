@@ -13,8 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pd4dgs_codec.cli import common, options
-from pd4dgs_codec.cli.common import FAILED, OK, STDIO, Console, UsageError, check_output, is_pd4, read_bytes
-from pd4dgs_codec.cli.progress import TrainingProgress, progress_bar
+from pd4dgs_codec.cli.common import FAILED, OK, STDIO, Console, UsageError, is_pd4, progress_bar, read_bytes, say
 from pd4dgs_codec.errors import DataError, DecodeError, TrainError
 from pd4dgs_codec.format.options import MODES
 
@@ -102,7 +101,7 @@ def _codec_options(p: options.Parser) -> None:
     _add_views(p, 6)
 
 
-def _codec(args: argparse.Namespace, console: Console) -> Outcome:
+def _codec(args: argparse.Namespace) -> Outcome:
     data = read_bytes(args.input)
     _complete_views(args, 6, not is_pd4(data))
     options.conditional(args, not is_pd4(data), CHECKPOINT, step_scales=None, modes=None, efforts=None, plot=None)
@@ -144,7 +143,7 @@ def _render_options(p: options.Parser) -> None:
     _add_views(p, 2)
 
 
-def _render(args: argparse.Namespace, console: Console) -> Outcome:
+def _render(args: argparse.Namespace) -> Outcome:
     from pd4dgs_codec.bench import report, runtime
     from pd4dgs_codec.quality.levels import load_levels
 
@@ -204,7 +203,7 @@ def _train_options(p: options.Parser) -> None:
     add("--from", dest="runs", nargs="+", metavar="FILE", help="report the runs of these checkpoints")
 
 
-def _train(args: argparse.Namespace, console: Console) -> Outcome:
+def _train(args: argparse.Namespace) -> Outcome:
     if args.runs and (args.source or _given(args, "presets", "seconds", *TRAIN_FIELDS)):
         raise UsageError("--from reports finished runs, expected no SOURCE and no training options")
     if not args.runs and not args.source:
@@ -214,13 +213,13 @@ def _train(args: argparse.Namespace, console: Console) -> Outcome:
     from pd4dgs_codec.bench import report, runtime
 
     machine = None if args.runs else report.machine()  # the machine of existing runs is unknown
-    runs = [runtime.recorded_run(path) for path in args.runs] if args.runs else _trained(args, console)
+    runs = [runtime.recorded_run(path) for path in args.runs] if args.runs else _trained(args)
     text = "\n\n".join([runtime.train_table(runs), *([report.machine_line(machine)] if machine else [])])
     result = {"source": args.source, "machine": machine, "runs": runs}
     return Outcome(result, text, runtime.train_panels(runs), "held-out RMSE of the highest level")
 
 
-def _trained(args: argparse.Namespace, console: Console) -> list[Point]:
+def _trained(args: argparse.Namespace) -> list[Point]:
     from pd4dgs_codec.bench import runtime
     from pd4dgs_codec.interchange.teacher import load_source
     from pd4dgs_codec.train.config import TrainConfig
@@ -231,9 +230,9 @@ def _trained(args: argparse.Namespace, console: Console) -> list[Point]:
     for preset in dict.fromkeys(args.presets or ("tiny", "small")):
         config = TrainConfig(preset=preset, source=args.source, max_seconds=limit, **_given(args, *TRAIN_FIELDS))
         trainer = Trainer(config, load_source(args.source, downscale=config.downscale, holdout=config.holdout))
-        console.message(f"training {preset} on {len(trainer.dataset.train)} views")
+        say(f"training {preset} on {len(trainer.dataset.train)} views")
         with tempfile.TemporaryDirectory() as folder:
-            trainer.run(Path(folder) / "model.pt", progress=TrainingProgress())
+            trainer.run(Path(folder) / "model.pt", progress=common.TrainingProgress())
         if trainer.interrupted:
             raise TrainError(f"interrupted while training {preset}; nothing was written")
         if not trainer.curve:
@@ -262,7 +261,7 @@ def _latency_options(p: options.Parser) -> None:
     add("--runs", type=options.positive_int, default=9, metavar="N", help="runs per median (default: 9)")
 
 
-def _latency(args: argparse.Namespace, console: Console) -> Outcome:
+def _latency(args: argparse.Namespace) -> Outcome:
     contents = [_with_camera(name) for name in args.inputs]
     from pd4dgs_codec.bench import latency, report
 
@@ -312,7 +311,7 @@ def _stability_options(p: options.Parser) -> None:
     p.add_argument("--only", metavar="NAME", help="run the group NAME, or the cases with NAME in their name")
 
 
-def _stability(args: argparse.Namespace, console: Console) -> Outcome:
+def _stability(args: argparse.Namespace) -> Outcome:
     from pd4dgs_codec.bench import stability
 
     stability.mpmath()
@@ -342,7 +341,7 @@ class Report(NamedTuple):
     summary: str
     details: str
     add_options: Callable[[options.Parser], None]
-    execute: Callable[[argparse.Namespace, Console], Outcome]
+    execute: Callable[[argparse.Namespace], Outcome]
     plot: bool = True
 
 
@@ -391,7 +390,7 @@ def _misplaced(args: argparse.Namespace, console: Console) -> int:
     raise UsageError(f"found options before {args.report!r}, expected the report first")
 
 
-def _report(execute: Callable[..., Outcome], args: argparse.Namespace, console: Console) -> int:
+def _report(execute: Callable[[argparse.Namespace], Outcome], args: argparse.Namespace, console: Console) -> int:
     """Checks the outputs, makes the report and writes it. Returns FAILED if one of its rows failed."""
     from pd4dgs_codec.io import finite, whole_file
 
@@ -401,8 +400,8 @@ def _report(execute: Callable[..., Outcome], args: argparse.Namespace, console: 
         raise UsageError(f"found --plot {plot}, expected a name that ends in .png")
     for path in (plot, args.json):
         if path is not None:
-            check_output(path, args.overwrite)
-    found = execute(args, console)
+            common.check_output(path, args.overwrite)
+    found = execute(args)
     if plot is not None:
         from pd4dgs_codec.bench.report import draw
 
@@ -412,6 +411,6 @@ def _report(execute: Callable[..., Outcome], args: argparse.Namespace, console: 
         text = json.dumps(finite(found.result), indent=1) + "\n"
         common.write_bytes(args.json, text.encode(), args.overwrite)
     for line in found.failures:
-        console.message(line)
+        say(line)
     console.result(found.result, found.text, on_stdout=True)
     return FAILED if found.failures else OK

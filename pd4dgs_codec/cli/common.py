@@ -1,4 +1,4 @@
-"""Runs commands: inputs, outputs, messages on stdout and stderr, one-line errors and exit codes.
+"""Runs commands: inputs, outputs, messages on stdout and stderr, progress, one-line errors and exit codes.
 
 At import only the standard library is loaded, so that `--help` and usage errors answer at once, and so that the number
 of threads is set before torch and numba are loaded.
@@ -14,17 +14,19 @@ import gc
 import io
 import os
 import sys
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, TextIO
 
-from pd4dgs_codec.errors import DamageWarning, DecodeError, EncodeError, Pd4Error, one_line, printable
+from pd4dgs_codec.errors import DamageWarning, DecodeError, DeliveryError, EncodeError, Pd4Error, one_line, printable
 from pd4dgs_codec.signals import ignore_more, interruptible
 from pd4dgs_codec.threads import configure
 
 if TYPE_CHECKING:
     from pd4dgs_codec.data.view import Dataset
     from pd4dgs_codec.scene import Scene, SceneInfo
+    from pd4dgs_codec.train.loop import Trainer
 
 #: A last garbage collection at exit took a quarter of the time of a cold start's first picture.
 atexit.register(gc.freeze)
@@ -32,6 +34,8 @@ atexit.register(gc.freeze)
 OK, FAILED, USAGE, PARTIAL = 0, 1, 2, 3
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  #: errors of a full disk
 STDIO = "-"
+#: Least time between two lines if stderr is not a terminal.
+LINE_SECONDS = 10.0
 EXTRAS = {"ray": "cluster", "submitit": "cluster"}  #: extra of each module that the extra `train` does not install
 
 
@@ -43,19 +47,15 @@ class UsageError(Exception):
 
 
 class Console:
-    """Prints data to stdout and messages to stderr; with --json, stdout gets one JSON object and nothing else."""
+    """Prints data to stdout and details to stderr; with --json, stdout gets one JSON object and nothing else."""
 
     def __init__(self, args: argparse.Namespace):
         self.json, self.verbose = args.json, args.verbose
 
-    def message(self, text: str) -> None:
-        """Prints a line for the person at the terminal."""
-        say(text)
-
     def detail(self, text: str) -> None:
         """Prints a line with -v only."""
         if self.verbose:
-            self.message(text)
+            say(text)
 
     def result(self, data: dict[str, Any], text: str, *, on_stdout: bool = False) -> None:
         """Prints `data` as JSON on stdout with --json, otherwise `text` on stderr, or on stdout with `on_stdout`."""
@@ -68,7 +68,7 @@ class Console:
         elif on_stdout:
             show(text)
         else:
-            self.message(text)
+            say(text)
 
 
 def show(text: str) -> None:
@@ -127,6 +127,65 @@ def shown_name(path: str, stream: str = "stdin") -> str:
     return stream if path == STDIO else path
 
 
+# -- progress ----------------------------------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def progress_bar(total: int | None, unit: str, label: str) -> Iterator[Callable[[], None]]:
+    """Yields a function to call after each item. Shows a bar on a terminal, otherwise a line every LINE_SECONDS."""
+    if sys.stderr.isatty():
+        from tqdm import tqdm
+
+        with tqdm(total=total, unit=unit, desc=label, leave=False, file=sys.stderr) as bar:
+            yield bar.update  # by 1
+        return
+    done, told = 0, time.monotonic()
+
+    def count_one() -> None:
+        nonlocal done, told
+        done += 1
+        if time.monotonic() - told > LINE_SECONDS:
+            told = time.monotonic()
+            say(f"{label}: {done}{f' of {total}' if total else ''} {unit}")
+
+    yield count_one
+
+
+class TrainingProgress:
+    """Shows a bar on a terminal, otherwise a line after each evaluation."""
+
+    def __init__(self) -> None:
+        self.stream = sys.stderr
+        self.bar: Any = None
+
+    def update(self, trainer: Trainer, record: dict[str, Any]) -> None:
+        psnr = "/".join(f"{value:.2f}" for value in trainer.curve[-1]["psnr"]) if trainer.curve else ""
+        if self.stream.isatty():
+            self._bar(trainer).set_postfix_str(f"{record['anchors']} anchors {psnr} dB" if psnr else "", refresh=False)
+            self.bar.update((int(trainer.seconds) if trainer.timed else trainer.iteration) - self.bar.n)
+        elif "held_out_psnr" in record:
+            steps = f"step {trainer.iteration}" if trainer.timed else f"step {trainer.iteration}/{trainer.total}"
+            limit = f" of {trainer.config.max_seconds:g}" if trainer.timed else ""
+            say(f"{steps}, {trainer.seconds:.0f}{limit} s: {psnr} dB, {record['anchors']} anchors")
+
+    def on_trial(self, done: int, steps: int) -> None:
+        if self.bar is not None:
+            self.bar.set_postfix_str(f"trial of motion or levels: step {done + 1}/{steps}")
+
+    def close(self) -> None:
+        if self.bar is not None:
+            self.bar.close()
+
+    def _bar(self, trainer: Trainer) -> Any:
+        if self.bar is None:
+            from tqdm import tqdm
+
+            total, unit = (trainer.config.max_seconds, "s") if trainer.timed else (trainer.total, "step")
+            initial = int(trainer.seconds) if trainer.timed else trainer.iteration - 1
+            self.bar = tqdm(total=total, initial=initial, unit=unit, file=self.stream, leave=False)
+        return self.bar
+
+
 # -- inputs and outputs ------------------------------------------------------------------------------------------------
 
 
@@ -139,6 +198,31 @@ def read_bytes(path: str) -> bytes:
     if sys.stdin is None or sys.stdin.isatty():
         raise UsageError("stdin is a terminal, expected a file name or piped input")
     return sys.stdin.buffer.read()
+
+
+def read_prefix(
+    path: str, console: Console, max_layer: int | None = None, max_bytes: int | None = None, allow_partial: bool = False
+) -> tuple[bytes, int]:
+    """Reads (bytes, length of the file). From a URL it fetches only the header and the slices of layers up to max_layer
+    within max_bytes; with allow_partial, as many of these bytes as arrive."""
+    from pd4dgs_codec.web import is_url
+
+    if not is_url(path):
+        data = read_bytes(path)
+        return data, len(data)
+    from pd4dgs_codec.web.client import Transfer, fetch
+
+    with contextlib.closing(Transfer(path)) as transfer:
+        try:
+            data = fetch(transfer, max_layer, max_bytes)
+        except DeliveryError as error:
+            if not (allow_partial and transfer.data):
+                raise
+            say(f"pd4dgs-decode: {error}")
+            data = bytes(transfer.data)
+    size = f"fetched {len(transfer.data):,} bytes"
+    console.detail(f"{size} in {transfer.requests} requests, {transfer.cuts} interruptions")
+    return data, len(data) if transfer.total is None else transfer.total
 
 
 def same_file(path: str, other: str) -> bool:

@@ -6,13 +6,11 @@ import argparse
 import io
 import time
 from collections.abc import Iterable
-from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.cli import common, options
-from pd4dgs_codec.cli.common import OK, PARTIAL, STDIO, Console, UsageError, number, shown_name, table
-from pd4dgs_codec.errors import DeliveryError
+from pd4dgs_codec.cli.common import OK, PARTIAL, STDIO, Console, UsageError, number, say, shown_name, table
 
 if TYPE_CHECKING:
     from pd4dgs_codec.scene import Scene
@@ -38,13 +36,7 @@ def parser() -> options.Parser:
     add = p.add_argument
     add("input", nargs="?", default=STDIO, metavar="scene.pd4", help=".pd4 file or URL; - reads stdin (default: -)")
     add("-o", "--output", metavar="FILE", help="FILE.npz or FILE.pt; - writes .npz to stdout (default: check only)")
-    options.add_max_layer(p, "highest layer to decode")
-    add(
-        "--max-bytes",
-        type=options.size,
-        metavar="SIZE",
-        help="decode only the slices within the first SIZE bytes, such as 50k",
-    )
+    options.add_prefix(p, "decode")
     add("--symbols", action="store_true", help="add quantised integers (NAME_q) and steps (NAME_step) to the .npz")
     add("--allow-partial", action="store_true", help="decode the complete slices of a truncated file, with exit code 3")
     p.add_common()
@@ -55,7 +47,7 @@ def _decode(args: argparse.Namespace, console: Console) -> int:
     kind = _output_kind(args)
     if args.output:
         common.check_output(args.output, args.overwrite)
-    data = _input(args, console)
+    data, _ = common.read_prefix(args.input, console, args.max_layer, args.max_bytes, args.allow_partial)
     from pd4dgs_codec.format.decoder import decode_partial
 
     start = time.perf_counter()
@@ -69,33 +61,13 @@ def _decode(args: argparse.Namespace, console: Console) -> int:
     elif kind == ".npz":
         common.write_bytes(args.output, _npz(scene, args.symbols), args.overwrite)
     if not complete:
-        console.message(f"pd4dgs-decode: warning: the input is truncated; decoded layers: {_listed(scene.layers)}")
+        say(f"pd4dgs-decode: warning: the input is truncated; decoded layers: {_listed(scene.layers)}")
     result = _summary(scene, data, complete, seconds, args)
     console.result(result, _text(result), on_stdout=not args.output)
     return OK if complete else PARTIAL
 
 
 main = common.command(parser, _decode)
-
-
-def _input(args: argparse.Namespace, console: Console) -> bytes:
-    """Reads the file; from a URL only the bytes that --max-layer and --max-bytes need."""
-    from pd4dgs_codec.web import is_url
-
-    if not is_url(args.input):
-        return common.read_bytes(args.input)
-    from pd4dgs_codec.web.client import Transfer, fetch
-
-    with closing(Transfer(args.input)) as transfer:
-        try:
-            data = fetch(transfer, args.max_layer, args.max_bytes)
-        except DeliveryError as error:
-            if not (args.allow_partial and transfer.data):
-                raise
-            console.message(f"pd4dgs-decode: {error}")
-            data = bytes(transfer.data)
-    console.detail(f"{len(transfer.data):,} bytes in {transfer.requests} requests, {transfer.cuts} interruptions")
-    return data
 
 
 def _output_kind(args: argparse.Namespace) -> str | None:

@@ -8,8 +8,7 @@ from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.cli import common, options
-from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError, number, shown_name, table
-from pd4dgs_codec.cli.progress import progress_bar
+from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError, number, progress_bar, say, shown_name, table
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.options import CHOICES, DEFAULTS, EncodeOptions
 from pd4dgs_codec.quality import ENCODE_MIN_DB_PER_MEGABYTE
@@ -170,7 +169,7 @@ def _views(args: argparse.Namespace, info: SceneInfo, console: Console) -> Views
     views = Views.of(dataset, args.data, args.views)
     console.detail(f"{args.data}: {len(views.fitting)} training views, {len(views.held_out)} held out")
     if not dataset.test:
-        console.message("no held-out views: gains are measured on training views")
+        say("no held-out views: gains are measured on training views")
     return views
 
 

@@ -4,8 +4,7 @@ import argparse
 from typing import Any
 
 from pd4dgs_codec.cli import options
-from pd4dgs_codec.cli.common import OK, Console, command, named_input, number, read_dataset, table
-from pd4dgs_codec.cli.progress import progress_bar
+from pd4dgs_codec.cli.common import OK, Console, command, named_input, number, progress_bar, read_dataset, say, table
 
 DETAILS = f"""\
 Decodes each level of a .pd4 file from its own prefix and compares its renderings with the held-out views.
@@ -29,16 +28,10 @@ def parser() -> options.Parser:
     p = options.Parser("eval", "FILE SOURCE", "Measure quality, bytes and time of each level on a dataset.", DETAILS)
     p.add_argument("input", metavar="FILE", help=".pd4 file or .pt checkpoint; - reads a .pd4 from stdin")
     p.add_argument("source", metavar="SOURCE", help="dataset to compare with, see below")
-    options.add_max_layer(p, "highest layer to measure")
+    options.add_prefix(p, "measure")
     options.add_reading(p)
     what = "metrics of DyCheck or of 3D Gaussian Splatting, see below (default: dycheck)"
     p.add_argument("--protocol", choices=("dycheck", "3dgs"), default="dycheck", help=what)
-    p.add_argument(
-        "--max-bytes",
-        type=options.size,
-        metavar="SIZE",
-        help="measure only the slices within the first SIZE bytes, such as 50k",
-    )
     options.add_background(p, "the file's")
     p.add_argument("--perceptual", action="store_true", help="also measure perceptual distances (slow)")
     p.add_common()
@@ -55,11 +48,11 @@ def _evaluate(args: argparse.Namespace, console: Console) -> int:
     dataset = read_dataset(args.source, args, levels[-1].model.info)
     console.detail(f"{args.source}: {len(dataset.train)} training views, {len(dataset.test)} held out")
     if not dataset.test:
-        console.message("no held-out views: measuring on the training views")
+        say("no held-out views: measuring on the training views")
     distances = (*(PERCEPTUAL if args.perceptual else ()), *([VGG] if args.protocol == "3dgs" else []))
     perceptual = load_perceptual(distances) if distances else None
     for name, why in (perceptual.absent if perceptual else {}).items():
-        console.message(f"no {name}: {why}")
+        say(f"no {name}: {why}")
     with progress_bar(None, "pictures", "evaluating") as step:
         result = evaluate(levels, dataset, protocol=args.protocol, perceptual=perceptual, step=step)
     result = {"input": args.input, "downscale": args.downscale, "holdout": args.holdout, **result}

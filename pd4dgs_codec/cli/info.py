@@ -1,11 +1,10 @@
 """`pd4dgs-info`: what a `.pd4` file holds."""
 
 import argparse
-from contextlib import closing
 from typing import Any
 
 from pd4dgs_codec.cli import options
-from pd4dgs_codec.cli.common import OK, Console, command, number, read_bytes, shown_name, table
+from pd4dgs_codec.cli.common import OK, Console, command, number, read_prefix, shown_name, table
 from pd4dgs_codec.errors import DataError
 
 DETAILS = """\
@@ -39,7 +38,8 @@ def parser() -> options.Parser:
 
 
 def _info(args: argparse.Namespace, console: Console) -> int:
-    data, total = _input(args, console)
+    whole = args.check or args.bytes or args.hashes
+    data, total = read_prefix(args.input, console, max_bytes=None if whole else 0)
     from pd4dgs_codec.format.decoder import read_layers
     from pd4dgs_codec.format.info import hashes, info
 
@@ -62,21 +62,6 @@ def _info(args: argparse.Namespace, console: Console) -> int:
 
 
 main = command(parser, _info)
-
-
-def _input(args: argparse.Namespace, console: Console) -> tuple[bytes, int]:
-    """Reads (bytes, length of the file). From a URL it fetches only the header if that suffices."""
-    from pd4dgs_codec.web import is_url
-
-    if not is_url(args.input):
-        data = read_bytes(args.input)
-        return data, len(data)
-    from pd4dgs_codec.web.client import Transfer, fetch
-
-    with closing(Transfer(args.input)) as transfer:
-        data = fetch(transfer, max_bytes=None if args.check or args.bytes or args.hashes else 0)
-    console.detail(f"fetched {len(transfer.data):,} bytes in {transfer.requests} requests")
-    return data, len(data) if transfer.total is None else transfer.total
 
 
 def _parts(result: dict[str, Any]) -> list[dict[str, Any]]:

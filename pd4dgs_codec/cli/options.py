@@ -108,9 +108,11 @@ def add_background(options: argparse._ActionsContainer, default: str) -> None:
     options.add_argument("--background", type=background, metavar="COLOR", help=what)
 
 
-def add_max_layer(options: argparse._ActionsContainer, what: str) -> None:
-    """Adds --max-layer with the help text `what`."""
-    options.add_argument("--max-layer", type=int, choices=(0, 1, 2), help=what)
+def add_prefix(options: argparse._ActionsContainer, verb: str) -> None:
+    """Adds --max-layer and --max-bytes, which limit what the command decodes, renders, ...: the `verb`."""
+    options.add_argument("--max-layer", type=int, choices=(0, 1, 2), help=f"highest layer to {verb}")
+    what = f"{verb} only the slices within the first SIZE bytes, such as 50k"
+    options.add_argument("--max-bytes", type=size, metavar="SIZE", help=what)
 
 
 class _Version(argparse.Action):

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.cli import options
-from pd4dgs_codec.cli.common import OK, STDIO, Console, command, number, read_bytes, same_file, table
-from pd4dgs_codec.cli.progress import progress_bar
+from pd4dgs_codec.cli.common import OK, STDIO, Console, command, number, progress_bar, read_bytes, same_file, say, table
 from pd4dgs_codec.errors import DeliveryError, RenderError
 from pd4dgs_codec.io import temporary_folder, whole_files
 
@@ -77,7 +77,7 @@ def _package(args: argparse.Namespace, console: Console) -> int:
             return _render(scene, args.fps)
         except (RenderError, ModuleNotFoundError) as error:
             missing.append(_reason(error))
-            console.message(f"pd4dgs-package: no 2D video: {missing[0]}")
+            say(f"pd4dgs-package: no 2D video: {missing[0]}")
             return None
 
     files = package(data, None if args.no_video else render, immutable=args.immutable)
@@ -119,7 +119,10 @@ def _reason(error: RenderError | ModuleNotFoundError) -> str:
 
 
 def _render(scene: Scene, fps: float) -> Video:
+    from PIL import Image
+
     from pd4dgs_codec.quality.frames import own_frames
+    from pd4dgs_codec.quality.image import to_uint8
     from pd4dgs_codec.quality.levels import level_of
     from pd4dgs_codec.quality.movie import check_mp4, write_mp4
     from pd4dgs_codec.web.manifests import Video
@@ -131,32 +134,22 @@ def _render(scene: Scene, fps: float) -> Video:
     count = max(2, round((high - low) * fps)) if high > low else STILL_FRAMES
     if count > MAX_FRAMES:
         raise RenderError(f"found {count:,} frames, expected at most {MAX_FRAMES:,}; lower --fps")
-    frames = own_frames(scene.info, count)
+    frames, level, poster = own_frames(scene.info, count), level_of(scene), BytesIO()
     camera = frames[0].camera
     with temporary_folder() as folder, progress_bar(len(frames), "frames", "video") as step:
+
+        def pictures() -> Iterator[np.ndarray]:
+            for i, frame in enumerate(frames):
+                picture = to_uint8(level.picture(frame.camera, frame.time))
+                if i == len(frames) // 2:
+                    Image.fromarray(picture).save(poster, "jpeg", quality=85)
+                yield picture
+                step()
+
         path = folder / "video.mp4"
-        write_mp4(_pictures(frames, level_of(scene), step), path, fps, fragment=max(1, round(FRAGMENT_SECONDS * fps)))
+        write_mp4(pictures(), path, fps, fragment=max(1, round(FRAGMENT_SECONDS * fps)))
         size = camera.width // 2 * 2, camera.height // 2 * 2
-        poster = _poster(next(_pictures(frames[len(frames) // 2 :], level_of(scene))))
-        return Video(path.read_bytes(), *size, fps, poster)
-
-
-def _poster(picture: np.ndarray) -> bytes:
-    from io import BytesIO
-
-    from PIL import Image
-
-    content = BytesIO()
-    Image.fromarray(picture).save(content, "jpeg", quality=85)
-    return content.getvalue()
-
-
-def _pictures(frames: list[Any], level: Any, step: Callable[[], None] = lambda: None) -> Iterator[np.ndarray]:
-    from pd4dgs_codec.quality.image import to_uint8
-
-    for frame in frames:
-        yield to_uint8(level.picture(frame.camera, frame.time))
-        step()
+        return Video(path.read_bytes(), *size, fps, poster.getvalue())
 
 
 def _text(result: dict[str, Any]) -> str:

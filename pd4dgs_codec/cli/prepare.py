@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from pd4dgs_codec.cli import options
-from pd4dgs_codec.cli.common import OK, Console, command
-from pd4dgs_codec.cli.progress import progress_bar
+from pd4dgs_codec.cli.common import OK, Console, command, progress_bar, say
 from pd4dgs_codec.errors import DataError
 
 CAMERAS = ("SIMPLE_RADIAL", "SIMPLE_PINHOLE", "PINHOLE", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
@@ -54,7 +53,7 @@ def _prepare(args: argparse.Namespace, console: Console) -> int:
     check_usage(args)
     chosen = Options(args.frames, args.fps, args.downscale, args.camera, args.threads or -1)
     try:
-        report = prepare(Path(args.input), Path(args.output), chosen, progress_bar, args.overwrite, console.message)
+        report = prepare(Path(args.input), Path(args.output), chosen, progress_bar, args.overwrite, say)
     except KeyboardInterrupt:
         raise DataError(f"interrupted; the same command resumes from {args.output}.partial") from None
     console.result({"output": args.output, **report}, _text(args.output, report))

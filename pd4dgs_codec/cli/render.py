@@ -9,9 +9,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.cli import options
-from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError, check_output, command, named_input, read_dataset
-from pd4dgs_codec.cli.progress import progress_bar
+from pd4dgs_codec.cli import common, options
+from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError, command, progress_bar
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.io import whole_file, whole_files
 from pd4dgs_codec.threads import load_numba
@@ -41,9 +40,7 @@ def parser() -> options.Parser:
     p.add_argument("input", metavar="FILE", help=".pd4 file or .pt checkpoint; - reads a .pd4 from stdin")
     what = "images such as out/%%04d.png, or a .gif or .mp4 video"
     p.add_argument("-o", "--output", required=True, metavar="OUT", help=what)
-    options.add_max_layer(p, "highest layer to render")
-    what = "render only the slices within the first SIZE bytes, such as 50k"
-    p.add_argument("--max-bytes", type=options.size, metavar="SIZE", help=what)
+    options.add_prefix(p, "render")
     options.add_background(p, "the file's")
     p.add_argument("--data", metavar="SOURCE", help="take cameras, times and ground truth from this dataset")
     p.add_argument("--split", choices=("test", "train"), help="views of the dataset (default: test)")
@@ -63,7 +60,7 @@ def parser() -> options.Parser:
 def _render(args: argparse.Namespace, console: Console) -> int:
     kind = _check_usage(args)
     if kind in VIDEOS:
-        check_output(args.output, args.overwrite)
+        common.check_output(args.output, args.overwrite)
     load_numba()
     from pd4dgs_codec.quality.levels import load_levels
 
@@ -72,7 +69,7 @@ def _render(args: argparse.Namespace, console: Console) -> int:
 
         check_mp4()
     levels = load_levels(
-        named_input(args.input),
+        common.named_input(args.input),
         args.max_layer,
         max_bytes=args.max_bytes,
         last_only=not args.side_by_side,
@@ -123,7 +120,7 @@ def _frames(args: argparse.Namespace, level: Level) -> list[Frame]:
 
     if args.data is None:
         return own_frames(level.model.info, args.frames or 60, args.orbit, args.downscale)
-    dataset = read_dataset(args.data, args, level.model.info)
+    dataset = common.read_dataset(args.data, args, level.model.info)
     views = dataset.test if args.split == "test" else dataset.train
     if not views:
         raise DataError(f"{args.data}: has no held-out views; expected --split train or another --holdout")

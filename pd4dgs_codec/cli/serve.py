@@ -5,7 +5,7 @@ import signal
 import threading
 
 from pd4dgs_codec.cli import options
-from pd4dgs_codec.cli.common import OK, Console, command
+from pd4dgs_codec.cli.common import OK, Console, command, say
 
 DETAILS = """\
 Answers GET and HEAD with ranges, If-Range, ETag and CORS. Files outside DIR and names that begin with a dot are not
@@ -49,7 +49,7 @@ def add_link(p: options.Parser) -> None:
 def _serve(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.web.server import Link, Server
 
-    log, latency = console.message if console.verbose else None, args.latency or 0.0
+    log, latency = say if console.verbose else None, args.latency or 0.0
     with Server(args.input, args.host, args.port, link=Link(args.rate), latency=latency, log=log) as server:
         stop = set_by_signals()
         with server.running():

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.cli import common, options
-from pd4dgs_codec.cli.common import OK, Console, UsageError, check_output, command, number, table, write_bytes
-from pd4dgs_codec.cli.progress import TrainingProgress
+from pd4dgs_codec.cli.common import OK, Console, TrainingProgress, UsageError, check_output, command, number, say, table
 from pd4dgs_codec.errors import RenderError, TrainError
 from pd4dgs_codec.io import remove_leftovers
 from pd4dgs_codec.train.config import ABLATIONS, FIXED, OPTIONS, TrainConfig, at_quality
@@ -107,7 +106,7 @@ def _train(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.train.loop import Trainer
 
     checkpoint.target(args.output)  # refuses a device now, not after the first minute
-    device = _device(args.device, console)
+    device = _device(args.device)
     config = _stored_config(args) if args.resume else _fresh_config(args)
     workers.start(device, config.views_per_step)
     first = workers.rank() == 0
@@ -121,7 +120,7 @@ def _train(args: argparse.Namespace, console: Console) -> int:
         log = _prepare_log(args, trainer.iteration)
         remove_leftovers(args.output)
         _announce(trainer, console)
-        progress = _progress(args, trainer, console)
+        progress = _progress(args, trainer)
     try:
         trainer.run(Path(args.output), log=log, progress=progress)
     except KeyboardInterrupt:
@@ -232,7 +231,7 @@ def _cut_log(path: str, iteration: int) -> None:
         lines = stream.read().splitlines(keepends=True)
     kept = b"".join(line for line in lines if line.endswith(b"\n") and not _is_step_from(line, iteration))
     if len(kept) < sum(map(len, lines)):
-        write_bytes(path, kept, overwrite=True)
+        common.write_bytes(path, kept, overwrite=True)
 
 
 def _is_step_from(line: bytes, iteration: int) -> bool:
@@ -243,13 +242,13 @@ def _is_step_from(line: bytes, iteration: int) -> bool:
     return isinstance(record, dict) and isinstance(n := record.get("iteration"), int) and n >= iteration
 
 
-def _progress(args: argparse.Namespace, trainer: Trainer, console: Console) -> TrainingProgress:
+def _progress(args: argparse.Namespace, trainer: Trainer) -> TrainingProgress:
     if args.view is None:
         return TrainingProgress()
     from pd4dgs_codec.cli.watch import WatchedProgress
 
     progress = WatchedProgress(trainer, args.view)
-    console.message(f"watch the training at {progress.url}")
+    say(f"watch the training at {progress.url}")
     return progress
 
 
@@ -263,15 +262,13 @@ def _announce(trainer: Trainer, console: Console) -> None:
     start = f", from step {trainer.iteration}" if trainer.iteration else ""
     several = f", {workers.count()} workers" if workers.count() > 1 else ""
     device = trainer.learner.device
-    console.message(
-        f"training {config.preset} on {len(dataset.train)} views ({held_out}), {device}{several}{limit}{start}"
-    )
+    say(f"training {config.preset} on {len(dataset.train)} views ({held_out}), {device}{several}{limit}{start}")
     for remark in dataset.remarks():
-        console.message(f"note: {remark}")
+        say(f"note: {remark}")
     console.detail(f"{config}")
 
 
-def _device(name: str, console: Console) -> str:
+def _device(name: str) -> str:
     """Returns the device. auto is CUDA if PyTorch finds a GPU and gsplat can render on it, else the CPU."""
     import torch
 
@@ -286,7 +283,7 @@ def _device(name: str, console: Console) -> str:
     except RenderError as error:
         if name == "cuda":
             raise TrainError(f"--device cuda: {error}") from None
-        console.message(f"training on the CPU: {error}")
+        say(f"training on the CPU: {error}")
         return "cpu"
     return "cuda"
 

@@ -5,17 +5,8 @@ import contextlib
 from pathlib import Path
 from urllib.parse import quote
 
-from pd4dgs_codec.cli import options
-from pd4dgs_codec.cli.common import (
-    OK,
-    Console,
-    UsageError,
-    check_other_file,
-    checkpoint_scene,
-    command,
-    is_pd4,
-    read_bytes,
-)
+from pd4dgs_codec.cli import common, options
+from pd4dgs_codec.cli.common import OK, Console, UsageError, command, say
 from pd4dgs_codec.cli.serve import add_link, set_by_signals
 from pd4dgs_codec.io import check_output, temporary_folder, write_bytes
 
@@ -33,7 +24,6 @@ examples:
   pd4dgs-view scene.pd4 --rate 2M --latency 50ms"""
 
 SCENE = "scene.pd4"
-PACKING_EFFORT = 1
 
 
 def parser() -> options.Parser:
@@ -61,11 +51,11 @@ def _view(args: argparse.Namespace, console: Console) -> int:
 
     options.conditional(args, not args.output, "has no effect with -o", port=0, rate=None, latency=0.0)
     if args.output:
-        check_other_file(args.input, args.output)
+        common.check_other_file(args.input, args.output)
         if Path(args.output).suffix.lower() not in (".html", ".htm"):
             raise UsageError(f"found -o {args.output}, expected a name that ends in .html")
         check_output(args.output, args.overwrite)
-        content = args.input if is_url(args.input) else _packed(args.input, console)
+        content = args.input if is_url(args.input) else _packed(args.input)
         write_bytes(args.output, page(content).encode(), args.overwrite)
         console.result({"output": args.output, "input": args.input}, args.output)
         return OK
@@ -73,9 +63,9 @@ def _view(args: argparse.Namespace, console: Console) -> int:
         source = args.input
         (folder / PAGE).write_bytes(page().encode())
         if not is_url(source):
-            (folder / SCENE).write_bytes(_packed(source, console))
+            (folder / SCENE).write_bytes(_packed(source))
             source = SCENE
-        log = console.message if console.verbose else None
+        log = say if console.verbose else None
         link = Link(args.rate)
         with Server(folder, port=args.port, private=True, link=link, latency=args.latency, log=log) as server:
             stop = set_by_signals()
@@ -91,19 +81,20 @@ def _view(args: argparse.Namespace, console: Console) -> int:
 main = command(parser, _view)
 
 
-def _packed(source: str, console: Console) -> bytes:
+def _packed(source: str) -> bytes:
     """Reads a complete, valid `.pd4`, or encodes a checkpoint."""
     from pd4dgs_codec.format.decoder import decode
 
-    data = read_bytes(source)
-    if is_pd4(data):
+    data = common.read_bytes(source)
+    if common.is_pd4(data):
         decode(data)  # report a damaged file here rather than in the page
         return data
     from pd4dgs_codec.format.encoder import encode
+    from pd4dgs_codec.web.page import EFFORT
 
-    scene = checkpoint_scene(source, data)
-    console.message(f"{source}: encoding the checkpoint")
-    return encode(scene, effort=PACKING_EFFORT, omit="nothing")
+    scene = common.checkpoint_scene(source, data)
+    say(f"{source}: encoding the checkpoint")
+    return encode(scene, effort=EFFORT, omit="nothing")
 
 
 def _open(url: str) -> None:

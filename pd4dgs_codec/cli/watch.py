@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pd4dgs_codec.cli.progress import TrainingProgress
+from pd4dgs_codec.cli.common import TrainingProgress
 from pd4dgs_codec.data.view import rotation_matrix, world_to_camera
 from pd4dgs_codec.errors import RenderError, TrainError, required
 from pd4dgs_codec.scene import Camera

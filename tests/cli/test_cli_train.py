@@ -7,14 +7,12 @@ import os
 import signal
 import subprocess
 import sys
-from argparse import Namespace
 
 import pytest
 from runs import assert_same_weights, read_log
 from tiny import TINY
 
 from pd4dgs_codec import decode, encode
-from pd4dgs_codec.cli.common import Console
 from pd4dgs_codec.cli.train import _device
 from pd4dgs_codec.errors import TrainError
 from pd4dgs_codec.model import checkpoint
@@ -170,14 +168,13 @@ def test_cuda_that_is_absent_is_refused(train, tmp_path, monkeypatch):
 
 
 def test_a_gpu_that_gsplat_cannot_use_is_left_alone(monkeypatch, capsys):
-    console = Console(Namespace(json=False, verbose=False))
     monkeypatch.setattr("torch.cuda.is_available", lambda: True)
     monkeypatch.setitem(sys.modules, "gsplat", None)
-    assert _device("auto", console) == "cpu" and "training on the CPU: gsplat" in capsys.readouterr().err
+    assert _device("auto") == "cpu" and "training on the CPU: gsplat" in capsys.readouterr().err
     with pytest.raises(TrainError, match="--device cuda: gsplat"):
-        _device("cuda", console)
+        _device("cuda")
     monkeypatch.setattr("pd4dgs_codec.model.picture.check_gsplat", lambda: None)
-    assert _device("auto", console) == _device("cuda", console) == "cuda"
+    assert _device("auto") == _device("cuda") == "cuda"
 
 
 def test_a_run_that_learnt_nothing_fails(train, tmp_path, monkeypatch):
