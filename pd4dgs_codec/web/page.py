@@ -44,11 +44,10 @@ def bundle(root: Path, entry: str) -> str:
         """Adds a module after its imports and returns its variable."""
         if path not in modules:
             modules[path] = _module(path, lambda name: add((path.parent / name).resolve()))
-            modules[path] = modules.pop(path)  # behind its imports
         return "m_" + re.sub(r"\W", "_", path.relative_to(root.resolve()).as_posix())
 
     add((root / entry).resolve())
-    return "".join(f"const {add(path)}=(()=>{{\n{body}}})();\n" for path, body in list(modules.items()))
+    return "".join(f"const {add(path)}=(()=>{{\n{body}}})();\n" for path, body in modules.items())
 
 
 def _module(path: Path, imported: Callable[[str], str]) -> str:

@@ -23,7 +23,7 @@ from socketserver import ThreadingTCPServer
 from typing import BinaryIO
 from urllib.parse import quote, unquote, urlsplit
 
-from pd4dgs_codec.errors import DeliveryError
+from pd4dgs_codec.errors import DeliveryError, printable
 from pd4dgs_codec.web import PAGE
 from pd4dgs_codec.web.headers import Unsatisfiable, cache_control, lists_etag, media_type, requested_range
 
@@ -207,10 +207,6 @@ def _etag(file: BinaryIO) -> str:
     return f'"{state.st_ino:x}-{state.st_size:x}-{state.st_mtime_ns:x}"'
 
 
-#: Control characters of a request line would act on the terminal that shows it.
-_PRINTABLE = {code: "?" for code in [*range(32), *range(127, 160)]}
-
-
 class _Handler(BaseHTTPRequestHandler):
     server: Server
     server_version, sys_version = "pd4dgs", ""
@@ -338,6 +334,6 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
 
     def log_message(self, format: str, *args: object) -> None:
-        """One line for each request."""
+        """One line for each request, in which control characters cannot act on the terminal."""
         if self.server.log:
-            self.server.log(f"{self.client_address[0]} {format % args}".translate(_PRINTABLE))
+            self.server.log(printable(f"{self.client_address[0]} {format % args}", ""))
