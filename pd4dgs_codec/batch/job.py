@@ -226,29 +226,24 @@ def run_job(job: Job, command: Command) -> Outcome:
     cpu = time.process_time()
     with interruptible() as outermost:
         try:
-            outcome = _outcome(job, command)
+            outcome = _done_once(job, command)
         except KeyboardInterrupt:
             if not outermost:
                 raise
             ignore_more()
             remove_temporaries()
             outcome = Outcome(FAILED, "interrupted")
+        except CommandFailed as error:
+            outcome = error.outcome
+        except Pd4Error as error:
+            outcome = Outcome(FAILED, str(error), final=True)
+        except OSError as error:
+            message = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+            outcome = Outcome(FAILED, message, final=isinstance(error, store.FINAL))
+        except Exception as error:  # a fault in the package or a library must not end the batch
+            outcome = Outcome(FAILED, f"{type(error).__name__}: {error}")
     peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return replace(outcome, message=one_line(outcome.message), cpu=time.process_time() - cpu, peak=peak)
-
-
-def _outcome(job: Job, command: Command) -> Outcome:
-    try:
-        return _done_once(job, command)
-    except CommandFailed as error:
-        return error.outcome
-    except Pd4Error as error:
-        return Outcome(FAILED, str(error), final=True)
-    except OSError as error:
-        message = f"{error.filename}: {error.strerror}" if error.filename else str(error)
-        return Outcome(FAILED, message, final=isinstance(error, store.FINAL))
-    except Exception as error:  # a fault in the package or a library must not end the batch
-        return Outcome(FAILED, f"{type(error).__name__}: {error}")
 
 
 def _done_once(job: Job, command: Command) -> Outcome:
@@ -276,11 +271,13 @@ def _done_once(job: Job, command: Command) -> Outcome:
 
 def _fetched(place: str, folder: Path) -> str:
     """Fetches a source and returns the command's argument. The path of a copy is relative to the folder, so that no
-    temporary name gets into outputs."""
+    temporary name gets into outputs; one that begins with a dash would be an option, or stdin."""
     if place.startswith(SYNTHETIC):
         return place
     path = store.fetch(place, folder)
-    return str(path.relative_to(folder) if path.is_relative_to(folder) else path)
+    if not path.is_relative_to(folder):
+        return str(path)
+    return ("./" if path.name.startswith("-") else "") + path.name
 
 
 def _run(

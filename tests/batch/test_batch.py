@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 import os
+from pathlib import Path
 
 import pytest
 
 from pd4dgs_codec import __version__
 from pd4dgs_codec.batch import store
-from pd4dgs_codec.batch.job import OPS, Manifest, arguments, scan
+from pd4dgs_codec.batch.job import OPS, Job, Line, Manifest, arguments, run_job, scan
 from pd4dgs_codec.errors import DataError
 
 
@@ -245,6 +246,20 @@ def test_uris_of_fsspec_are_sources_and_outputs(library):
     assert record["source"] == "memory://films/a.pt"
     assert library.run(root="memory://made/here")["already"] == 1
     assert library.made() == ["text"]
+
+
+def test_a_copy_whose_name_begins_with_a_dash_is_no_option(tmp_path):
+    import fsspec
+
+    fsspec.filesystem("memory").pipe_file("/films/-a.pt", b"text")
+    asked = []
+
+    def command(verb, argv):
+        asked.append((argv[0], Path(argv[0]).read_bytes()))
+        return 1, "", "enough"
+
+    run_job(Job(Line(1, "memory://films/-a.pt", "a.pd4"), "encode", str(tmp_path), 1), command)
+    assert asked == [("./-a.pt", b"text")]
 
 
 @pytest.mark.parametrize("schemes, name", [(("s3", "s3a"), "ContentType"), (("gs", "gcs"), "content_type")])
