@@ -58,13 +58,16 @@ def parser() -> options.Parser:
     add("input", metavar="model.pt", help="checkpoint of pd4dgs-train, or a .pd4 file to re-encode; - reads stdin")
     add("-o", "--output", required=True, metavar="FILE.pd4", help="file to write; - writes stdout")
     for name, what in HELP.items():
-        default, allowed = vars(DEFAULTS)[name], CHOICES[name]
-        kind = int if all(isinstance(value, int) for value in allowed) else str
-        choices = [kind(value) for value in allowed]
-        add(f"--{name}", type=kind, choices=choices, default=default, help=f"{what} (default: {default})")
+        add(
+            f"--{name}",
+            type=_value,
+            choices=CHOICES[name],
+            default=vars(DEFAULTS)[name],
+            help=f"{what} (default: %(default)s)",
+        )
     what = "factor on all quantisation steps; above 1, smaller and coarser files (default: %(default)g)"
     add("--step-scale", type=options.positive_float, default=DEFAULTS.step_scale, metavar="X", help=what)
-    add("--no-verify", action="store_true", help="do not decode the result to verify it")
+    add("--no-verify", dest="verify", action="store_false", help="do not decode the result to verify it")
     what = "cut layers into slices: the first of SIZE bytes, later ones of two thirds at most (default: no slices)"
     add("--slices", type=options.size, default=DEFAULTS.slices, metavar="SIZE", help=what)
     what = "byte limits of layers (layer 0 with the header), met by coarser steps and fewer anchors"
@@ -85,11 +88,15 @@ def parser() -> options.Parser:
     return p
 
 
+def _value(text: str) -> str | int:
+    return int(text) if text.isdecimal() else text
+
+
 def check_usage(args: argparse.Namespace) -> None:
     """Sets conditional defaults. Raises UsageError for options that do not fit together."""
     if args.output == STDIO and args.json:
         raise UsageError("-o - and --json both write to stdout, expected -o FILE")
-    if args.layers != "auto" and (gone := [layer for layer in args.target_size if layer > int(args.layers)]):
+    if args.layers != "auto" and (gone := [layer for layer in args.target_size if layer > args.layers]):
         raise UsageError(f"--target-size L{gone[0]} has no effect with --layers {args.layers}")
     if args.mode == "lzma" and args.priors != DEFAULTS.priors:
         raise UsageError("--priors has no effect with --mode lzma")
@@ -101,7 +108,7 @@ def check_usage(args: argparse.Namespace) -> None:
     needs = "needs --data SOURCE and --layers auto"
     options.conditional(args, args.data and gains, needs, min_gain=ENCODE_MIN_DB_PER_MEGABYTE)
     try:
-        args.options = _options(args)
+        args.options = EncodeOptions(**{field.name: getattr(args, field.name) for field in fields(EncodeOptions)})
     except EncodeError as error:
         raise UsageError(str(error)) from None
 
@@ -130,12 +137,6 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
 
 
 main = common.command(parser, _encode)
-
-
-def _options(args: argparse.Namespace) -> EncodeOptions:
-    named = {f.name: getattr(args, f.name) for f in fields(EncodeOptions) if hasattr(args, f.name)}
-    layers = args.layers if args.layers == "auto" else int(args.layers)
-    return EncodeOptions(**named | {"layers": layers, "verify": not args.no_verify})
 
 
 def _load(args: argparse.Namespace) -> tuple[Scene, Metadata | None]:
