@@ -75,11 +75,8 @@ class DecodeError(Pd4Error):
         self.chunk = chunk
 
     def __str__(self) -> str:
-        where = []
-        if self.chunk is not None:
-            where.append(f"chunk {self.chunk}")
-        if self.offset is not None:
-            where.append(f"offset {self.offset}")
+        places = {"chunk": self.chunk, "offset": self.offset}
+        where = [f"{name} {number}" for name, number in places.items() if number is not None]
         return self.message + (f" ({', '.join(where)})" if where else "")
 
 

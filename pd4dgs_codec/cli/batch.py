@@ -18,7 +18,6 @@ from pd4dgs_codec.cli.common import FAILED, OK, STDIO, Console, UsageError, prog
 from pd4dgs_codec.errors import DataError, printable
 from pd4dgs_codec.threads import available
 
-VERBS = tuple(OPS)
 ENGINES = ("local", "ray", "slurm")
 
 DETAILS = """\
@@ -54,7 +53,7 @@ def parser() -> options.Parser:
     add = p.add_argument
     add("input", metavar="MANIFEST", help="file of JSON lines, see below")
     add("-o", "--output", required=True, type=options.named, metavar="URI", help="output folder or URI")
-    add("--op", required=True, choices=VERBS, help="command to run on each scene (pd4dgs-OP)")
+    add("--op", required=True, choices=OPS, help="command to run on each scene (pd4dgs-OP)")
     add("--on", choices=ENGINES, default="local", help="where to run the command (default: local)")
     what = "scenes at a time (default: one per core; ray: as many as fit; 0: one after another in this process)"
     add("--workers", type=options.count, metavar="N", help=what)
@@ -65,12 +64,8 @@ def parser() -> options.Parser:
     add("--retries", type=options.count, default=2, metavar="N", help=what)
     what = "time limit of each try, such as 90s (default: none)"
     add("--timeout", type=options.duration, metavar="T", help=what)
-    add(
-        "--logs",
-        default="batch-logs",
-        metavar="DIR",
-        help="folder for the logs of failed scenes (default: %(default)s)",
-    )
+    what = "folder for the logs of failed scenes (default: %(default)s)"
+    add("--logs", default="batch-logs", metavar="DIR", help=what)
     what = "address of the Ray cluster (default: RAY_ADDRESS, else a new local cluster)"
     add("--address", metavar="A", help=what)
     what = "parameter of submitit, such as slurm_partition=gpu; cluster=local runs on this machine"
@@ -82,7 +77,7 @@ def parser() -> options.Parser:
 def scan_parser() -> options.Parser:
     p = options.Parser("batch scan", "FOLDER", "Write a manifest of the sources in a folder.", SCAN_DETAILS)
     p.add_argument("input", metavar="FOLDER", help="folder or URI of the sources")
-    p.add_argument("--op", choices=VERBS, help="command of the manifest (default: chosen by the sources found)")
+    p.add_argument("--op", choices=OPS, help="command of the manifest (default: chosen by the sources found)")
     p.add_argument("-o", "--output", default=STDIO, metavar="FILE", help="manifest to write (default: stdout)")
     p.add_common()
     return p

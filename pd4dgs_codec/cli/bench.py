@@ -186,18 +186,10 @@ def _train_options(p: options.Parser) -> None:
     presets, add = ("tiny", "small", "paper"), p.add_argument
     add("source", nargs="?", metavar="SOURCE", help="dataset to train on, see below")
     add("--presets", nargs="+", choices=presets, metavar="PRESET", help="model sizes (default: tiny small)")
-    add(
-        "--seconds",
-        type=options.positive_float,
-        metavar="S",
-        help="training time of each preset in seconds (default: 120)",
-    )
-    add(
-        "--iterations",
-        type=options.positive_int,
-        metavar="N",
-        help="training steps of each preset, instead of --seconds",
-    )
+    what = "training time of each preset in seconds (default: 120)"
+    add("--seconds", type=options.positive_float, metavar="S", help=what)
+    what = "training steps of each preset, instead of --seconds"
+    add("--iterations", type=options.positive_int, metavar="N", help=what)
     options.add_reading(p, unset=options.READING)
     add("--seed", type=options.seed, metavar="N", help="random seed (default: 0)")
     add("--from", dest="runs", nargs="+", metavar="FILE", help="report the runs of these checkpoints")

@@ -59,7 +59,13 @@ def _decode(args: argparse.Namespace, console: Console) -> int:
     if kind == ".pt":
         common.write_checkpoint(args.output, scene, args.overwrite)
     elif kind == ".npz":
-        common.write_bytes(args.output, _npz(scene, args.symbols), args.overwrite)
+        import numpy as np
+
+        from pd4dgs_codec.format.info import to_npz_dict
+
+        stream = io.BytesIO()
+        np.savez(stream, **to_npz_dict(scene, args.symbols))  # type: ignore[arg-type]
+        common.write_bytes(args.output, stream.getvalue(), args.overwrite)
     if not complete:
         say(f"pd4dgs-decode: warning: the input is truncated; decoded layers: {_listed(scene.layers)}")
     result = _summary(scene, data, complete, seconds, args)
@@ -80,16 +86,6 @@ def _output_kind(args: argparse.Namespace) -> str | None:
     if args.symbols and kind != ".npz":
         raise UsageError("--symbols needs -o FILE.npz")
     return kind
-
-
-def _npz(scene: Scene, symbols: bool) -> bytes:
-    import numpy as np
-
-    from pd4dgs_codec.format.info import to_npz_dict
-
-    stream = io.BytesIO()
-    np.savez(stream, **to_npz_dict(scene, symbols))  # type: ignore[arg-type]
-    return stream.getvalue()
 
 
 def _summary(scene: Scene, data: bytes, complete: bool, seconds: float, args: argparse.Namespace) -> dict[str, Any]:

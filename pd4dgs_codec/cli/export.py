@@ -52,9 +52,8 @@ FPS, STEPS, MAX_FRAMES = 30.0, 300, 100_000
 def parser() -> options.Parser:
     p = options.Parser("export", "FILE -o OUT --to KIND", "Export a scene as Gaussians for other viewers.", DETAILS)
     p.add_argument("input", metavar="FILE", help=".pd4 file; - reads stdin")
-    p.add_argument(
-        "-o", "--output", required=True, type=options.named, metavar="OUT", help="output file; a folder for ply-seq"
-    )
+    what = "output file; a folder for ply-seq"
+    p.add_argument("-o", "--output", required=True, type=options.named, metavar="OUT", help=what)
     p.add_argument("--to", required=True, choices=KINDS, help="file format, see below")
     what = "time of ply, spz and glb, as 0..1 of the file's time range (default: 0)"
     p.add_argument("--time", type=options.share, metavar="T", help=what)

@@ -28,9 +28,8 @@ def parser() -> options.Parser:
     p.add_argument("input", metavar="FILE", help=".pd4 file or URL; - reads stdin")
     p.add_argument("--check", action="store_true", help="decode the whole file and check every checksum and rule")
     p.add_argument("--bytes", action="store_true", help="show the bytes of each section and layer")
-    p.add_argument(
-        "--hashes", action="store_true", help="show SHA-256 of the integers and float32 tensors of each layer"
-    )
+    what = "show SHA-256 of the integers and float32 tensors of each layer"
+    p.add_argument("--hashes", action="store_true", help=what)
     what = "link rates in bits per second for the time to the first frame (default: 2M,10M,50M)"
     p.add_argument("--at", type=options.rates, default="2M,10M,50M", metavar="RATES", help=what)
     p.add_common()

@@ -46,14 +46,14 @@ FRAGMENT_SECONDS = 2
 def parser() -> options.Parser:
     summary = "Make a folder for web servers, with a player page, DASH and HLS."
     p = options.Parser("package", "scene.pd4 -o DIR", summary, DETAILS)
-    p.add_argument("input", metavar="scene.pd4", help=".pd4 file (- reads stdin), or a folder of packages")
-    p.add_argument(
-        "-o", "--output", required=True, type=options.named, metavar="DIR", help="output folder, created if missing"
-    )
-    p.add_argument("--immutable", action="store_true", help="put checksums into file names, for long-lived caches")
-    p.add_argument("--no-video", action="store_true", help="make no 2D video")
+    add = p.add_argument
+    add("input", metavar="scene.pd4", help=".pd4 file (- reads stdin), or a folder of packages")
+    what = "output folder, created if missing"
+    add("-o", "--output", required=True, type=options.named, metavar="DIR", help=what)
+    add("--immutable", action="store_true", help="put checksums into file names, for long-lived caches")
+    add("--no-video", action="store_true", help="make no 2D video")
     what = "frame rate of the 2D video (default: 20)"
-    p.add_argument("--fps", type=options.fps, metavar="F", help=what)
+    add("--fps", type=options.fps, metavar="F", help=what)
     p.add_common()
     return p
 
@@ -75,10 +75,14 @@ def _package(args: argparse.Namespace, console: Console) -> int:
     def render(scene: Scene) -> Video | None:
         try:
             return _render(scene, args.fps)
-        except (RenderError, ModuleNotFoundError) as error:
-            missing.append(_reason(error))
-            say(f"pd4dgs-package: no 2D video: {missing[0]}")
-            return None
+        except RenderError as error:
+            missing.append(str(error))
+        except ModuleNotFoundError as error:
+            if (error.name or "").startswith("pd4dgs_codec"):
+                raise
+            missing.append(f"the module {error.name} is not installed")
+        say(f"pd4dgs-package: no 2D video: {missing[0]}")
+        return None
 
     files = package(data, None if args.no_video else render, immutable=args.immutable)
     result = {"input": args.input, "output": args.output, "files": _write(args, files), "video": not missing}
@@ -107,15 +111,6 @@ def _write(args: argparse.Namespace, files: dict[str, bytes]) -> list[dict[str, 
         for temporary, content in zip(temporaries, files.values(), strict=True):
             temporary.write_bytes(content)
     return [{"name": name, "bytes": len(content)} for name, content in files.items()]
-
-
-def _reason(error: RenderError | ModuleNotFoundError) -> str:
-    """Returns the reason why there is no video. Raises the error if a module of ours is missing."""
-    if isinstance(error, RenderError):
-        return str(error)
-    if (error.name or "").startswith("pd4dgs_codec"):
-        raise error
-    return f"the module {error.name} is not installed"
 
 
 def _render(scene: Scene, fps: float) -> Video:

@@ -26,13 +26,8 @@ def parser() -> options.Parser:
     p.add_argument("input", metavar="DIR", help="folder to serve")
     what = "address to listen on (default: 127.0.0.1)"
     p.add_argument("--host", type=options.host, default="127.0.0.1", metavar="H", help=what)
-    p.add_argument(
-        "--port",
-        type=options.port,
-        default=8000,
-        metavar="N",
-        help="port to listen on (default: 8000; 0: any free port)",
-    )
+    what = "port to listen on (default: 8000; 0: any free port)"
+    p.add_argument("--port", type=options.port, default=8000, metavar="N", help=what)
     add_link(p)
     p.add_common()
     return p

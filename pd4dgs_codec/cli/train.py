@@ -60,12 +60,8 @@ def parser() -> options.Parser:
     add("--quality", type=options.checked(float, lambda q: 0 <= q <= 100, "0 to 100"), metavar="Q", help=what)
     _add_fields(p)
     add("--device", choices=("auto", "cpu", "cuda"), default="auto", help="device to train on (default: auto)")
-    add(
-        "--resume",
-        type=options.named,
-        metavar="FILE.pt",
-        help="continue from this checkpoint with its stored settings",
-    )
+    what = "continue from this checkpoint with its stored settings"
+    add("--resume", type=options.named, metavar="FILE.pt", help=what)
     add("--log", type=options.named, metavar="FILE.jsonl", help="log to write, one JSON object per step")
     what = f"show the training in the browser at this port (default: {VIEW_PORT}; needs viser)"
     add("--view", type=options.port, nargs="?", const=VIEW_PORT, metavar="PORT", help=what)

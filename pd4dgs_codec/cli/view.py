@@ -29,13 +29,8 @@ SCENE = "scene.pd4"
 def parser() -> options.Parser:
     p = options.Parser("view", "SCENE", "Show a scene in the browser.", DETAILS)
     p.add_argument("input", metavar="SCENE", help=".pd4 file, its URL, or .pt checkpoint; - reads stdin")
-    p.add_argument(
-        "-o",
-        "--output",
-        type=options.named,
-        metavar="FILE",
-        help="write one HTML file instead of starting a server",
-    )
+    what = "write one HTML file instead of starting a server"
+    p.add_argument("-o", "--output", type=options.named, metavar="FILE", help=what)
     what = "port to listen on (default: any free port)"
     p.add_argument("--port", type=options.port, metavar="N", help=what)
     p.add_argument("--no-browser", action="store_true", help="do not open the browser")

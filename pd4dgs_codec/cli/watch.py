@@ -161,9 +161,7 @@ def camera_of(wxyz: Any, position: Any, fov: float, aspect: float, pixels: int) 
     aspect: width over height; pixels: of the longer side."""
     rotation = rotation_matrix(np.asarray(wxyz) / max(float(np.linalg.norm(wxyz)), 1e-12))
     viewmat = world_to_camera(rotation.T, np.asarray(position, np.float64))
-    width, height = (
-        (pixels, max(1, round(pixels / aspect))) if aspect >= 1 else (max(1, round(pixels * aspect)), pixels)
-    )
+    width, height = max(1, round(pixels * min(aspect, 1.0))), max(1, round(pixels / max(aspect, 1.0)))
     focal = 0.5 * height / np.tan(0.5 * fov)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
     return Camera(viewmat.astype(np.float32), K.astype(np.float32), width, height)
