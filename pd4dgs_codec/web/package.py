@@ -89,7 +89,7 @@ def _segments(data: bytes, about: dict[str, Any], seconds: float) -> tuple[bytes
     Byte ranges are [first, one past the last]; sha256: of the `.pd4` bytes.
     """
     rows = [(row["layer"], i, part["end"]) for row in about["layers"] for i, part in enumerate(row["slices"])]
-    content = initialisation(len(rows), ticks(seconds))
+    content = bytearray(initialisation(len(rows), ticks(seconds)))
     init, start, slices = len(content), 0, list[dict[str, Any]]()
     for number, (layer, place, end) in enumerate(rows, 1):
         part = data[start : len(data) if number == len(rows) else end]
@@ -101,7 +101,7 @@ def _segments(data: bytes, about: dict[str, Any], seconds: float) -> tuple[bytes
         slices.append(row)
         content += piece
         start += len(part)
-    return content, slices
+    return bytes(content), slices
 
 
 def _json(content: dict[str, Any]) -> bytes:
