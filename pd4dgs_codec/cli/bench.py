@@ -82,9 +82,13 @@ examples:
   pd4dgs-bench codec model.pt --quick --views 2
   pd4dgs-bench codec scene.pd4 --json"""
 
-Options = dict[str, Any]
-SWEEP: Options = {"step_scales": (0.5, 1.0, 2.0, 4.0), "modes": ("ans", "lzma"), "efforts": (1, 5, 9), "repeats": 5}
-QUICK: Options = {"step_scales": (1.0, 2.0), "efforts": (1,), "repeats": 1}
+SWEEP: dict[str, Any] = {
+    "step_scales": (0.5, 1.0, 2.0, 4.0),
+    "modes": ("ans", "lzma"),
+    "efforts": (1, 5, 9),
+    "repeats": 5,
+}
+QUICK: dict[str, Any] = {"step_scales": (1.0, 2.0), "efforts": (1,), "repeats": 1}
 
 
 def _codec_options(p: options.Parser) -> None:
