@@ -173,7 +173,7 @@ def _fullest_window(h: Histogram) -> Window:
 Fit = Callable[[Histogram], Fitted]
 
 
-def plan_priors(histograms: Sequence[Histogram], fit: Fit, share: bool, known: Sequence[Fitted] = ()) -> list[Fitted]:
+def plan_priors(histograms: Sequence[Histogram], fit: Fit, share: bool, known: Sequence[Fitted]) -> list[Fitted]:
     """Returns the prior of each channel; channels that share one get the same object. share: whether channels may share
     new priors. known: priors that were described earlier, at no cost now."""
     plan = [fit(h) for h in histograms]

@@ -40,7 +40,9 @@ def decode_channels_lzma(payload: bytes | memoryview, counts: Sequence[int]) -> 
         if not 0 <= count <= MAX_COUNT:
             raise LimitExceeded(f"array {index}: {count} numbers, limit {MAX_COUNT}")
     reader = ByteReader(payload)
-    planar = bool(reader.bits("the layout's flags", 1))
+    flags = reader.byte("the layout's flags")
+    if flags > 1:
+        raise Malformed(f"the layout's flags is {flags:#04x}, bits 1..7 are reserved", offset=0)
     bases, dtypes = list[int](), list[np.dtype]()
     for count in counts:
         code = reader.varint(8 * K_MAX + 3, "a channel's base and width") if count else 0
@@ -49,7 +51,7 @@ def decode_channels_lzma(payload: bytes | memoryview, counts: Sequence[int]) -> 
         bases.append(-((code >> 2) + 1) // 2 if code & 4 else code >> 3)
         dtypes.append(_SIGNED[code & 3])
     arrays = []
-    for base, numbers in zip(bases, _decompress(reader, dtypes, counts, planar), strict=True):
+    for base, numbers in zip(bases, _decompress(reader, dtypes, counts, bool(flags)), strict=True):
         symbols = numbers.astype(np.int64) + base
         if len(symbols) and int(np.abs(symbols).max()) > K_MAX:
             raise Malformed(f"symbols {symbols.min()}..{symbols.max()}, limit |k| <= {K_MAX}")

@@ -66,13 +66,6 @@ class ByteReader:
         self.offset += 1
         return value
 
-    def bits(self, what: str, used: int) -> int:
-        """The next byte, whose bits from `used` on are reserved."""
-        value = self.byte(what)
-        if value >> used:
-            raise Malformed(f"{what} is {value:#04x}, bits {used}..7 are reserved", offset=self.offset - 1)
-        return value
-
     def zigzag(self, limit: int, what: str) -> int:
         """The next signed integer, at most `limit` in magnitude."""
         code = self.varint(2 * limit, what)

@@ -107,7 +107,7 @@ def layer_steps(steps: Steps, kind: LayerKind, tensors: Deformation) -> dict[str
     return {name: float(getattr(steps, name)) for name in kind.step_names} if tensors.networks else {}
 
 
-def check_tensors(tensors: Deformation, kind: LayerKind, widths: Widths, below: Deformation | None = None) -> None:
+def check_tensors(tensors: Deformation, kind: LayerKind, widths: Widths, below: Deformation | None) -> None:
     """Raises EncodeError unless planes and networks of a layer have the shapes and dtypes that scene.Deformation and
     Widths document, and finite values. below: the deformation of the layer below."""
     own, required = kind.name, (TRUNK,) if kind.layer else tuple(kind.network_ids)
