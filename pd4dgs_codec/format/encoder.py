@@ -134,8 +134,9 @@ def encode_with_report(
     errors = verify_errors(planned.scene, symbols, bounds) if options.verify else []
     del planned  # as large as the scene
     written = _write_layers(symbols, bounds, options, utility or by_size)
-    about = write_metadata(metadata) if metadata is not None else b""
-    data = _container(symbols, bounds, options.mode, written, about)
+    data, about_bytes = _container(symbols, bounds, options.mode, written), 0
+    if metadata is not None:
+        data, about_bytes = with_metadata(data, metadata)
     reports = [_layer_report(layer, slices) for layer, slices in zip(symbols.layers, written, strict=True)]
     fingerprints = [_fingerprint(layer) for layer in symbols.layers] if options.verify else []
     del symbols, written  # as large as what is decoded
@@ -144,7 +145,6 @@ def encode_with_report(
     kept_bits = sum(r.position_bits + s.payload_bits for r in reports for s in r.streams if s.name == "attributes")
     rows = [item.row(scene.steps, options, kept, kept_bits) for item in (*left_out, *omitted)]
     seconds = round(time.perf_counter() - started, 4)
-    about_bytes = CHUNK_OVERHEAD + len(about) if about else 0
     return data, Report(options.mode, len(data), options.verify, seconds, reports, rows, errors, about_bytes)
 
 
@@ -156,13 +156,16 @@ def by_size(scene: Scene) -> np.ndarray:
     return utility
 
 
-def with_metadata(data: bytes, metadata: Metadata) -> bytes:
-    """Appends metadata to a complete file that has none. In the header only the chunk list changes."""
+def with_metadata(data: bytes, metadata: Metadata) -> tuple[bytes, int]:
+    """Appends metadata to a complete file that has none: returns (file, bytes of the metadata chunk). The chunk comes
+    last, so that no picture waits for it; in the header only the chunk list changes. Raises EncodeError."""
     preamble = read_preamble(data)
     header, about = unpack_header(preamble.header), write_metadata(metadata)
+    if len(header.chunks) == MAX_CHUNKS:
+        raise EncodeError(f"metadata beside {MAX_CHUNKS} chunks, expected fewer: let slices take more bytes")
     packed = pack_header(replace(header, chunks=(*header.chunks, (CHUNK_TYPE, len(about)))))
     chunk = write_chunk(CHUNK_TYPE, FLAG_ANCILLARY, scene_id_of(packed), about)
-    return write_preamble(packed) + data[preamble.size :] + chunk
+    return write_preamble(packed) + data[preamble.size :] + chunk, len(chunk)
 
 
 def _write_layers(
@@ -226,18 +229,14 @@ def _write_slices(layer: LayerSymbols, options: EncodeOptions, size: float, util
     return found
 
 
-def _container(
-    symbols: SceneSymbols, bounds: dict[str, float], mode: str, written: list[list[_Slice]], metadata: bytes
-) -> bytes:
-    """Returns the file of these slices. Metadata, if any, comes last, so that no picture waits for it."""
+def _container(symbols: SceneSymbols, bounds: dict[str, float], mode: str, written: list[list[_Slice]]) -> bytes:
+    """Returns the file of these slices."""
     parts = [
         (layer.kind.layer, slice_flags(number, len(slices)), part.payload)
         for layer, slices in zip(symbols.layers, written, strict=True)
         for number, part in enumerate(slices)
     ]
     digest = payload_digest(payload for *_, payload in parts)
-    if metadata:
-        parts.append((CHUNK_TYPE, FLAG_ANCILLARY, metadata))
     chunks = tuple((kind, len(payload)) for kind, _, payload in parts)
     packed = _header(symbols, bounds, mode, chunks, digest)
     scene_id = scene_id_of(packed)

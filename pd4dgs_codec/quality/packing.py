@@ -8,10 +8,9 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.format.container import CHUNK_OVERHEAD
 from pd4dgs_codec.format.decoder import every_prefix
 from pd4dgs_codec.format.encoder import Report, encode_with_report, with_metadata
-from pd4dgs_codec.format.metadata import Metadata, write_metadata
+from pd4dgs_codec.format.metadata import Metadata
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.plan import LeftOut, plan
 from pd4dgs_codec.quality import ENCODE_MIN_DB_PER_MEGABYTE
@@ -211,6 +210,6 @@ class _Pictures:
                 ]
             metadata = replace(metadata or Metadata(), slices=tuple(about["psnr"]))
         if metadata is not None:
-            data, about_bytes = with_metadata(data, metadata), CHUNK_OVERHEAD + len(write_metadata(metadata))
+            data, about_bytes = with_metadata(data, metadata)
             report = replace(report, bytes=len(data), metadata_bytes=about_bytes)
         return data, report, about

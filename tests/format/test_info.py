@@ -9,7 +9,8 @@ from fuzzing.mutate import Chunk, put_together, take_apart
 from strategies import make_scene, small_file
 
 from pd4dgs_codec import FORMAT_VERSION
-from pd4dgs_codec.errors import DecodeError, Truncated
+from pd4dgs_codec.errors import DecodeError, EncodeError, Truncated
+from pd4dgs_codec.format import encoder
 from pd4dgs_codec.format.container import FLAG_ANCILLARY
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode, encode_with_report
@@ -95,6 +96,16 @@ def test_metadata_is_written_shown_and_skipped():
     assert hashes(told) == hashes(plain)
     assert report.metadata_bytes == info(told)["chunks"][0]["bytes"]
     assert sum(report.added_bytes().values()) == len(told) - report.metadata_bytes
+
+
+def test_a_file_of_the_most_chunks_takes_no_metadata(monkeypatch):
+    data = encode(SCENE, effort=1, slices=1000)
+    monkeypatch.setattr(encoder, "MAX_CHUNKS", sum(len(layer["slices"]) for layer in info(data)["layers"]))
+    with pytest.raises(EncodeError, match="let slices take more bytes"):
+        encoder.with_metadata(data, Metadata("Kitchen"))
+    monkeypatch.setattr(encoder, "MAX_CHUNKS", encoder.MAX_CHUNKS + 1)
+    told, size = encoder.with_metadata(data, Metadata("Kitchen"))
+    assert metadata_of(told) == Metadata("Kitchen") and size == info(told)["chunks"][0]["bytes"]
 
 
 @pytest.mark.parametrize("name", ["metadata-cut", "metadata-bomb"])
