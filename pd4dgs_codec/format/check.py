@@ -14,7 +14,7 @@ import numpy as np
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.deformation import arrays_of, check_tensors
 from pd4dgs_codec.format.header import MAX_CAMERA_SIDE, info_fault
-from pd4dgs_codec.format.quantise import all_finite, dequantise, expect, expect_array, is_step, magnitude
+from pd4dgs_codec.format.quantise import all_finite, dequantise, expect, expect_array, is_step, magnitude, row_blocks
 from pd4dgs_codec.format.registry import LAYER_KINDS
 from pd4dgs_codec.format.symbols import SceneSymbols
 from pd4dgs_codec.morton import MAX_VOXEL
@@ -146,11 +146,14 @@ def verify_errors(given: Scene, symbols: SceneSymbols, declared: Mapping[str, fl
 
 def _pairs(given: Scene, symbols: SceneSymbols) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray | float]]:
     """Yields (field of Steps, values given, values dequantised, 2^(step class) of each)."""
-    for rows, classes, values in symbols.blocks():
-        for name, x in values.items():
-            spacing = 2.0 ** classes.reshape(-1, *(1,) * (x.ndim - 1)) if classes.size else 1.0
-            yield name, given.attributes[name][rows], x, spacing
+    first = 0
     for layer in symbols.layers:
+        for rows in row_blocks(len(layer.anchor_q)):
+            own, classes = slice(first + rows.start, first + rows.stop), layer.classes[rows]
+            for name, x in symbols.grid.dequantise(layer.attributes[:, rows], classes).items():
+                spacing = 2.0 ** classes.reshape(-1, *(1,) * (x.ndim - 1)) if classes.size else 1.0
+                yield name, given.attributes[name][own], x, spacing
+        first += len(layer.anchor_q)
         both = (arrays_of(given.tensors(layer.kind.layer), layer.kind), arrays_of(layer.tensors, layer.kind))
         for (what, _, x), (*_, k) in zip(*both, strict=True):
             yield what, x, dequantise(k, layer.steps[what]), 1.0

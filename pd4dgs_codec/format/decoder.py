@@ -1,10 +1,10 @@
 """Decodes a `.pd4` file at once or as its bytes arrive. Needs only numpy, constriction and msgpack."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 
 from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.errors import DecodeError, Malformed, Truncated, UnsupportedFeature
-from pd4dgs_codec.format.container import CHUNK_OVERHEAD, PREAMBLE_SIZE, Chunk, read_chunk, read_preamble
+from pd4dgs_codec.format.container import CHUNK_OVERHEAD, Chunk, read_chunk, read_preamble
 from pd4dgs_codec.format.header import Header, scene_id_of, unpack_header
 from pd4dgs_codec.format.payload import Declared, Past, read_layer
 from pd4dgs_codec.format.registry import BY_CHUNK_TYPE, LayerKind
@@ -53,10 +53,13 @@ class LayerReader:
 
         start: offset of `data` in the file, at most `offset`. Raises Truncated if `data` ends before the slice does; a
         call with more bytes can then go on. Raises Malformed if neither limit is given and bytes follow the last chunk.
+        Raises ValueError if max_layer < 0.
         """
+        if max_layer is not None and max_layer < 0:
+            raise ValueError(f"max_layer must be 0 or more, found {max_layer}")
         if self.header is None:
             preamble = read_preamble(data)
-            self._begin(unpack_header(preamble.header, offset=PREAMBLE_SIZE))
+            self._begin(unpack_header(preamble.header))
             self.offset, self._scene_id = preamble.size, scene_id_of(preamble.header)
         assert self.header is not None
         chunks = self.header.chunks
@@ -134,33 +137,11 @@ class LayerReader:
         return part
 
 
-def _read(
-    reader: LayerReader,
-    data: bytes,
-    max_layer: int | None,
-    max_bytes: int | None = None,
-    allow_partial: bool = False,
-    take: Callable[[LayerSymbols], None] = lambda part: None,
-) -> bool:
-    """Passes each slice to `take`; returns whether no requested slice is missing. Other arguments as in `decode`."""
-    if max_layer is not None and max_layer < 0:
-        raise ValueError(f"max_layer must be 0 or more, found {max_layer}")
-    try:
-        while (part := reader.next_slice(data, max_layer, max_bytes)) is not None:
-            take(part)
-        if not reader.count:
-            raise Truncated(f"{max_bytes} bytes end before the first slice is complete", offset=max_bytes)
-    except Truncated:
-        if not (allow_partial and reader.count):
-            raise
-        return False
-    return True
-
-
 def read_layers(data: bytes, *, max_layer: int | None = None) -> tuple[Header, SceneSymbols]:
     """Returns (header, symbols) of a complete file, or of its layers <= max_layer. Raises as `decode` does."""
     reader, layers = LayerReader(), dict[int, list[LayerSymbols]]()
-    _read(reader, data, max_layer, take=lambda part: layers.setdefault(part.kind.layer, []).append(part))
+    while (part := reader.next_slice(data, max_layer)) is not None:
+        layers.setdefault(part.kind.layer, []).append(part)
     assert reader.header is not None
     header = reader.header
     return header, SceneSymbols(header.info, header.grid, [merged(parts) for parts in layers.values()])
@@ -182,8 +163,16 @@ def decode_partial(
     data: bytes, *, max_layer: int | None = None, max_bytes: int | None = None, allow_partial: bool = True
 ) -> tuple[Scene, bool]:
     """Returns (scene as from `decode`, whether every requested slice was there)."""
-    reader = LayerReader()
-    complete = _read(reader, data, max_layer, max_bytes, allow_partial)
+    reader, complete = LayerReader(), True
+    try:
+        while reader.next_slice(data, max_layer, max_bytes) is not None:
+            pass
+        if not reader.count:
+            raise Truncated(f"{max_bytes} bytes end before the first slice is complete", offset=max_bytes)
+    except Truncated:
+        if not (allow_partial and reader.count):
+            raise
+        complete = False
     reader.scene.sort()
     return reader.scene.scene(), complete
 

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.format import canonical
 from pd4dgs_codec.format.canonical import Fields, as_integer, as_list
-from pd4dgs_codec.format.container import SCENE_ID_SIZE
+from pd4dgs_codec.format.container import PREAMBLE_SIZE, SCENE_ID_SIZE
 from pd4dgs_codec.format.options import MODES
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, Grid, is_step
 from pd4dgs_codec.format.registry import BY_CHUNK_TYPE, LAYER_KINDS, MAX_CHUNKS, MAX_PAYLOAD
@@ -95,9 +95,9 @@ def pack_header(header: Header) -> bytes:
     return canonical.pack(fields)
 
 
-def unpack_header(data: bytes, offset: int = 0) -> Header:
-    """The inverse of pack_header. offset: of the header in the file, for messages. Raises subclasses of DecodeError."""
-    fields = Fields(canonical.unpack(data, offset=offset), "header", KEYS)
+def unpack_header(data: bytes) -> Header:
+    """The inverse of pack_header. Raises subclasses of DecodeError."""
+    fields = Fields(canonical.unpack(data, offset=PREAMBLE_SIZE), "header", KEYS)
     steps = fields.reals(STEPS, len(ATTRIBUTES))
     voxel_size = fields.real(VOXEL_SIZE)
     for name, step in zip(["voxel_size", *ATTRIBUTES], [voxel_size, *steps], strict=True):

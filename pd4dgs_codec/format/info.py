@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.errors import DecodeError
-from pd4dgs_codec.format.container import CHUNK_OVERHEAD, MAJOR, MINOR, PREAMBLE_SIZE, read_chunk, read_preamble
+from pd4dgs_codec.format.container import CHUNK_OVERHEAD, MAJOR, MINOR, read_chunk, read_preamble
 from pd4dgs_codec.format.decoder import read_layers
 from pd4dgs_codec.format.deformation import arrays_of
 from pd4dgs_codec.format.header import unpack_header
@@ -14,7 +14,6 @@ from pd4dgs_codec.format.metadata import CHUNK_TYPE, TEXTS, Metadata, read_metad
 from pd4dgs_codec.format.payload import Declared, read_parameters
 from pd4dgs_codec.format.quantise import Grid, attribute_rows, classes_of, quantise
 from pd4dgs_codec.format.registry import BY_CHUNK_TYPE, LAYER_KINDS, Section
-from pd4dgs_codec.format.symbols import float_tensors
 from pd4dgs_codec.scene import MASK_STEP, Scene
 
 FORMAT_VERSION = f"{MAJOR}.{MINOR}"
@@ -31,7 +30,7 @@ def info(data: bytes) -> dict[str, Any]:
     read, None if `data` holds no metadata chunk. Raises DecodeError.
     """
     preamble = read_preamble(data)
-    header = unpack_header(preamble.header, offset=PREAMBLE_SIZE)
+    header = unpack_header(preamble.header)
     others, offset, declared = [], preamble.size, Declared()
     layers: list[dict[str, Any]] = []
     metadata: dict[str, Any] | None = None
@@ -90,7 +89,7 @@ def metadata_of(data: bytes) -> Metadata | None:
     """Returns the metadata of a complete file, None if it has none. Raises DecodeError if it cannot be read."""
     preamble = read_preamble(data)
     offset = preamble.size
-    for chunk_type, length in unpack_header(preamble.header, offset=PREAMBLE_SIZE).chunks:
+    for chunk_type, length in unpack_header(preamble.header).chunks:
         if chunk_type == CHUNK_TYPE:
             return read_metadata(read_chunk(data, offset, type=chunk_type, length=length).payload)
         offset += CHUNK_OVERHEAD + length
@@ -120,11 +119,14 @@ def hashes(data: bytes, max_layer: int | None = None) -> list[dict[str, Any]]:
     then planes and networks as above.
     """
     _, symbols = read_layers(data, max_layer=max_layer)
-    scene, rows = symbols.scene(), []
-    for index, layer in enumerate(symbols.layers):
-        integers, tensors = _digest(layer.arrays(), "<i4"), _digest(float_tensors(scene, index), "<f4")
-        rows.append({"layer": layer.kind.layer, "symbols": integers, "tensors": tensors})
-    return rows
+    scene, found, first = symbols.scene(), [], 0
+    for layer, last in zip(symbols.layers, scene.rows, strict=True):
+        own, first = slice(first, last), last
+        tensors = [scene.anchor_at(own), *(values[own] for values in scene.attributes.values())]
+        tensors += [x for *_, x in arrays_of(scene.tensors(layer.kind.layer), layer.kind)]
+        digests = {"symbols": _digest(layer.arrays(), "<i4"), "tensors": _digest(tensors, "<f4")}
+        found.append({"layer": layer.kind.layer, **digests})
+    return found
 
 
 def _digest(arrays: list[np.ndarray], dtype: str) -> str:

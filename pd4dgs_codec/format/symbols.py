@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -116,30 +116,12 @@ class SceneSymbols:
         """All steps; those that no layer uses have the defaults of Steps."""
         return Steps(**self.grid.steps, **{name: q for layer in self.layers for name, q in layer.steps.items()})
 
-    def blocks(self) -> Iterator[tuple[slice, np.ndarray, dict[str, np.ndarray]]]:
-        """Yields (rows of the scene, step classes, attributes float32 [n, ...] by name), a few rows at a time."""
-        first = 0
-        for layer in self.layers:
-            for rows in row_blocks(len(layer.anchor_q)):
-                classes = layer.classes[rows]
-                values = self.grid.dequantise(layer.attributes[:, rows], classes)
-                yield slice(first + rows.start, first + rows.stop), classes, values
-            first += len(layer.anchor_q)
-
     def scene(self) -> Scene:
         """Returns the dequantised scene (clause 11.5)."""
         grown = GrowingScene(self.info, self.grid)
         for layer in self.layers:
             grown.add(layer)
         return grown.scene()
-
-
-def float_tensors(scene: Scene, index: int) -> list[np.ndarray]:
-    """Returns the float32 arrays of scene.layers[index] alone: positions, attributes, planes, then networks."""
-    kind = LAYER_KINDS[scene.layers[index]]
-    own = slice(scene.rows[index - 1] if index else 0, scene.rows[index])
-    attributes = [values[own] for values in scene.attributes.values()]
-    return [scene.anchor_at(own), *attributes, *(x for *_, x in arrays_of(scene.tensors(kind.layer), kind))]
 
 
 # -- slices as they come -----------------------------------------------------------------------------------------------
