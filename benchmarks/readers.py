@@ -41,7 +41,7 @@ from pd4dgs_codec.interchange import runs
 from pd4dgs_codec.interchange.splats import Splats, fourdgs_bytes, read_splats
 from pd4dgs_codec.interchange.teacher import read_model
 from pd4dgs_codec.model import checkpoint
-from pd4dgs_codec.quality.movie import write_mp4
+from pd4dgs_codec.quality.frames import write_mp4
 from pd4dgs_codec.web.client import SceneClient
 from pd4dgs_codec.web.package import library
 from pd4dgs_codec.web.server import Server

@@ -116,10 +116,9 @@ def _write(args: argparse.Namespace, files: dict[str, bytes]) -> list[dict[str, 
 def _render(scene: Scene, fps: float) -> Video:
     from PIL import Image
 
-    from pd4dgs_codec.quality.frames import own_frames
+    from pd4dgs_codec.quality.frames import check_mp4, own_frames, write_mp4
     from pd4dgs_codec.quality.image import to_uint8
     from pd4dgs_codec.quality.levels import level_of
-    from pd4dgs_codec.quality.movie import check_mp4, write_mp4
     from pd4dgs_codec.web.manifests import Video
 
     check_mp4()

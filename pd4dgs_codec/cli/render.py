@@ -65,7 +65,7 @@ def _render(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.quality.levels import load_levels
 
     if kind == ".mp4":
-        from pd4dgs_codec.quality.movie import check_mp4
+        from pd4dgs_codec.quality.frames import check_mp4
 
         check_mp4()
     levels = load_levels(
@@ -132,7 +132,7 @@ def _pictures(
 ) -> Iterator[np.ndarray]:
     """Yields uint8 [H, W, 3] per frame: one level, or all levels beside the ground truth. Appends the time of each
     picture to `milliseconds`."""
-    from pd4dgs_codec.quality.movie import Panel, level_panels, side_by_side
+    from pd4dgs_codec.quality.frames import Panel, level_panels, side_by_side
 
     for frame in frames:
         panels = level_panels(levels, frame)
@@ -145,7 +145,7 @@ def _pictures(
 
 def _write(args: argparse.Namespace, kind: str, pictures: Iterator[np.ndarray], count: int) -> int:
     """Writes all pictures; returns the number of files."""
-    from pd4dgs_codec.quality.movie import write_gif, write_mp4, write_pictures
+    from pd4dgs_codec.quality.frames import write_gif, write_mp4, write_pictures
 
     if kind in VIDEOS:
         with whole_file(args.output, args.overwrite) as temporary:

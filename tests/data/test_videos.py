@@ -103,7 +103,7 @@ def test_training_views_are_kept_within_a_budget(scene, monkeypatch):
 @pytest.fixture(scope="module")
 def recorded(once):
     """A video of 60 frames that begins with its header, so that it plays while it arrives."""
-    from pd4dgs_codec.quality.movie import write_mp4
+    from pd4dgs_codec.quality.frames import write_mp4
 
     def make(folder):
         pictures = np.random.default_rng(0).integers(0, 255, (60, 48, 64, 3), np.uint8)

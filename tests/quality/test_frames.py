@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from pd4dgs_codec.errors import RenderError
-from pd4dgs_codec.quality import frames, movie
+from pd4dgs_codec.quality import frames
 from pd4dgs_codec.scene import Camera, SceneInfo
 
 
@@ -73,30 +73,30 @@ def test_shrunk_camera_sees_the_same_rays():
 
 def test_panels_paste_images_unchanged_below_captions():
     a, b = np.full((40, 60, 3), 10, np.uint8), np.full((40, 30, 3), 200, np.uint8)
-    captioned = (movie.Panel(a, "level 0, 12 kB"), movie.Panel(b, "a caption far too long for its image"))
-    sheet = movie.side_by_side(captioned)
-    assert sheet.shape == (40 + 16, 60 + 30 + movie.GAP, 3)
+    captioned = (frames.Panel(a, "level 0, 12 kB"), frames.Panel(b, "a caption far too long for its image"))
+    sheet = frames.side_by_side(captioned)
+    assert sheet.shape == (40 + 16, 60 + 30 + frames.GAP, 3)
     assert np.array_equal(sheet[-40:, :60], a) and np.array_equal(sheet[-40:, -30:], b)
     band = sheet[:-40]
-    assert (band[:, :60] < 128).any() and (band[:, 60 : 60 + movie.GAP] == 255).all()
+    assert (band[:, :60] < 128).any() and (band[:, 60 : 60 + frames.GAP] == 255).all()
 
 
 def test_captions_state_the_size():
-    assert movie.level_caption(1, None) == "level 1"
-    assert movie.level_caption(0, 425_000) == "level 0, 425 kB"
-    assert movie.level_caption(2, 6_880_000) == "level 2, 6.88 MB"
+    assert frames.level_caption(1, None) == "level 1"
+    assert frames.level_caption(0, 425_000) == "level 0, 425 kB"
+    assert frames.level_caption(2, 6_880_000) == "level 2, 6.88 MB"
 
 
 def test_a_film_of_one_pixel_is_refused_in_one_line(tmp_path):
     with pytest.raises(RenderError, match="1x2 pixels, expected at least 2x2 for a video"):
-        movie.write_mp4(iter([np.zeros((2, 1, 3), np.uint8)]), tmp_path / "a.mp4", 10.0)
+        frames.write_mp4(iter([np.zeros((2, 1, 3), np.uint8)]), tmp_path / "a.mp4", 10.0)
 
 
 def test_gif_keeps_order_count_and_speed(tmp_path):
     colours = [(200, 30, 30), (30, 200, 30), (30, 30, 200)]
     images = [np.full((8, 10, 3), c, np.uint8) for c in colours]
     mixed = np.concatenate([*images], axis=1)  # the first frame's palette serves all
-    movie.write_gif(iter([mixed] + [np.tile(i, (1, 3, 1)) for i in images]), tmp_path / "a.gif", 10.0)
+    frames.write_gif(iter([mixed] + [np.tile(i, (1, 3, 1)) for i in images]), tmp_path / "a.gif", 10.0)
     gif = Image.open(tmp_path / "a.gif")
     assert gif.n_frames == 4 and gif.info["duration"] == 100
     for i, colour in enumerate(colours, start=1):
