@@ -96,7 +96,8 @@ def scene_info(dataset: Dataset) -> SceneInfo:
 
 def initial_cells(dataset: Dataset, count: int, voxel_size: float, generator: torch.Generator) -> Tensor:
     """int32 [n, 3] unique voxel cells, about `count` of them."""
-    points = _points_near_box(dataset)
+    points = torch.from_numpy(np.array(() if dataset.points is None else dataset.points, np.float32).reshape(-1, 3))
+    points = points[near_box(points, torch.from_numpy(np.asarray(dataset.box, np.float32)))]
     if len(points) == 0:
         points = carved_points(dataset, count, generator)
     elif len(points) > count:
@@ -110,12 +111,13 @@ def initial_cells(dataset: Dataset, count: int, voxel_size: float, generator: to
     return cells
 
 
-def _points_near_box(dataset: Dataset) -> Tensor:
-    """float32 [n, 3]: the dataset's points in or near its box; points farther away would stretch the grid."""
-    points = torch.from_numpy(np.array(() if dataset.points is None else dataset.points, np.float32).reshape(-1, 3))
-    low, high = (torch.from_numpy(np.asarray(dataset.box[i], np.float32)) for i in (0, 1))
+def near_box(points: Tensor, box: Tensor) -> Tensor:
+    """bool [n]: whether points [n, 3] lie in the box [2, 3] or within half its longest side of it. Anchors farther away
+    would stretch the grid."""
+    low, high = box
     reach = 0.5 * (high - low).max()
-    return points[((points > low - reach) & (points < high + reach)).all(1)]
+    near: Tensor = ((points > low - reach) & (points < high + reach)).all(1)
+    return near
 
 
 def carved_points(dataset: Dataset, count: int, generator: torch.Generator) -> Tensor:

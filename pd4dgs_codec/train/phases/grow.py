@@ -13,7 +13,7 @@ from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.picture import Picture
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train import workers
-from pd4dgs_codec.train.initialise import fresh_mask_logits
+from pd4dgs_codec.train.initialise import fresh_mask_logits, near_box
 from pd4dgs_codec.train.phases import Phase
 from pd4dgs_codec.train.state import TrainState, fresh_statistics
 
@@ -139,12 +139,10 @@ def _new_cells(
 def _inside(model: Model, slots: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """(slots, their anchors, float64 [n, 3] their positions in voxels) of the Gaussians that lie near the box."""
     anchor_q, scaling = model.anchor_q.cpu(), model.scaling_log.detach().cpu().exp()
-    low, high = (torch.from_numpy(model.info.box[i]).double() / model.info.voxel_size for i in (0, 1))
-    reach = 0.5 * (high - low).max()
     rows = slots // model.widths.slots
     shift = model.offset.detach().cpu().view(-1, 3)[slots] * scaling[rows, :3]
     position = anchor_q[rows].double() + shift.double() / model.info.voxel_size
-    inside = ((position > low - reach) & (position < high + reach)).all(1)
+    inside = near_box(position, torch.from_numpy(model.info.box).double() / model.info.voxel_size)
     return slots[inside], rows[inside], position[inside]
 
 
