@@ -6,7 +6,6 @@ import argparse
 import itertools
 import json
 import sys
-import tempfile
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -16,6 +15,7 @@ from pd4dgs_codec.cli import common, options
 from pd4dgs_codec.cli.common import FAILED, OK, STDIO, Console, UsageError, is_pd4, progress_bar, read_bytes, say
 from pd4dgs_codec.errors import DataError, DecodeError, TrainError
 from pd4dgs_codec.format.options import MODES
+from pd4dgs_codec.io import temporary_folder
 
 if TYPE_CHECKING:
     from pd4dgs_codec.bench.report import Panel
@@ -227,8 +227,8 @@ def _trained(args: argparse.Namespace) -> list[Point]:
         config = TrainConfig(preset=preset, source=args.source, max_seconds=limit, **_given(args, *TRAIN_FIELDS))
         trainer = Trainer(config, load_source(args.source, downscale=config.downscale, holdout=config.holdout))
         say(f"training {preset} on {len(trainer.dataset.train)} views")
-        with tempfile.TemporaryDirectory() as folder:
-            trainer.run(Path(folder) / "model.pt", progress=common.TrainingProgress())
+        with temporary_folder() as folder:
+            trainer.run(folder / "model.pt", progress=common.TrainingProgress())
         if trainer.interrupted:
             raise TrainError(f"interrupted while training {preset}; nothing was written")
         if not trainer.curve:
