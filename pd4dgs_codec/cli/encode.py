@@ -117,7 +117,8 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
     check_usage(args)
     common.check_output(args.output, args.overwrite)
     scene, metadata = _load(args)
-    console.detail(f"{args.input}: {len(scene.anchor_q)} anchors, layers {list(scene.layers)}, steps {scene.steps}")
+    size = f"{len(scene.anchor_q)} anchors, layers {list(scene.layers)}"
+    console.detail(f"{shown_name(args.input)}: {size}, steps {scene.steps}")
     from pd4dgs_codec.quality.packing import pack
 
     packed = pack(

@@ -75,7 +75,8 @@ def _render(args: argparse.Namespace, console: Console) -> int:
         last_only=not args.side_by_side,
         background=args.background,
     )
-    console.detail(f"{args.input}: levels " + ", ".join(f"{row.level} ({row.anchors} anchors)" for row in levels))
+    found = ", ".join(f"{row.level} ({row.anchors} anchors)" for row in levels)
+    console.detail(f"{common.shown_name(args.input)}: levels {found}")
     frames = _frames(args, levels[-1])
     if kind in VIDEOS and len({(frame.camera.width, frame.camera.height) for frame in frames}) > 1:
         raise DataError(f"{args.data}: found views of several sizes, expected one size, or -o such as out/%04d.png")

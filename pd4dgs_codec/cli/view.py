@@ -88,7 +88,7 @@ def _packed(source: str) -> bytes:
     from pd4dgs_codec.web.page import EFFORT
 
     scene = common.checkpoint_scene(source, data)
-    say(f"{source}: encoding the checkpoint")
+    say(f"{common.shown_name(source)}: encoding the checkpoint")
     return encode(scene, effort=EFFORT, omit="nothing")
 
 

@@ -57,7 +57,7 @@ def test_a_checkpoint_may_come_through_stdin(model_pt):
         page = process.stdout.readline().strip()
         assert decode(fetch(page.replace("index.html?src=", ""))).layers[0] == 0
         process.send_signal(signal.SIGTERM)
-        assert process.wait(60) == 0
+        assert process.communicate(timeout=60)[1] == "stdin: encoding the checkpoint\n" and process.returncode == 0
 
 
 def test_one_html_file_instead_of_a_server(cli, scene_pd4, tmp_path):
