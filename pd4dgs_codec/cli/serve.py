@@ -1,11 +1,20 @@
 """`pd4dgs-serve`: a folder over HTTP, at the rate of a slow link if asked for."""
 
+from __future__ import annotations
+
 import argparse
+import contextlib
 import signal
 import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.cli import options
 from pd4dgs_codec.cli.common import OK, Console, command, say
+
+if TYPE_CHECKING:
+    from pd4dgs_codec.web.server import Server
 
 DETAILS = """\
 Answers GET and HEAD with ranges, If-Range, ETag and CORS. Files outside DIR and names that begin with a dot are not
@@ -42,25 +51,25 @@ def add_link(p: options.Parser) -> None:
 
 
 def _serve(args: argparse.Namespace, console: Console) -> int:
-    from pd4dgs_codec.web.server import Link, Server
-
-    log, latency = say if console.verbose else None, args.latency or 0.0
-    with Server(args.input, args.host, args.port, link=Link(args.rate), latency=latency, log=log) as server:
-        stop = set_by_signals()
-        with server.running():
-            result = {"url": server.url, "folder": str(server.root), "rate": args.rate, "latency": latency}
-            console.result(result, server.url, on_stdout=True)
-            stop.wait()
+    with serving(args.input, args, console, host=args.host, port=args.port) as server:
+        result = {"url": server.url, "folder": str(server.root), "rate": args.rate, "latency": server.latency}
+        console.result(result, server.url, on_stdout=True)
     return OK
 
 
 main = command(parser, _serve)
 
 
-def set_by_signals() -> threading.Event:
-    """Returns an event that Ctrl-C and SIGTERM set from now on."""
-    stop = threading.Event()
-    if threading.current_thread() is threading.main_thread():
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, lambda *_: stop.set())
-    return stop
+@contextlib.contextmanager
+def serving(folder: str | Path, args: argparse.Namespace, console: Console, **where: Any) -> Iterator[Server]:
+    """Serves a folder over the link of `add_link`; after the block, until Ctrl-C or SIGTERM. where: for Server."""
+    from pd4dgs_codec.web.server import Link, Server
+
+    log, latency, stop = say if console.verbose else None, args.latency or 0.0, threading.Event()
+    with Server(folder, link=Link(args.rate), latency=latency, log=log, **where) as server:
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, lambda *_: stop.set())
+        with server.running():
+            yield server
+            stop.wait()

@@ -7,7 +7,7 @@ from urllib.parse import quote
 
 from pd4dgs_codec.cli import common, options
 from pd4dgs_codec.cli.common import OK, Console, UsageError, command, say
-from pd4dgs_codec.cli.serve import add_link, set_by_signals
+from pd4dgs_codec.cli.serve import add_link, serving
 from pd4dgs_codec.io import check_output, temporary_folder, write_bytes
 
 DETAILS = """\
@@ -42,7 +42,6 @@ def parser() -> options.Parser:
 def _view(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.web import PAGE, is_url
     from pd4dgs_codec.web.page import page
-    from pd4dgs_codec.web.server import Link, Server
 
     options.conditional(args, not args.output, "has no effect with -o", port=0, rate=None, latency=0.0)
     if args.output:
@@ -60,16 +59,14 @@ def _view(args: argparse.Namespace, console: Console) -> int:
         if not is_url(source):
             (folder / SCENE).write_bytes(_packed(source))
             source = SCENE
-        log = say if console.verbose else None
-        link = Link(args.rate)
-        with Server(folder, port=args.port, private=True, link=link, latency=args.latency, log=log) as server:
-            stop = set_by_signals()
-            with server.running():
-                url = f"{server.url}{PAGE}?src={quote(source, safe='')}"
-                console.result({"url": url, "input": args.input}, url, on_stdout=True)
-                if not args.no_browser:
-                    _open(url)
-                stop.wait()
+        with serving(folder, args, console, port=args.port, private=True) as server:
+            url = f"{server.url}{PAGE}?src={quote(source, safe='')}"
+            console.result({"url": url, "input": args.input}, url, on_stdout=True)
+            if not args.no_browser:
+                import webbrowser
+
+                with contextlib.suppress(webbrowser.Error, OSError):  # the address is printed in any case
+                    webbrowser.open(url)
     return OK
 
 
@@ -90,11 +87,3 @@ def _packed(source: str) -> bytes:
     scene = common.checkpoint_scene(source, data)
     say(f"{common.shown_name(source)}: encoding the checkpoint")
     return encode(scene, effort=EFFORT, omit="nothing")
-
-
-def _open(url: str) -> None:
-    """Opens the user's browser if there is one; the address is printed in any case."""
-    import webbrowser
-
-    with contextlib.suppress(webbrowser.Error, OSError):
-        webbrowser.open(url)
