@@ -115,14 +115,13 @@ def _write_channel(out: bytearray, prior: Prior, exceptions: _Exceptions, define
     if back is None:
         prior.write(out)
         defined.append(prior)
-    if not len(exceptions.positions):
-        return back is None
-    put_varint(out, len(exceptions.positions) - 1)
-    kmin, end = prior.window.kmin, prior.window.end
-    gaps = np.diff(exceptions.positions, prepend=-1) - 1
-    for gap, value in zip(gaps.tolist(), exceptions.values.tolist(), strict=True):
-        put_varint(out, gap)
-        put_varint(out, 2 * (kmin - 1 - value) + 1 if value < kmin else 2 * (value - end))
+    if len(exceptions.positions):
+        put_varint(out, len(exceptions.positions) - 1)
+        kmin, end = prior.window.kmin, prior.window.end
+        gaps = np.diff(exceptions.positions, prepend=-1) - 1
+        for gap, value in zip(gaps.tolist(), exceptions.values.tolist(), strict=True):
+            put_varint(out, gap)
+            put_varint(out, 2 * (kmin - 1 - value) + 1 if value < kmin else 2 * (value - end))
     return back is None
 
 

@@ -28,14 +28,13 @@ from pd4dgs_codec.morton import AXIS_BITS, MAX_VOXEL, join_bits, morton_codes
 
 LEAST_EFFORT = 3  #: below it, channels share no priors, and at 1 have only Gaussians: 4 to 13 % more bytes
 
-_BYTES = np.arange(256)
 _CHILDREN = np.array([value.bit_count() for value in range(256)])  # by occupancy byte
 _PATTERNS = [np.flatnonzero(_CHILDREN == k) for k in range(9)]  #: bytes with k children, ascending
 _INDEX = np.zeros(256, dtype=np.int32)  # of a byte among the bytes with as many children
 for _patterns in _PATTERNS:
     _INDEX[_patterns] = np.arange(len(_patterns))
 #: Child numbers by byte, ascending; entries past the last child are unused.
-_CHILD = np.argsort((_BYTES[:, None] >> np.arange(8) & 1) == 0, axis=1, kind="stable")
+_CHILD = np.argsort((np.arange(256)[:, None] >> np.arange(8) & 1) == 0, axis=1, kind="stable")
 _CODED = range(2, 8)  # numbers of children with more than one pattern; nodes with one child have channels of their own
 
 
