@@ -137,20 +137,13 @@ def _canonical(obj: Any, depth: int = 0) -> Any:
             if type(key) is not int or not 0 <= key < 1 << 32:
                 raise ValueError(f"map key {key!r}, expected an integer in 0..2**32 - 1")
         return {key: _canonical(obj[key], depth + 1) for key in sorted(obj)}
-    if type(obj) is float:
-        return _single(obj)
+    if type(obj) is float and not (abs(obj) <= _SINGLE_MAX and _REAL.unpack(_REAL.pack(obj))[0] == obj):
+        raise ValueError(f"real {obj!r} is not a finite binary32 value")
     if type(obj) is int and not -(1 << 63) <= obj < 1 << 64:
         raise ValueError(f"integer {obj} does not fit 64 bits")
-    if type(obj) not in (bool, int, str, bytes):
+    if type(obj) not in (bool, int, float, str, bytes):
         raise ValueError(f"a value of type {type(obj).__name__}, expected bool, int, float, str, bytes, list or dict")
     return obj
-
-
-def _single(value: float) -> float:
-    fits = math.isfinite(value) and abs(value) <= _SINGLE_MAX
-    if not fits or struct.unpack("<f", struct.pack("<f", value))[0] != value:
-        raise ValueError(f"real {value!r} is not a finite binary32 value")
-    return value
 
 
 # -- checked access ----------------------------------------------------------------------------------------------------
