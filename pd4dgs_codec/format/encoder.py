@@ -178,13 +178,14 @@ def _write_layers(
     values = np.split(utility(symbols.scene()), ends)
     bits = sum(float(layer.bits_per_row().sum()) for layer in symbols.layers)
     most = len(values) + math.ceil(bits / 8 / (LATER * SLACK * options.slices))  # more than there will be
-    head = PREAMBLE_SIZE + len(_header(symbols, bounds, options.mode, ((0, options.slices),) * most))
-    sizes = [options.slices - head, *[LATER * options.slices] * (len(values) - 1)]
+    chunks = ((0, options.slices),) * most
+    header = pack_header(Header(chunks, options.mode, symbols.grid, symbols.info, bounds, bytes(DIGEST_SIZE)))
+    sizes = [options.slices - PREAMBLE_SIZE - len(header), *[LATER * options.slices] * (len(values) - 1)]
     written = [
         _write_slices(layer, options, size, u) for layer, size, u in zip(symbols.layers, sizes, values, strict=True)
     ]
-    if (chunks := sum(map(len, written))) > MAX_CHUNKS:
-        raise EncodeError(f"{chunks} slices, expected at most {MAX_CHUNKS}: let slices take more bytes")
+    if (slices := sum(map(len, written))) > MAX_CHUNKS:
+        raise EncodeError(f"{slices} slices, expected at most {MAX_CHUNKS}: let slices take more bytes")
     return written
 
 
@@ -238,20 +239,9 @@ def _container(symbols: SceneSymbols, bounds: dict[str, float], mode: str, writt
     ]
     digest = payload_digest(payload for *_, payload in parts)
     chunks = tuple((kind, len(payload)) for kind, _, payload in parts)
-    packed = _header(symbols, bounds, mode, chunks, digest)
+    packed = pack_header(Header(chunks, mode, symbols.grid, symbols.info, bounds, digest))
     scene_id = scene_id_of(packed)
     return b"".join([write_preamble(packed), *(write_chunk(kind, flags, scene_id, p) for kind, flags, p in parts)])
-
-
-def _header(
-    symbols: SceneSymbols,
-    bounds: dict[str, float],
-    mode: str,
-    chunks: tuple[tuple[int, int], ...],
-    digest: bytes = bytes(DIGEST_SIZE),
-) -> bytes:
-    """Returns the header's bytes. chunks: type and bytes of each."""
-    return pack_header(Header(chunks, mode, symbols.grid, symbols.info, bounds, digest))
 
 
 def _check_file(data: bytes, fingerprints: list[bytes]) -> None:

@@ -89,7 +89,8 @@ def pack_header(header: Header) -> bytes:
         }
     bounds = header.error_bounds
     fields[ERROR_BOUNDS] = {number: bounds[name] for name, number in TENSOR_KINDS.items() if name in bounds}
-    fields |= {DIGEST: header.digest, WIDTHS: _pack_widths(grid.widths)}
+    viewing = sum(1 << SCAFFOLD_NETWORKS.index(name) for name in grid.widths.viewing)
+    fields |= {DIGEST: header.digest, WIDTHS: [grid.widths.feature, grid.widths.slots, viewing]}
     if grid.widths.graded:
         fields[CENTRE] = grid.centre.tolist()
     return canonical.pack(fields)
@@ -195,10 +196,6 @@ def _unpack_chunks(rows: list[Any]) -> tuple[tuple[int, int], ...]:
 def layers_of(chunks: Iterable[tuple[int, int]]) -> list[int]:
     """Returns the layer of each slice in a chunk list."""
     return [kind for kind, _ in chunks if kind in BY_CHUNK_TYPE]
-
-
-def _pack_widths(widths: Widths) -> list[int]:
-    return [widths.feature, widths.slots, sum(1 << SCAFFOLD_NETWORKS.index(name) for name in widths.viewing)]
 
 
 def _unpack_widths(header: Fields) -> Widths:
