@@ -253,7 +253,6 @@ def read_layer(
         if codes.size and not (low <= codes.min() and codes.max() <= 255):
             found = f"{int(codes.min())}..{int(codes.max())}"
             raise Malformed(f"layer {kind.layer}: {name} in {found}, expected {low}..255")
-    check_classes(classes)
     if magnitude(attributes) > MAX_SYMBOL:
         raise Malformed(f"layer {kind.layer}: an attribute's symbol over {MAX_SYMBOL} in magnitude")
     return LayerSymbols(kind, widths, anchor_q, increase, own, classes, attributes, tensors, parameters.steps), declared
@@ -307,6 +306,7 @@ def _read_lzma(sections: _Sections, parameters: Parameters) -> Content:
     data = sections.take(Section.SYMBOLS, sum(sizes))
     channels = decode_channels_lzma(data, sizes) if data else [np.zeros(0, np.int32) for _ in sizes]
     classes, attributes = channels[2] if widths.graded else NO_CLASSES, np.stack(channels[first:last])
+    check_classes(classes)
     end = last + len(planes)
     tensors = deformation.from_channels(channels[last:end], channels[end:], parameters.shape)
     return channels[0], channels[1], classes, attributes, tensors
