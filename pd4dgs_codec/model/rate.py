@@ -1,12 +1,12 @@
 """The training-time rate R(a) = -log2 P, P = Phi((a + Q/2 - mu)/sigma) - Phi((a - Q/2 - mu)/sigma).
 
 Source: the PD-4DGS rate model. In float32 the plain difference of two Phi is wrong by 7 % above P = 1e-6 and 0 below,
-so ln P is computed in one of three forms, chosen per element, with an explicit gradient.
+so kernels compute ln P in float64, in one of three forms, chosen per element, with an explicit gradient.
 With d = |a - mu|, z = d/sigma, h = Q/(2 sigma), u = (d - Q/2)/sigma, v = (d + Q/2)/sigma:
 
 - narrow, h*max(z, 1) small: P = 2 h phi(z) (1 + h^2 He2(z)/6 + h^4 He4(z)/120 + h^6 He6(z)/5040)
 - tail, u >= 0:              P = phi(u) sqrt(pi/2) (erfcx(u/sqrt 2) - exp(-2zh) erfcx(v/sqrt 2))
-- centre, u < 0:             ln P = log_ndtr(-u) + log1mexp(log_ndtr(-v) - log_ndtr(-u))
+- centre, u < 0:             P = (erfc(u/sqrt 2) - erfc(v/sqrt 2)) / 2
 """
 
 from __future__ import annotations
@@ -34,105 +34,7 @@ MIN_VARIANCE = 1e-20
 
 _LN2 = math.log(2.0)
 _HALF_LN_2PI = 0.5 * math.log(2.0 * math.pi)
-_LN_SQRT_HALF_PI = 0.5 * math.log(0.5 * math.pi)
 _SQRT_HALF = math.sqrt(0.5)
-
-
-def _log_ratio(z: Tensor, h: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """Returns ln(phi(u) / P), from which ln P and the gradients follow. In the tails ln P and ln phi(u) grow like z^2;
-    their difference does not, so it is computed directly."""
-    narrow = h * z.clamp(min=1.0) < NARROW[z.dtype]
-    tail = ~narrow & (u >= 0)
-    centre = ~(narrow | tail)
-    out = torch.empty_like(z)
-
-    zn, hn = z[narrow], h[narrow]
-    z2, h2 = zn * zn, hn * hn
-    series = (z2 - 1) * h2 / 6 + ((z2 - 6) * z2 + 3) * h2 * h2 / 120 + (((z2 - 15) * z2 + 45) * z2 - 15) * h2**3 / 5040
-    out[narrow] = zn * hn - 0.5 * h2 - torch.log(2 * hn) - torch.log1p(series)
-
-    ut, vt = u[tail], v[tail]
-    far = torch.exp(-2 * z[tail] * h[tail]) * torch.special.erfcx(vt * _SQRT_HALF)
-    out[tail] = -_LN_SQRT_HALF_PI - torch.log(torch.special.erfcx(ut * _SQRT_HALF) - far)
-
-    uc, vc = u[centre], v[centre]
-    above = torch.special.log_ndtr(-uc)
-    gap = torch.special.log_ndtr(-vc) - above
-    log1mexp = torch.where(gap > -_LN2, torch.log(-torch.expm1(gap)), torch.log1p(-torch.exp(gap)))
-    out[centre] = -0.5 * uc * uc - _HALF_LN_2PI - above - log1mexp
-    return out
-
-
-class _LogProbability(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, a: Tensor, mu: Tensor, sigma: Tensor, q: Tensor) -> Tensor:
-        shapes, dtype = (a.shape, mu.shape, sigma.shape, q.shape), a.dtype
-        # float32 loses the small difference of nearly equal arguments when sigma << Q
-        wide = torch.float64 if dtype == torch.float64 or bool((sigma < q * 2.0**-7).any()) else torch.float32
-        wider = (x.to(wide) for x in (a, mu, sigma, q))
-        a, mu, sigma, q = torch.broadcast_tensors(*wider)  # type: ignore[no-untyped-call]
-        signed = a - mu
-        d = signed.abs()
-        z, h, u, v = d / sigma, 0.5 * q / sigma, (d - 0.5 * q) / sigma, (d + 0.5 * q) / sigma
-        log_ratio = _log_ratio(z, h, u, v)
-        ctx.save_for_backward(signed, sigma, q, z, h, v, log_ratio)
-        ctx.shapes, ctx.dtype = shapes, dtype
-        return (-0.5 * u * u - _HALF_LN_2PI - log_ratio).to(dtype)
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
-        signed, sigma, q, z, h, v, log_ratio = ctx.saved_tensors
-        ratio, m = torch.exp(log_ratio), torch.expm1(-2 * z * h)
-        grad_a = grad * torch.sign(signed) * ratio * m / sigma
-        grad_sigma = -grad * ratio * (2 * h + v * m) / sigma
-        grad_q = grad * ratio * h * (2 + m) / q
-        grads = (grad_a, -grad_a, grad_sigma, grad_q)
-        reduced = [
-            g.sum_to_size(shape).to(ctx.dtype) if need else None
-            for g, shape, need in zip(grads, ctx.shapes, ctx.needs_input_grad, strict=True)
-        ]
-        return tuple(reduced)
-
-
-def log_probability(a: Tensor, mu: Tensor, sigma: Tensor, q: Tensor | float) -> Tensor:
-    """Returns ln P of a +- Q/2 under N(mu, sigma), broadcast; gradients reach all arguments, finite in the tails."""
-    q = torch.as_tensor(q, dtype=a.dtype, device=a.device)
-    log_p: Tensor = _LogProbability.apply(a, mu, sigma, q)  # type: ignore[no-untyped-call]
-    return log_p
-
-
-class _ClipValue(torch.autograd.Function):
-    """Clips bits forward but passes the gradient of the unclipped bits, so that it still reaches outliers."""
-
-    @staticmethod
-    def forward(ctx: Any, bits: Tensor) -> Tensor:
-        return bits.clamp(max=MAX_BITS)
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Tensor:
-        return grad
-
-
-def rate_bits(a: Tensor, mu: Tensor, sigma: Tensor, q: Tensor | float) -> Tensor:
-    """Returns R(a) in bits, in the shape of the broadcast inputs, with probabilities clipped at 1e-6."""
-    q = torch.as_tensor(q, dtype=a.dtype, device=a.device)
-    sigma = torch.maximum(sigma, q * MIN_SIGMA_RATIO)
-    bits: Tensor = _ClipValue.apply(-log_probability(a, mu, sigma, q) / _LN2)  # type: ignore[no-untyped-call]
-    return bits
-
-
-def channel_moments(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns mean and standard deviation per column of x [n, c], n >= 1, both differentiable."""
-    mu = x.mean(0)
-    return mu, ((x - mu).square().mean(0) + MIN_VARIANCE).sqrt()
-
-
-# -- rows of anchors, in numba -----------------------------------------------------------------------------------------
-
-# `classes` int8 [N] is the step class of each anchor, -1 if inactive. Values are [N, c] of one float type, computed in
-# float64. Sums are kept per block of rows, so that results do not depend on the number of threads.
-
-_BLOCK = 1024  #: rows
 _SQRT_HALF_PI = math.sqrt(0.5 * math.pi)
 _INVERSE_SQRT_PI = 1.0 / math.sqrt(math.pi)
 #: From here on erfcx is computed by its asymptotic series, to 4e-12; below by exp(x^2) erfc(x), to 1e-13.
@@ -162,6 +64,83 @@ def _probability(z: float, h: float, u: float, v: float, narrow_below: float) ->
         return math.log(p), math.exp(-0.5 * u * u - _HALF_LN_2PI) / p
     mass = _SQRT_HALF_PI * (_erfcx(u * _SQRT_HALF) - math.exp(-2 * z * h) * _erfcx(v * _SQRT_HALF))
     return math.log(mass) - 0.5 * u * u - _HALF_LN_2PI, 1.0 / mass
+
+
+@parallel(lambda log_p, *_: len(log_p))
+def _log_probabilities(
+    tasks: Tasks, log_p: Array, slopes: Array, a: Array, mu: Array, sigma: Array, q: Array, narrow_below: float
+) -> None:
+    """Fills log_p [n] with ln P, and slopes [3, n] with its derivatives by a, sigma and Q. All float64 [n]."""
+    for i in range(tasks[0], tasks[1]):
+        signed = a[i] - mu[i]
+        z, h = abs(signed) / sigma[i], 0.5 * q[i] / sigma[i]
+        u, v = (abs(signed) - 0.5 * q[i]) / sigma[i], (abs(signed) + 0.5 * q[i]) / sigma[i]
+        log_p[i], ratio = _probability(z, h, u, v, narrow_below)
+        m = math.expm1(-2 * z * h)
+        slopes[0, i] = np.sign(signed) * ratio * m / sigma[i]
+        slopes[1, i] = -ratio * (2 * h + v * m) / sigma[i]
+        slopes[2, i] = ratio * h * (2 + m) / q[i]
+
+
+class _LogProbability(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, *inputs: Tensor) -> Tensor:
+        wide = np.broadcast_arrays(*(x.numpy().astype(np.float64) for x in inputs))
+        a, mu, sigma, q = map(np.ravel, wide)
+        log_p, slopes = np.empty(len(a)), np.empty((3, len(a)))
+        _log_probabilities(log_p, slopes, a, mu, sigma, q, NARROW[inputs[0].dtype])
+        ctx.slopes = torch.from_numpy(slopes).view(3, *wide[0].shape)
+        ctx.shapes, ctx.dtype = [x.shape for x in inputs], inputs[0].dtype
+        return torch.from_numpy(log_p).view(wide[0].shape).to(ctx.dtype)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, ...]:
+        by_a, by_sigma, by_q = grad * ctx.slopes
+        grads = (by_a, -by_a, by_sigma, by_q)
+        return tuple(g.sum_to_size(shape).to(ctx.dtype) for g, shape in zip(grads, ctx.shapes, strict=True))
+
+
+def log_probability(a: Tensor, mu: Tensor, sigma: Tensor, q: Tensor | float) -> Tensor:
+    """Returns ln P of a +- Q/2 under N(mu, sigma), broadcast, on the CPU; gradients reach all arguments, finite in the
+    tails."""
+    q = torch.as_tensor(q, dtype=a.dtype)
+    log_p: Tensor = _LogProbability.apply(a, mu, sigma, q)  # type: ignore[no-untyped-call]
+    return log_p
+
+
+class _ClipValue(torch.autograd.Function):
+    """Clips bits forward but passes the gradient of the unclipped bits, so that it still reaches outliers."""
+
+    @staticmethod
+    def forward(ctx: Any, bits: Tensor) -> Tensor:
+        return bits.clamp(max=MAX_BITS)
+
+    @staticmethod
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
+        return grad
+
+
+def rate_bits(a: Tensor, mu: Tensor, sigma: Tensor, q: Tensor | float) -> Tensor:
+    """Returns R(a) in bits, in the shape of the broadcast inputs on the CPU, probabilities clipped at 1e-6."""
+    q = torch.as_tensor(q, dtype=a.dtype)
+    sigma = torch.maximum(sigma, q * MIN_SIGMA_RATIO)
+    bits: Tensor = _ClipValue.apply(-log_probability(a, mu, sigma, q) / _LN2)  # type: ignore[no-untyped-call]
+    return bits
+
+
+def channel_moments(x: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns mean and standard deviation per column of x [n, c], n >= 1, both differentiable."""
+    mu = x.mean(0)
+    return mu, ((x - mu).square().mean(0) + MIN_VARIANCE).sqrt()
+
+
+# -- rows of anchors, in numba -----------------------------------------------------------------------------------------
+
+# `classes` int8 [N] is the step class of each anchor, -1 if inactive. Values are [N, c] of one float type, computed in
+# float64. Sums are kept per block of rows, so that results do not depend on the number of threads.
+
+_BLOCK = 1024  #: rows
 
 
 @parallel(lambda parts, *_: len(parts))
