@@ -218,7 +218,7 @@ class Steps:
     @property
     def attributes(self) -> dict[str, float]:
         """Steps by attribute name."""
-        return {"feature": self.feature, "scaling_log": self.scaling_log, "offset": self.offset}
+        return {name: getattr(self, name) for name in ATTRIBUTES}
 
     def planes(self, layer: int) -> float:
         """Step of the planes of layer 1 or 2."""
@@ -306,7 +306,7 @@ class Scene:
     @property
     def attributes(self) -> dict[str, np.ndarray]:
         """Arrays float32 [N, ...] by attribute name."""
-        return {"feature": self.feature, "scaling_log": self.scaling_log, "offset": self.offset}
+        return {name: getattr(self, name) for name in ATTRIBUTES}
 
     def of_anchors(self, rows: np.ndarray | slice) -> dict[str, Any]:
         """Returns the fields of the anchors `rows`, without masks, as arguments of `dataclasses.replace`."""
