@@ -170,7 +170,7 @@ def write_gif(frames: Iterator[np.ndarray], path: Path, fps: float) -> None:
 
 
 def write_mp4(frames: Iterator[np.ndarray], path: Path, fps: float, *, fragment: int | None = None) -> None:
-    """Writes H.264 in 4:2:0, which every browser plays; an odd row or column is cropped.
+    """Writes one frame or more as H.264 in 4:2:0, which every browser plays; an odd row or column is cropped.
 
     fragment: for streaming, frames per fragment, each of which starts with a key frame; None for a plain file. Raises
     RenderError without ffmpeg, DataError if ffmpeg cannot write the whole file.
@@ -178,9 +178,7 @@ def write_mp4(frames: Iterator[np.ndarray], path: Path, fps: float, *, fragment:
     check_mp4()
     movflags = "+frag_keyframe+empty_moov+default_base_moof"
     options = ["-g", str(fragment), "-sc_threshold", "0", "-bf", "0", "-movflags", movflags] if fragment else []
-    first = next(frames, None)
-    if first is None:
-        return
+    first = next(frames)
     height, width = (size // 2 * 2 for size in first.shape[:2])
     if min(height, width) < 2:
         raise RenderError(f"the camera has {first.shape[1]}x{first.shape[0]} pixels, expected at least 2x2 for a video")
