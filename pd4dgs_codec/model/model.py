@@ -170,7 +170,7 @@ class Model(nn.Module):
         steps, centres, names = self.steps.attributes, self.centres, ("feature", "offset", "scaling_log")
         noise = None
         if rounding.noise is not None and not rounding.attributes:
-            draws = {n: rounding.noise.draw(torch.Size((len(rows), centres[n].numel()))) for n in ATTRIBUTES}
+            draws = {n: rounding.noise.draw(len(rows), centres[n].numel()) for n in ATTRIBUTES}
             noise = [draws[name] for name in names]
         quantisation = Quantisation(
             [steps[n] for n in names], [centres[n] for n in names], self.spacing, noise, rounding.attributes

@@ -23,13 +23,13 @@ class Noise:
         self.generator = torch.Generator().manual_seed(seed)
         self.pool = (torch.rand(POOL, generator=self.generator) - 0.5).to(device)
 
-    def draw(self, shape: torch.Size) -> Tensor:
-        """Returns noise of `shape`."""
-        n = shape.numel()
+    def draw(self, rows: int, columns: int) -> Tensor:
+        """Returns noise [rows, columns]."""
+        n = rows * columns
         if n > len(self.pool):
-            return torch.rand(shape, generator=self.generator).to(self.pool.device) - 0.5
+            return torch.rand(rows, columns, generator=self.generator).to(self.pool.device) - 0.5
         start = int(torch.randint(len(self.pool) - n + 1, (), generator=self.generator))
-        return self.pool[start : start + n].view(shape)
+        return self.pool[start : start + n].view(rows, columns)
 
 
 @dataclass(frozen=True)
