@@ -13,7 +13,7 @@ import re
 import shutil
 import stat
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -75,15 +75,20 @@ def whole_file(path: str | Path, overwrite: bool) -> Iterator[Path]:
         _move(folder / target.name, target)
 
 
+def check_new(names: Iterable[str], overwrite: bool) -> None:
+    """Raises DataError if an output is a URI, or exists without `overwrite`."""
+    for name in names:
+        check_path(name)
+        if Path(name).exists() and not overwrite:
+            raise DataError(f"{name}: exists already; --overwrite replaces it")
+
+
 @contextlib.contextmanager
 def whole_files(names: Sequence[str], overwrite: bool, told: str | None = None) -> Iterator[list[Path]]:
     """Yields temporary paths for outputs in one folder, which appear together once all are written. Creates the folder
-    if missing. Raises DataError if an output exists without `overwrite`; an OSError names `told` or the first."""
-    check_path(names[0])
+    if missing. Raises DataError as check_new does; an OSError names `told` or the first."""
+    check_new(names, overwrite)
     parent = Path(names[0]).parent
-    for name in names:
-        if Path(name).exists() and not overwrite:
-            raise DataError(f"{name}: exists already; --overwrite replaces it")
     existing = next(p for p in (parent, *parent.parents) if p.exists())
     if not existing.is_dir():
         raise DataError(f"{existing}: is a file, expected a folder to write into")

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from pd4dgs_codec.cli import options
 from pd4dgs_codec.cli.common import OK, STDIO, Console, command, number, progress_bar, read_bytes, same_file, say, table
 from pd4dgs_codec.errors import DeliveryError, RenderError
-from pd4dgs_codec.io import temporary_folder, whole_files
+from pd4dgs_codec.io import check_new, temporary_folder, whole_files
 
 if TYPE_CHECKING:
     import numpy as np
@@ -67,9 +67,10 @@ def _package(args: argparse.Namespace, console: Console) -> int:
     if args.input != STDIO and Path(args.input).is_dir():
         return _library(args, console)
     check_usage(args)
-    data = read_bytes(args.input)
-    from pd4dgs_codec.web.package import package
+    from pd4dgs_codec.web.package import INDEX, package
 
+    check_new([str(Path(args.output) / INDEX)], args.overwrite)  # before a video is rendered
+    data = read_bytes(args.input)
     missing = ["--no-video"] if args.no_video else []
 
     def render(scene: Scene) -> Video | None:

@@ -212,6 +212,15 @@ def test_without_a_renderer_there_is_a_clear_word(cli, folder, tmp_path, monkeyp
     assert done.code == 1 and "threads is 100000" in done.err and not (tmp_path / "other").exists()
 
 
+@pytest.mark.parametrize("output", ["out", "s3://films/out"])
+def test_outputs_are_checked_before_a_video_is_rendered(cli, folder, tmp_path, monkeypatch, output):
+    monkeypatch.chdir(tmp_path)
+    assert cli("package", folder / "scene.pd4", "-o", "out", "--no-video").code == 0
+    monkeypatch.setattr("pd4dgs_codec.cli.package._render", lambda *_: pytest.fail("renders a video"))
+    done = cli("package", folder / "scene.pd4", "-o", output)
+    assert done.code == 1 and ("exists already" in done.err or "looks like a URI" in done.err)
+
+
 @pytest.mark.parametrize(
     ("time_range", "camera", "says"), [((0.0, 2.0), False, "no camera"), ((0.0, 1e5), True, "2,000,000 frames")]
 )
