@@ -371,15 +371,17 @@ def _header(path: Path, raw: bytes) -> tuple[str, int, np.dtype, int]:
     return kind, count, np.dtype(fields), newline + 1
 
 
-def _body(path: Path, raw: bytes, kind: str, count: int, dtype: np.dtype) -> np.ndarray:
-    """Structured array [count] of the vertices."""
-    names = dtype.names or ()
+def read_vertices(path: Path, raw: bytes | None = None) -> np.ndarray:
+    """Structured array [count] of the vertex element, one field per property. raw: the file's bytes, if known."""
+    raw = read_file(path) if raw is None else raw
+    kind, count, dtype, start = _header(path, raw)
+    names, body = dtype.names or (), raw[start:]
     if kind == "binary_little_endian":
-        if len(raw) < count * dtype.itemsize:
+        if len(body) < count * dtype.itemsize:
             size = count * dtype.itemsize
-            raise DataError(f"{path}: {len(raw)} bytes of vertices, expected {size} for {count} of them")
-        return np.frombuffer(raw, dtype, count)
-    lines = raw.decode("ascii", "replace").splitlines()[:count]
+            raise DataError(f"{path}: {len(body)} bytes of vertices, expected {size} for {count} of them")
+        return np.frombuffer(body, dtype, count)
+    lines = body.decode("ascii", "replace").splitlines()[:count]
     if len(lines) < count:
         raise DataError(f"{path}: {len(lines)} vertex lines, expected {count}")
     try:
@@ -391,13 +393,6 @@ def _body(path: Path, raw: bytes, kind: str, count: int, dtype: np.dtype) -> np.
         for name, column in zip(names, table.T, strict=True):
             vertices[name] = column
     return vertices
-
-
-def read_vertices(path: Path, raw: bytes | None = None) -> np.ndarray:
-    """Structured array [count] of the vertex element, one field per property. raw: the file's bytes, if known."""
-    raw = read_file(path) if raw is None else raw
-    kind, count, dtype, start = _header(path, raw)
-    return _body(path, raw[start:], kind, count, dtype)
 
 
 def read_only_ply(folder: Path) -> np.ndarray | None:

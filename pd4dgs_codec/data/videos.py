@@ -15,7 +15,7 @@ import subprocess
 import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any
@@ -230,7 +230,7 @@ def _compress(video: Video, file: Path, cache: Path, treat: Callable[[np.ndarray
 
     compress, limit = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress, _limit()
     offsets, shape = [0], list[int]()
-    others = sum(other.stat().st_size for other in cache.glob("*.frames"))
+    others = sum(stat.st_size for stat in _cached(cache).values())
     with file.open("wb") as stream:
         for picture in video.pictures:
             frame = np.ascontiguousarray(treat(picture))
@@ -262,13 +262,22 @@ def _limit() -> float:
 
 def _make_room(cache: Path, limit: float) -> int:
     """Removes the least recently used files until the rest takes `limit` bytes or is in use. Returns its bytes."""
-    files = sorted(cache.glob("*.frames"), key=lambda file: file.stat().st_mtime)
-    total = sum(file.stat().st_size for file in files)
-    for file in files:
+    files = _cached(cache)
+    total = sum(stat.st_size for stat in files.values())
+    for file, stat in sorted(files.items(), key=lambda item: item[1].st_mtime):
         if total > limit and file not in _IN_USE:
-            total -= file.stat().st_size
-            file.unlink()
+            total -= stat.st_size
+            file.unlink(missing_ok=True)
     return total
+
+
+def _cached(cache: Path) -> dict[Path, os.stat_result]:
+    """The files of the cache. Other processes may remove some meanwhile."""
+    found = {}
+    for file in cache.glob("*.frames"):
+        with suppress(FileNotFoundError):
+            found[file] = file.stat()
+    return found
 
 
 # -- datasets ----------------------------------------------------------------------------------------------------------

@@ -356,11 +356,6 @@ def border_color(views: Sequence[View]) -> tuple[float, float, float]:
     return float(r), float(g), float(b)
 
 
-def centers(frames: Sequence[UnreadView]) -> np.ndarray:
-    """Camera centres float64 [n, 3], world."""
-    return np.stack([-f.viewmat[:3, :3].T @ f.viewmat[:3, 3] for f in frames])
-
-
 def mean_up(frames: Sequence[UnreadView]) -> tuple[float, float, float]:
     """Unit mean of the cameras' up directions (minus OpenCV's y axis)."""
     up = -np.mean([f.viewmat[1, :3] for f in frames], axis=0)
@@ -405,7 +400,8 @@ def cameras_box(frames: Sequence[UnreadView], depth: tuple[float, float] | None 
 
     Its half side is 1.3/4 of the median distance, as in D-NeRF, or half of far - near if `depth` is known.
     """
-    origins, axes = centers(frames), np.stack([f.viewmat[2, :3] for f in frames])
+    origins = np.stack([-f.viewmat[:3, :3].T @ f.viewmat[:3, 3] for f in frames])
+    axes = np.stack([f.viewmat[2, :3] for f in frames])
     normal = np.eye(3) - axes[:, :, None] * axes[:, None, :]
     total = normal.sum(axis=0)
     if np.linalg.eigvalsh(total)[0] > 1e-3 * len(frames):

@@ -75,6 +75,12 @@ def test_a_full_disk_keeps_no_part_of_a_video(folder, monkeypatch, cache):
     assert not list(cache.iterdir())
 
 
+def test_a_video_that_another_process_has_just_removed_takes_no_room(folder, cache):
+    cache.mkdir(exist_ok=True)
+    (cache / "gone.frames").symlink_to("nothing")  # is listed and cannot be measured
+    assert load(folder).train
+
+
 def test_a_cache_that_is_lost_or_broken_is_reported_and_made_anew(folder, cache):
     view = load(folder).train[0]
     expected = view.image
