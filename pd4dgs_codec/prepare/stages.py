@@ -157,16 +157,26 @@ def _frames(
 
 
 def _poses(work: Path, times: dict[str, float], options: Options, progress: Progress) -> Findings:
-    """Estimates the poses and writes the model without moving features to sparse/0."""
+    """Estimates the poses and writes the model without moving features to sparse/0. Raises DataError for a camera that
+    stands still, or too few poses."""
     names, images, database = sorted(times), work / "images", work / "colmap.db"
     with progress(len(names), "frames", "features") as advance:
         poses.extract(database, images, names, options.camera, options.threads, advance)
     listed = poses.pairs(len(names))
     with progress(len(listed), "pairs", "matching") as advance:
         poses.match(database, names, listed, options.threads, advance)
-    _check_moves(poses.travel(database), image_info(images / names[0])[0])
+    travel, width = poses.travel(database), image_info(images / names[0])[0]
+    if 0 <= travel < poses.STILL * width / 1000:  # without any pair of frames, the model below says more
+        found = f"static points move by at most {travel:.1f} pixels between frames"
+        raise DataError(f"the camera stands still: {found}; expected a camera that moves around the scene")
     with progress(None, "frames", "poses") as advance:
-        model = _checked(poses.reconstruct(database, images, work / "models", options.threads, advance), len(names))
+        model = poses.reconstruct(database, images, work / "models", options.threads, advance)
+    posed = 0 if model is None else model.num_reg_images()
+    if model is None or posed < max(FEWEST_FRAMES, poses.LEAST_SHARE * len(names)):
+        raise DataError(
+            f"found camera poses for {posed} of {len(names)} frames, expected at least half; "
+            "record static, textured objects with a camera that moves slowly and sideways"
+        )
     features = poses.moving_features(database, model)
     named = [image for image in model.images.values() if image.name in features]
     moving = {image.name: features[image.name].moving(image.camera.width) for image in named}
@@ -174,24 +184,6 @@ def _poses(work: Path, times: dict[str, float], options: Options, progress: Prog
     poses.upright(model)
     poses.write(model, work / "sparse" / "0")
     return Findings(model, features, moving)
-
-
-def _check_moves(travel: float, width: int) -> None:
-    """Raises DataError for a camera on a tripod; without any pair of frames, `_checked` reports more."""
-    if 0 <= travel < poses.STILL * width / 1000:
-        found = f"static points move by at most {travel:.1f} pixels between frames"
-        raise DataError(f"the camera stands still: {found}; expected a camera that moves around the scene")
-
-
-def _checked(model: Any | None, count: int) -> Any:
-    """Returns the model. Raises DataError if it has poses of too few of `count` frames."""
-    found = 0 if model is None else model.num_reg_images()
-    if model is None or found < max(FEWEST_FRAMES, poses.LEAST_SHARE * count):
-        raise DataError(
-            f"found camera poses for {found} of {count} frames, expected at least half; "
-            "record static, textured objects with a camera that moves slowly and sideways"
-        )
-    return model
 
 
 def _finish(
