@@ -76,11 +76,6 @@ class Eyes:
         """float32 [E, 3], world."""
         return np.stack([camera_eye(camera) for camera in self.cameras]).astype(np.float32)
 
-    def weigh(self, positions: np.ndarray) -> np.ndarray:
-        """Returns weights [E, n] float64 for anchors at `positions` [n, 3], times OUTSIDE for anchors out of view."""
-        inside = np.stack([_inside(camera, positions) for camera in self.cameras])
-        return np.asarray(self.weights[:, None] * np.where(inside, 1.0, OUTSIDE))
-
 
 def eyes_of_cameras(cameras: Sequence[Camera]) -> Eyes:
     """Picks EYES cameras, evenly spaced in their order, or all if there are fewer. Their weights are equal."""
@@ -150,7 +145,8 @@ def _bake(
     finite = np.isfinite(g.colors).all(axis=1).reshape(count, -1)  # as in Player.picture
     opacities = np.where(finite, opacities, 0)
     colors = np.nan_to_num(g.colors).reshape(count, -1, 3)
-    prior = eyes.weigh(player.positions[rows])
+    inside = np.stack([_inside(camera, player.positions[rows]) for camera in eyes.cameras])
+    prior = eyes.weights[:, None] * np.where(inside, 1.0, OUTSIDE)
     prior = prior[:, np.searchsorted(rows, slots // player.slots)]
     prior /= prior.sum(axis=0)
     weights = prior * opacities

@@ -243,11 +243,6 @@ def _through(layers: list[Layer], values: np.ndarray) -> np.ndarray:
     return values
 
 
-def _places(state: State, name: str) -> list[int]:
-    """Returns the numbers of the linear layers in a sequence where every second layer is a ReLU."""
-    return [i for i in range(0, 2 * MOST_LAYERS, 2) if f"{name}.{i}.weight" in state.tensors] or [0]
-
-
 # -- 4DGaussians -------------------------------------------------------------------------------------------------------
 
 
@@ -258,7 +253,8 @@ def _hexplane_move(state: State, config: Config, rest: Parts) -> Move:
             raise DataError(f"{config.path}: has {name}={value}, expected 0 or False")
     net = "deformation_net"
     field, features = _field(state, f"{net}.grid")
-    trunk = state.chain(f"{net}.feature_out", _places(state, f"{net}.feature_out"), features)
+    places = [i for i in range(0, 2 * MOST_LAYERS, 2) if f"{net}.feature_out.{i}.weight" in state.tensors]
+    trunk = state.chain(f"{net}.feature_out", places or [0], features)  # every second layer is a ReLU
     width = len(trunk[-1][1])
     heads = {
         name: state.chain(f"{net}.{head}", (1, 3), width, int(np.prod(rest[name].shape[1:])))

@@ -88,17 +88,15 @@ def load_source(source: str, *, downscale: int = 1, holdout: int = 8, background
     """Loads a `teacher:` source, or any other as `data.dataset.load` does. Raises DataError."""
     if not source.startswith(PREFIX):
         return load(source, downscale=downscale, holdout=holdout, background=background)
-    place, options = _parsed(source)
+    place, values = split_options(source.removeprefix(PREFIX), source, _value, EXAMPLES)
+    if not place:
+        raise DataError(f"{source}: names no teacher; expected {PREFIX}FOLDER, {PREFIX}FILE or {PREFIX}module:function")
+    options = Options(**values)
     teacher = read_model(place, options.fps)
-    if options.cameras:
-        like = load(options.cameras, downscale=downscale, holdout=holdout, background=background)
-        return _like(source, teacher, like)
-    return _around(source, Path(place), teacher, options, downscale, holdout)
-
-
-def _like(source: str, teacher: Teacher, data: Dataset) -> Dataset:
-    """Replaces the training pictures of a dataset by the teacher's; the held-out pictures stay."""
-    poses = [(view.camera, view.time) for view in data.train]
+    if not options.cameras:
+        return _around(source, Path(place), teacher, options, downscale, holdout)
+    data = load(options.cameras, downscale=downscale, holdout=holdout, background=background)
+    poses = [(view.camera, view.time) for view in data.train]  # the held-out pictures stay
     train = _pictures(teacher, poses, data.background, data.near)
     return replace(data, name=source, train=tuple(train), points=_points(teacher, _solid(source, teacher, MIDDLE)))
 
@@ -147,14 +145,6 @@ def _pictures(teacher: Teacher, poses: Sequence[tuple[Camera, float]], backgroun
         image = np.rint(picture(teacher.splats(t), camera, background, near) * 255).astype(np.uint8)
         views[i] = View(camera.viewmat, camera.K, camera.width, camera.height, t, image, None, f"{i:05d}", i)
     return [views[i] for i in range(len(poses))]
-
-
-def _parsed(source: str) -> tuple[str, Options]:
-    """Splits `teacher:place?key=value&...` into place and options."""
-    place, values = split_options(source.removeprefix(PREFIX), source, _value, EXAMPLES)
-    if not place:
-        raise DataError(f"{source}: names no teacher; expected {PREFIX}FOLDER, {PREFIX}FILE or {PREFIX}module:function")
-    return place, Options(**values)
 
 
 def _value(key: str, text: str) -> Any:
