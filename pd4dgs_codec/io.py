@@ -113,11 +113,14 @@ def check_source(path: str | Path) -> None:
 
 
 def read_source(path: str | Path) -> bytes:
-    """All bytes of a file, or of a pipe until its writer closes it. Raises as `check_source` does, and for a folder."""
-    check_source(path)
-    if os.path.isdir(path):
-        raise DataError(f"{path}: is a folder, expected a file")
-    return Path(path).read_bytes()
+    """All bytes of a file, or of a pipe until its writer closes it. Raises DataError for all else."""
+    try:
+        check_source(path)
+        if os.path.isdir(path):
+            raise DataError(f"{path}: is a folder, expected a file")
+        return Path(path).read_bytes()
+    except (OSError, ValueError) as error:  # ValueError: a NUL or half a surrogate in the name
+        raise DataError(f"{path}: cannot be read: {getattr(error, 'strerror', error)}") from None
 
 
 def remove_leftovers(path: str | Path) -> None:

@@ -190,7 +190,7 @@ class TrainingProgress:
 
 
 def read_bytes(path: str) -> bytes:
-    """Reads a file, or stdin for `-`. Raises an OSError that names the path, UsageError if stdin is a terminal."""
+    """Reads a file, or stdin for `-`. Raises DataError that names the path, UsageError if stdin is a terminal."""
     if path != STDIO:
         from pd4dgs_codec.io import read_source
 
@@ -248,19 +248,12 @@ def is_pd4(data: bytes) -> bool:
     return data.startswith(SIGNATURE[:4])
 
 
-class _Stdin(io.BytesIO):
-    """The bytes of stdin, for a file reader that names its input in messages."""
-
-    def __str__(self) -> str:
-        return "stdin"
-
-
 def checkpoint_scene(path: str, data: bytes) -> Scene:
-    """Loads the scene of the checkpoint at `path`, or of its bytes `data` if the path is `-`. Needs torch."""
+    """The scene of a checkpoint of bytes `data`, read from `path`. Needs torch."""
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.model.model import to_scene
 
-    model, _ = checkpoint.load(path if path != STDIO else _Stdin(data))
+    model, _ = checkpoint.loads(data, shown_name(path))
     return to_scene(model)
 
 

@@ -12,7 +12,7 @@ import io
 import os
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import torch
@@ -62,18 +62,17 @@ def target(path: str | Path) -> Path:
     return real
 
 
-def load(path: str | Path | BinaryIO) -> tuple[Model, dict[str, Any]]:
+def load(path: str | Path) -> tuple[Model, dict[str, Any]]:
     """Reads a checkpoint. Returns (model, training). Raises DataError, of one line, for any other or damaged file."""
-    try:
-        raw = read_source(path) if isinstance(path, (str, Path)) else path.read()
-    except FileNotFoundError:
-        raise DataError(f"{path}: no such checkpoint") from None
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        raise DataError(f"{path}: cannot be read: {getattr(error, 'strerror', error)}") from None
+    return loads(read_source(path), str(path))
+
+
+def loads(raw: bytes, path: str) -> tuple[Model, dict[str, Any]]:
+    """`load` of the bytes of a file; messages call it `path`."""
     if not raw.startswith(b"PK"):  # a zip archive, as torch writes it
         found = f"a file that begins with {raw[:8]!r}" if raw else "an empty file"
         raise DataError(f"{path}: found {found}, expected a .pd4 file or a {FORMAT}")
-    content = read_tensors(raw, str(path), lambda array: torch.from_numpy(np.array(array)))
+    content = read_tensors(raw, path, lambda array: torch.from_numpy(np.array(array)))
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         found = (
             f"dict with keys {sorted(map(str, content))[:4]}" if isinstance(content, dict) else type(content).__name__

@@ -69,24 +69,17 @@ def load_levels(
     background: RGB in place of the scene's. Each level of a `.pd4` is decoded from its own prefix, so no data of later
     layers can leak into it. Raises DataError for a file that cannot be read, DecodeError for an invalid `.pd4`.
     """
-    data = file if isinstance(file, bytes) else _read(file)
+    data = file if isinstance(file, bytes) else read_source(file)
     if isinstance(file, bytes) or data.startswith(SIGNATURE[:4]):
         levels = _of_bytes(data, max_layer, max_bytes, last_only)
     elif max_bytes is None:
-        levels = _of_checkpoint(file, max_layer)[-1 if last_only else 0 :]
+        levels = _of_checkpoint(data, str(file), max_layer)[-1 if last_only else 0 :]
     else:
         raise DataError(f"{file}: a checkpoint has no slices; expected a .pd4 file")
     if background is not None:
         for level in levels:
             level.model.info = replace(level.model.info, background=background)
     return levels
-
-
-def _read(file: str | Path) -> bytes:
-    try:
-        return read_source(file)
-    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
-        raise DataError(f"{file}: cannot be read: {getattr(error, 'strerror', error)}") from None
 
 
 def _of_bytes(data: bytes, max_layer: int | None, max_bytes: int | None, last_only: bool) -> list[Level]:
@@ -105,12 +98,12 @@ def _of_bytes(data: bytes, max_layer: int | None, max_bytes: int | None, last_on
     return levels
 
 
-def _of_checkpoint(path: str | Path, max_layer: int | None) -> list[Level]:
+def _of_checkpoint(data: bytes, name: str, max_layer: int | None) -> list[Level]:
     import torch
 
     from pd4dgs_codec.model import checkpoint
 
-    model, _ = checkpoint.load(path)
+    model, _ = checkpoint.loads(data, name)
     with torch.no_grad():
         return [
             Level(level, model, int((model.masks(level) > MASK_THRESHOLD).sum()))

@@ -283,13 +283,13 @@ def test_a_missing_package_is_named(cli, scene_pd4, tmp_path, monkeypatch, kind,
 
 
 def test_missing_torch_and_faults_of_ours_are_one_line(cli, model_pt, scene_pd4, tmp_path, monkeypatch):
-    def gone(path):
+    def gone(*_):
         raise ModuleNotFoundError("No module named 'torch'", name="torch")
 
     def broken(data):
         raise ZeroDivisionError("a fault of ours")
 
-    monkeypatch.setattr("pd4dgs_codec.model.checkpoint.load", gone)
+    monkeypatch.setattr("pd4dgs_codec.model.checkpoint.loads", gone)
     _check(cli("encode", model_pt, "-o", tmp_path / "s.pd4"), "encode", 1, "pip install 'pd4dgs-codec[train]'")
     monkeypatch.setattr("pd4dgs_codec.format.info.info", broken)
     result = cli("info", scene_pd4)

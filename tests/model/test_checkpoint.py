@@ -165,7 +165,7 @@ def test_what_costs_more_than_it_weighs_is_refused_in_one_line(path, kind):
 
 
 def test_missing_files_and_folders(tmp_path):
-    refusal(tmp_path / "none.pt", "no such")
+    refusal(tmp_path / "none.pt", "No such")
     (tmp_path / "folder.pt").mkdir()
     refusal(tmp_path / "folder.pt")
 
