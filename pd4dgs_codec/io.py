@@ -114,11 +114,18 @@ def check_source(path: str | Path) -> None:
 
 def read_source(path: str | Path) -> bytes:
     """All bytes of a file, or of a pipe until its writer closes it. Raises DataError for all else."""
-    try:
+    with reading(path):
         check_source(path)
         if os.path.isdir(path):
             raise DataError(f"{path}: is a folder, expected a file")
         return Path(path).read_bytes()
+
+
+@contextlib.contextmanager
+def reading(path: str | Path) -> Iterator[None]:
+    """Within the block, errors of the system and invalid names become a DataError that names `path`."""
+    try:
+        yield
     except (OSError, ValueError) as error:  # ValueError: a NUL or half a surrogate in the name
         raise DataError(f"{path}: cannot be read: {getattr(error, 'strerror', error)}") from None
 

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pd4dgs_codec.errors import DataError, one_line
+from pd4dgs_codec.io import reading
 
 if TYPE_CHECKING:
     from PIL.Image import Image as Picture
@@ -64,11 +65,9 @@ def check_regular(path: Path) -> None:
 
 def read_file(path: Path) -> bytes:
     """Reads all bytes of a regular file. Raises DataError."""
-    try:
+    with reading(path):
         check_regular(path)
         return path.read_bytes()
-    except (OSError, ValueError) as error:  # ValueError: a NUL or half a surrogate in the name
-        raise DataError(f"{path}: cannot be read: {getattr(error, 'strerror', error)}") from None
 
 
 def read_json(path: Path) -> dict[str, Any]:
