@@ -192,6 +192,11 @@ class Model(nn.Module):
         step = self.steps.weights(layers[-1]) if rounding.weights else None
         return fields[-1].moved(rows, features, self.widths.head_columns, t, step, kernels)
 
+    def moved_points(self, points: Tensor, level: int, t: float, rounding: Rounding = EXACT) -> Tensor:
+        """Returns points [n, 3], world, as the deformation of `level` moves them to normalised time t."""
+        rows = torch.cat([points, points.new_zeros(len(points), self.widths.channels)], dim=1)
+        return self._moved(level, rows, t, rounding, self._fusible())[:, :3]
+
     def _viewmat(self, camera: Camera) -> Tensor:
         """[4, 4] world to camera."""
         return torch.as_tensor(np.array(camera.viewmat, np.float32), device=self.feature.device)

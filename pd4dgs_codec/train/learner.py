@@ -21,6 +21,7 @@ from pd4dgs_codec.train.losses import ModelLoss
 from pd4dgs_codec.train.phases import Phase
 from pd4dgs_codec.train.phases.grow import Grow
 from pd4dgs_codec.train.phases.levels import SelectLevels
+from pd4dgs_codec.train.phases.matching import Match
 from pd4dgs_codec.train.phases.opening import OpenTime, few_instants
 from pd4dgs_codec.train.phases.prefixes import Prefixes
 from pd4dgs_codec.train.phases.prune import Prune
@@ -54,10 +55,12 @@ class Learner(TrainState):
         super().__init__(config, dataset, schedule, device, size)
         self.model_loss = ModelLoss(config, self.generator)
         self.levels, self.prefixes, self.grow = SelectLevels(self.practise), Prefixes(), Grow()
+        self.match = Match()
         self.before_practice: Callable[[int, int], None] = lambda done, steps: None
         pruning = (Prune(turn) for turn in range(PRUNING_ROUNDS))
         self.before_step: list[Phase] = [
             OpenTime(self.practise),
+            self.match,
             self.levels,
             FitQuantisation(),
             *pruning,
@@ -207,6 +210,9 @@ class Learner(TrainState):
             x, y, z = picture.gaussians.scales.unbind(1)  # the gradient of prod() is slow
             terms["volume"] = (x * y * z).mean()
             loss = loss + config.volume * terms["volume"]
+        if (guide := self.match.term(self, level)) is not None:
+            terms["match"] = guide
+            loss = loss + self.match.weight(self) * guide
         return picture, terms, loss
 
     def _measure(self, record: dict[str, Any]) -> None:

@@ -1,0 +1,204 @@
+"""Guides motion where pictures cannot: points of what moves are found at each instant and matched between instants.
+
+A picture teaches motion only where a body's picture and its image overlap. A small body that moves by its own size in a
+few views overlaps nowhere, and fades. Its points are found without a model of its motion, where pixels that differ from
+level 0 agree in successive views (photo-consistency: Seitz and Dyer, Photorealistic scene reconstruction by voxel
+coloring, 1997). The deformation moves the points of the key instant to another instant, where the nearest point of
+similar colour attracts each (iterative closest points: Besl and McKay, A method for registration of 3-D shapes, 1992).
+Large surfaces slide along themselves in such matches, so the term ends early. `opening` finds steady motion better.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, max_pool2d
+
+from pd4dgs_codec.data.view import View
+from pd4dgs_codec.train import phases, workers
+from pd4dgs_codec.train.phases.levels import held_back_views, images
+from pd4dgs_codec.train.state import TrainState
+
+#: Weight of the loss term where it starts; it falls to 0 until END, a share of the run.
+WEIGHT, END = 0.4, 0.35
+#: Training views that are searched at most; more views are searched in groups of three, evenly spread.
+MOST_VIEWS = 240
+#: Pixels of a view that are searched, at random, and depths on the ray of each.
+PIXELS, DEPTHS = 400, 64
+#: A pixel shows something that moves if its mean difference from level 0 is MOVED. Its point is at the depth at which
+#: the colours of three views differ least, if by at most CONSISTENT, and if a share of at most AMBIGUOUS of the depths
+#: does.
+MOVED, CONSISTENT, AMBIGUOUS = 0.12, 0.16, 0.3
+#: If fewer of the pixels have a point, the camera moves too little between views for their depths to be trusted.
+LEAST_FOUND = 1 / 6
+#: Points of the key instant are those of KEY_VIEWS views around it. A step matches SAMPLE of them.
+KEY_VIEWS, SAMPLE = 5, 600
+#: A match has the least distance, to which a difference in colour adds COLOUR_WEIGHT times. It attracts if the colours
+#: differ by at most SAME_COLOUR and the distance is at most REACH. Distances are in units of the deformation, colour
+#: differences are means over RGB.
+COLOUR_WEIGHT, SAME_COLOUR, REACH = 4.0, 0.1, 0.8
+
+
+class Points(NamedTuple):
+    """n points of what moves. time: [n], normalised. position: [n, 3], world. colour: [n, 3], 0..1."""
+
+    time: Tensor
+    position: Tensor
+    colour: Tensor
+
+    @staticmethod
+    def joined(parts: Sequence[Points]) -> Points:
+        """All points of `parts`."""
+        none = Points(torch.zeros(0), torch.zeros(0, 3), torch.zeros(0, 3))
+        return Points(*(torch.cat(values) for values in zip(none, *parts, strict=True)))
+
+    def at(self, index: Tensor) -> Points:
+        """The points at an index or in a mask."""
+        return Points(*(values[index] for values in self))
+
+
+class Match(phases.Phase):
+    """Finds the points at the end of the coarse phase; then `term` matches them."""
+
+    def __init__(self) -> None:
+        self.points = Points.joined([])
+        self._instants: list[Points] = []  #: `points` by instant
+        self._here: Points | None = None  #: those of the key instant
+
+    def due(self, state: TrainState) -> bool:
+        """At the end of the coarse phase, if motion is not steady."""
+        return state.reached(state.schedule.coarse_end) and state.opened
+
+    def apply(self, state: TrainState, record: dict[str, Any]) -> None:
+        """Finds the points, and logs their number."""
+        self._keep(workers.alike(lambda: moving_points(state)))
+        record["moving_points"] = len(self.points.time)
+
+    def weight(self, state: TrainState) -> float:
+        """The weight of `term` at this step."""
+        return WEIGHT * max(0.0, 1 - state.schedule.progress(state.position) / END)
+
+    def term(self, state: TrainState, level: int) -> Tensor | None:
+        """The `attraction` of points of the key instant that `level` moves to another instant; None if there are no
+        points, at level 0, in trials and once the weight is 0."""
+        key, generator = state.key, state.generator
+        if key is None or level == 0 or state.practising or not self._instants or not self.weight(state):
+            return None
+        if self._here is None:
+            nearest = sorted(self._instants, key=lambda points: abs(float(points.time[0]) - key))
+            self._here = Points.joined(nearest[:KEY_VIEWS])
+        there = self._instants[int(torch.randint(len(self._instants), (), generator=generator))]
+        drawn = torch.randint(len(self._here.time), (SAMPLE,), generator=generator)
+        return attraction(state, level, self._here.at(drawn), there)
+
+    def _keep(self, found: Points) -> None:
+        self.points, self._here = found, None
+        self._instants = [found.at(found.time == t) for t in torch.unique(found.time)]
+
+    def stored(self) -> dict[str, Any]:
+        """The points, as tensors."""
+        return {f"moving_{name}": values for name, values in self.points._asdict().items()}
+
+    def restore(self, stored: Mapping[str, Any]) -> None:
+        self._keep(Points(*(stored[f"moving_{name}"] for name in Points._fields)))
+
+
+def attraction(state: TrainState, level: int, here: Points, there: Points) -> Tensor:
+    """The mean over points `here`, moved to the instant of the points `there`, of their distance from their match,
+    in units of the deformation; 0 without a match."""
+    model, rounding, time = state.model, state.rounding(noisy=False), float(there.time[0])
+    unit = model.deformations[1].unit
+    moved = model.moved_points(here.position.to(state.device), level, time, rounding).cpu() / unit
+    place = there.position / unit
+    with torch.no_grad():
+        contrast = torch.cdist(here.colour, there.colour, p=1) / 3
+        match = (torch.cdist(moved, place) + COLOUR_WEIGHT * contrast).argmin(1)
+        alike = contrast.gather(1, match[:, None])[:, 0] <= SAME_COLOUR
+    distance = (moved - place[match]).norm(dim=1)
+    found: Tensor = (distance * (alike & (distance.detach() <= REACH))).mean()
+    return found
+
+
+# -- finding points ----------------------------------------------------------------------------------------------------
+
+
+class Evidence(NamedTuple):
+    """A view for the search. moved: [H, W], the mean difference of its image from level 0. around: [H, W], the largest
+    of these within two pixels. colour: [H, W, 3]. All are means over 3 x 3 pixels."""
+
+    view: View
+    moved: Tensor
+    around: Tensor
+    colour: Tensor
+
+
+@torch.no_grad()
+def moving_points(state: TrainState) -> Points:
+    """Points of what moves, on the CPU, from each training view and the views before and after it in time; none if
+    fewer than LEAST_FOUND of the searched pixels have one."""
+    held_back, views = held_back_views(state), state.views.views
+    order = sorted((i for i in range(len(views)) if i not in held_back), key=lambda i: views[i].time)
+    stride = 1 if len(order) <= MOST_VIEWS else -(-3 * len(order) // MOST_VIEWS)
+
+    @lru_cache(maxsize=3)
+    def evidence(index: int) -> Evidence:
+        shown = state.picture(index)
+        different = (images(state, shown, (0,))[0] - shown.image).abs().mean(-1) * (shown.weights > 0)
+        moved, *colour = avg_pool2d(torch.cat([different[None], shown.image.permute(2, 0, 1)]), 3, 1, 1).cpu()
+        return Evidence(shown.view, moved, max_pool2d(moved[None], 5, 1, 2)[0], torch.stack(colour, -1))
+
+    low, high = torch.from_numpy(state.model.info.box.copy())
+    found, searched, generator = [], 0, torch.Generator().manual_seed(0)
+    for k in range(1, len(order) - 1, stride):
+        before, own, after = (evidence(order[j]) for j in (k - 1, k, k + 1))
+        pixels = (own.moved > MOVED).nonzero()
+        pixels = pixels[torch.randperm(len(pixels), generator=generator)[:PIXELS]]
+        searched += len(pixels)
+        found.append(_points(own, pixels, (before, after), low, high, state.model.info.near))
+    points = Points.joined(found)
+    return points if len(points.time) >= LEAST_FOUND * searched else Points.joined([])
+
+
+def _points(
+    own: Evidence, pixels: Tensor, others: Sequence[Evidence], low: Tensor, high: Tensor, near: float
+) -> Points:
+    """The points of `pixels` (int64 [n, 2], row and column) of view `own`, in the box from `low` to `high` and beyond
+    `near`."""
+    viewmat, K = _matrices(own.view)
+    eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    x, y = (pixels.flip(1) + 0.5 - K[:2, 2]).div(K.diagonal()[:2]).unbind(1)
+    rays = torch.stack([x, y, torch.ones_like(x)], 1) @ viewmat[:3, :3]
+    bounds = torch.stack([(low - eye) / rays, (high - eye) / rays])
+    first, last = bounds.amin(0).amax(1).clamp(min=near), bounds.amax(0).amin(1)
+    depths = first[:, None] + (last - first)[:, None] * ((torch.arange(DEPTHS) + 0.5) / DEPTHS)
+    colour = own.colour[pixels[:, 0], pixels[:, 1]]
+    places = eye + depths[..., None] * rays[:, None]
+    contrast = torch.stack([_contrast(places, colour, other) for other in others]).amax(0)
+    consistent = contrast <= CONSISTENT
+    best = contrast.argmin(1, keepdim=True)
+    clear = (first < last) & consistent.gather(1, best)[:, 0] & (consistent.float().mean(1) <= AMBIGUOUS)
+    beside = consistent & ((torch.arange(DEPTHS) - best).abs() <= 3)  # colours hardly tell neighbouring depths apart
+    depth = (depths * beside).sum(1)[clear] / beside.sum(1)[clear]
+    return Points(torch.full_like(depth, own.view.time), eye + depth[:, None] * rays[clear], colour[clear])
+
+
+def _contrast(places: Tensor, colour: Tensor, other: Evidence) -> Tensor:
+    """The mean difference [n, depths] of `colour` [n, 3] from a view's colours at `places` [n, depths, 3]; infinite
+    outside the view and where it shows nothing that moves."""
+    viewmat, K = _matrices(other.view)
+    height, width = other.moved.shape
+    x, y, z = (places @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(-1)
+    column, line = ((K[0, 0] * x / z + K[0, 2]).long(), (K[1, 1] * y / z + K[1, 2]).long())
+    seen = (z > 0) & (column >= 0) & (column < width) & (line >= 0) & (line < height)
+    at = line.clamp(0, height - 1), column.clamp(0, width - 1)
+    seen &= other.around[at] > MOVED
+    return torch.where(seen, (other.colour[at] - colour[:, None]).abs().mean(-1), torch.inf)
+
+
+def _matrices(view: View) -> tuple[Tensor, Tensor]:
+    """float32 viewmat [4, 4] and K [3, 3] of a view."""
+    return torch.from_numpy(view.viewmat.copy()).float(), torch.from_numpy(view.K.copy()).float()

@@ -1,0 +1,135 @@
+"""Points of what moves: where they are found, what they attract, and when they guide a run."""
+
+import numpy as np
+import pytest
+import torch
+from runs import assert_resumes_bit_for_bit, run_saving
+from test_phases import trainer_of
+
+from pd4dgs_codec.data.bodies import bodies
+from pd4dgs_codec.interchange.teacher import load_source
+from pd4dgs_codec.train import phases
+from pd4dgs_codec.train.config import TrainConfig
+from pd4dgs_codec.train.loop import Trainer
+from pd4dgs_codec.train.phases import levels, matching, opening
+from pd4dgs_codec.train.phases.matching import Match, Points, attraction, moving_points
+
+
+@pytest.fixture
+def short_runs_match(monkeypatch):
+    """Short runs make a trial of motion, whose motion is not steady, and find points at any depth."""
+    monkeypatch.setattr(phases, "MIN_ITERATIONS", 10)
+    monkeypatch.setattr(opening, "MIN_TRIAL", 4)
+    monkeypatch.setattr(opening, "_predicted", lambda state: 0.0)
+    monkeypatch.setattr(levels, "MIN_PRACTICE", (3, 3))
+    monkeypatch.setattr(matching, "AMBIGUOUS", 1.0)
+    monkeypatch.setattr(matching, "LEAST_FOUND", 0.0)
+    monkeypatch.setattr(matching, "CONSISTENT", 1.0)
+
+
+def points(position: list[list[float]], colour: list[list[float]], time: float = 0.25) -> Points:
+    return Points(torch.full((len(position),), time), torch.tensor(position), torch.tensor(colour))
+
+
+def empty_level_0(trainer: Trainer) -> Trainer:
+    """Its level 0 shows the background alone."""
+    with torch.no_grad():
+        trainer.learner.model.mask_logits[:, 0] = -20
+    return trainer
+
+
+def test_points_lie_on_the_moving_ball(monkeypatch):
+    """A ball that no level follows: its points are found from pictures of a camera that jumps."""
+    monkeypatch.setattr(matching, "MOST_VIEWS", 60)
+    dataset = load_source("synthetic:dart", downscale=1, holdout=8, background=None)
+    found = moving_points(empty_level_0(trainer_of(dataset)).learner)
+    (ball,) = bodies("dart", 0)
+    centres = np.array([ball.pose(float(t))[1] for t in found.time])
+    away = np.linalg.norm(found.position.numpy() - centres, axis=1)
+    assert len(torch.unique(found.time)) >= 12
+    assert np.median(away) < 0.15 and np.mean(away < 0.3) > 0.9  # the ball's radius is 0.1, it moves 0.1 in a view
+
+
+def test_a_camera_that_stands_still_shows_no_depth():
+    dataset = load_source("synthetic:dart?frames=40&size=48x48", downscale=1, holdout=8, background=None)
+    for view in dataset.train:
+        view.viewmat[:] = dataset.train[0].viewmat
+    assert not len(moving_points(empty_level_0(trainer_of(dataset)).learner).time)
+
+
+def test_few_points_are_not_trusted(monkeypatch):
+    monkeypatch.setattr(matching, "MOST_VIEWS", 30)
+    dataset = load_source("synthetic:dart", downscale=1, holdout=8, background=None)
+    learner = empty_level_0(trainer_of(dataset)).learner
+    counts = []
+    for least in (0.0, 1.0):
+        monkeypatch.setattr(matching, "LEAST_FOUND", least)
+        counts.append(len(moving_points(learner).time))
+    assert counts[0] > 0 and counts[1] == 0
+
+
+def test_views_that_show_nothing_moving_have_no_points(dataset, monkeypatch):
+    monkeypatch.setattr(matching, "MOVED", 2.0)
+    found = moving_points(trainer_of(dataset).learner)
+    assert [value.shape for value in found] == [(0,), (0, 3), (0, 3)]
+
+
+def test_the_nearest_point_of_similar_colour_attracts(dataset):
+    """The deformation learns to move a red point to the red point, past a green one."""
+    torch.manual_seed(0)
+    learner = trainer_of(dataset).learner
+    for field in learner.model.deformations.values():  # fresh planes are constant in time
+        field.planes.grid.data += 0.3 * torch.randn_like(field.planes.grid)
+    unit = learner.model.deformations[1].unit
+    here = points([[0.0, 0.0, 0.0]], [[0.8, 0.1, 0.1]])
+    red, green = [0.6 * unit, 0.0, 0.0], [0.1 * unit, 0.0, 0.0]
+    there = points([red, green], [[0.75, 0.1, 0.1], [0.1, 0.8, 0.1]])
+    optimiser = torch.optim.Adam([p for f in learner.model.deformations.values() for p in f.parameters()], 1e-2)
+    first = attraction(learner, 2, here, there)
+    assert float(first.detach()) == pytest.approx(0.6, abs=1e-5)
+    for _ in range(150):
+        optimiser.zero_grad()
+        attraction(learner, 2, here, there).backward()
+        optimiser.step()
+    reached = learner.model.moved_points(here.position, 2, 0.25)[0].detach()
+    assert float((reached - torch.tensor(red)).norm()) < 0.05 * unit
+    still = learner.model.moved_points(here.position, 2, learner.key)[0].detach()
+    assert torch.equal(still, here.position[0])
+
+
+def test_points_far_away_or_of_other_colours_do_not_attract(dataset):
+    learner = trainer_of(dataset).learner
+    unit = learner.model.deformations[1].unit
+    here, colour = points([[0.0, 0.0, 0.0]], [[0.5, 0.5, 0.5]]), [[0.5, 0.5, 0.5]]
+    far = points([[(matching.REACH + 0.01) * unit, 0.0, 0.0]], colour)
+    other = points([[0.3 * unit, 0.0, 0.0]], [[0.5 + 3.1 * matching.SAME_COLOUR, 0.5, 0.5]])
+    for there in (far, other):
+        assert float(attraction(learner, 1, here, there).detach()) == 0
+
+
+@pytest.mark.usefixtures("short_runs_match")
+def test_points_guide_higher_levels_until_the_end_of_the_term(dataset):
+    trainer = trainer_of(dataset, 60, steps=7)
+    learner, terms = trainer.learner, []
+    (phase,) = [phase for phase in learner.before_step if isinstance(phase, Match)]
+    assert len(phase.points.time)
+    while learner.iteration < 60:
+        terms.append((learner.iteration, learner.step()))
+    with_it = {at for at, record in terms if "match" in record}
+    assert with_it == {at for at, record in terms if record["level"] and at < matching.END * 60}
+    assert with_it
+
+
+@pytest.mark.usefixtures("short_runs_match")
+def test_steady_motion_needs_no_points(dataset, monkeypatch):
+    monkeypatch.setattr(opening, "_predicted", lambda state: opening.MIN_GAIN)
+    assert not len(trainer_of(dataset, 60, steps=8).learner.match.points.time)
+
+
+@pytest.mark.usefixtures("short_runs_match")
+def test_a_guided_run_resumes_bit_for_bit(dataset, tmp_path):
+    config = TrainConfig(preset="tiny", iterations=40, seed=3)
+    trainer = Trainer(config, dataset)
+    run_saving(trainer, tmp_path, (9,), log=tmp_path / "log.jsonl")
+    assert len(trainer.learner.match.points.time)
+    assert_resumes_bit_for_bit(config, dataset, tmp_path, (9,))
