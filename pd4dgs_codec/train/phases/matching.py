@@ -84,9 +84,11 @@ class Match(phases.Phase):
 
     def term(self, state: TrainState, level: int) -> Tensor | None:
         """The `attraction` of points of the key instant that `level` moves to another instant; None if there are no
-        points, at level 0, in trials and once the weight is 0."""
+        points, at level 0 and in trials. The points are dropped once the weight is 0."""
         key, generator = state.key, state.generator
-        if key is None or level == 0 or state.practising or not self._instants or not self.weight(state):
+        if not self.weight(state):
+            self._keep(Points.joined([]))
+        if key is None or level == 0 or state.practising or not self._instants:
             return None
         if self._here is None:
             nearest = sorted(self._instants, key=lambda points: abs(float(points.time[0]) - key))
