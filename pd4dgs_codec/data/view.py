@@ -64,6 +64,17 @@ class View:
         """The camera alone."""
         return Camera(self.viewmat, self.K, self.width, self.height)
 
+    def project(self, x: np.ndarray, y: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Projects points, given by their world coordinates, arrays of one shape. Returns int64 lines and columns of
+        the pixels that show them, and bool whether they are before the camera and inside the picture; 0 otherwise."""
+        viewmat, K = (np.array(m, np.float32) for m in (self.viewmat, self.K))
+        x, y, z = (row[3] + row[0] * x + row[1] * y + row[2] * z for row in viewmat[:3])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            column, line = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+        inside = (z > 0) & (column >= 0) & (column < self.width) & (line >= 0) & (line < self.height)
+        line, column = (np.where(inside, part, 0).astype(np.int64) for part in (line, column))
+        return line, column, inside
+
 
 @dataclass(frozen=True, eq=False)
 class Dataset:

@@ -133,14 +133,9 @@ def carved_points(dataset: Dataset, count: int, generator: torch.Generator) -> T
     seen, hits = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
     for view in dataset.train[:: max(1, len(dataset.train) // CARVE_VIEWS)]:
         shown = np.abs(view.image - background).max(2) > CARVE_CONTRAST
-        viewmat, K = (np.array(m, np.float32) for m in (view.viewmat, view.K))
-        x, y, z = (row[3] + row[0] * px + row[1] * py + row[2] * pz for row in viewmat[:3])
-        with np.errstate(divide="ignore", invalid="ignore"):
-            column, line = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
-        height, width = shown.shape
-        inside = (z > 0) & (column >= 0) & (column < width) & (line >= 0) & (line < height)
+        line, column, inside = view.project(px, py, pz)
         seen[inside] += 1
-        hits[inside] += shown[line[inside].astype(int), column[inside].astype(int)]
+        hits[inside] += shown[line[inside], column[inside]]
     share = torch.from_numpy((hits + np.float32(1e-3)) / (seen + 1))  # + 1 discounts points that few views see
     return points[torch.multinomial(share.square(), count, generator=generator)]
 

@@ -140,6 +140,12 @@ def held_back_views(state: TrainState) -> set[int]:
     return views if len(views) >= MIN_VIEWS else set()
 
 
+def other_views(state: TrainState) -> list[int]:
+    """Indices of the training views that are not held back, ascending."""
+    held_back = held_back_views(state)
+    return [index for index in range(len(state.views)) if index not in held_back]
+
+
 def drop_level(model: Model, optimiser: Optimiser, level: int) -> None:
     """Removes the deformation of `level` from the model and its optimiser, and ties its masks to the level below."""
     name = {1: "global_deformation", 2: "local_deformation"}[level]

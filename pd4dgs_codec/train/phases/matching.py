@@ -14,13 +14,14 @@ from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from pd4dgs_codec.data.view import View
 from pd4dgs_codec.train import phases, workers
-from pd4dgs_codec.train.phases.levels import held_back_views, images
+from pd4dgs_codec.train.phases.levels import images, other_views
 from pd4dgs_codec.train.state import TrainState
 
 #: Weight of the loss term where it starts; it falls to 0 until END, a share of the run.
@@ -65,9 +66,13 @@ class Match(phases.Phase):
     """Finds the points at the end of the coarse phase; then `term` matches them."""
 
     def __init__(self) -> None:
-        self.points = Points.joined([])
-        self._instants: list[Points] = []  #: `points` by instant
+        self._instants: list[Points] = []  #: ascending
         self._here: Points | None = None  #: those of the key instant
+
+    @property
+    def points(self) -> Points:
+        """All points, by time."""
+        return Points.joined(self._instants)
 
     def due(self, state: TrainState) -> bool:
         """At the end of the coarse phase, if motion is not steady."""
@@ -86,7 +91,7 @@ class Match(phases.Phase):
         """The `attraction` of points of the key instant that `level` moves to another instant; None if there are no
         points, at level 0 and in trials. The points are dropped once the weight is 0."""
         key, generator = state.key, state.generator
-        if not self.weight(state):
+        if self._instants and not self.weight(state):
             self._keep(Points.joined([]))
         if key is None or level == 0 or state.practising or not self._instants:
             return None
@@ -98,7 +103,7 @@ class Match(phases.Phase):
         return attraction(state, level, self._here.at(drawn), there)
 
     def _keep(self, found: Points) -> None:
-        self.points, self._here = found, None
+        self._here = None
         self._instants = [found.at(found.time == t) for t in torch.unique(found.time)]
 
     def stored(self) -> dict[str, Any]:
@@ -142,8 +147,7 @@ class Evidence(NamedTuple):
 def moving_points(state: TrainState) -> Points:
     """Points of what moves, on the CPU, from each training view and the views before and after it in time; none if
     fewer than LEAST_FOUND of the searched pixels have one."""
-    held_back, views = held_back_views(state), state.views.views
-    order = sorted((i for i in range(len(views)) if i not in held_back), key=lambda i: views[i].time)
+    order = sorted(other_views(state), key=lambda index: state.views.views[index].time)
     stride = 1 if len(order) <= MOST_VIEWS else -(-3 * len(order) // MOST_VIEWS)
 
     @lru_cache(maxsize=3)
@@ -170,7 +174,7 @@ def _points(
 ) -> Points:
     """The points of `pixels` (int64 [n, 2], row and column) of view `own`, in the box from `low` to `high` and beyond
     `near`."""
-    viewmat, K = _matrices(own.view)
+    viewmat, K = (torch.from_numpy(np.array(matrix)) for matrix in (own.view.viewmat, own.view.K))
     eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
     x, y = (pixels.flip(1) + 0.5 - K[:2, 2]).div(K.diagonal()[:2]).unbind(1)
     rays = torch.stack([x, y, torch.ones_like(x)], 1) @ viewmat[:3, :3]
@@ -191,16 +195,6 @@ def _points(
 def _contrast(places: Tensor, colour: Tensor, other: Evidence) -> Tensor:
     """The mean difference [n, depths] of `colour` [n, 3] from a view's colours at `places` [n, depths, 3]; infinite
     outside the view and where it shows nothing that moves."""
-    viewmat, K = _matrices(other.view)
-    height, width = other.moved.shape
-    x, y, z = (places @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(-1)
-    column, line = ((K[0, 0] * x / z + K[0, 2]).long(), (K[1, 1] * y / z + K[1, 2]).long())
-    seen = (z > 0) & (column >= 0) & (column < width) & (line >= 0) & (line < height)
-    at = line.clamp(0, height - 1), column.clamp(0, width - 1)
-    seen &= other.around[at] > MOVED
-    return torch.where(seen, (other.colour[at] - colour[:, None]).abs().mean(-1), torch.inf)
-
-
-def _matrices(view: View) -> tuple[Tensor, Tensor]:
-    """float32 viewmat [4, 4] and K [3, 3] of a view."""
-    return torch.from_numpy(view.viewmat.copy()).float(), torch.from_numpy(view.K.copy()).float()
+    line, column, inside = map(torch.from_numpy, other.view.project(*places.numpy().transpose(2, 0, 1)))
+    seen = inside & (other.around[line, column] > MOVED)
+    return torch.where(seen, (other.colour[line, column] - colour[:, None]).abs().mean(-1), torch.inf)

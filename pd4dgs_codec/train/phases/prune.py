@@ -20,7 +20,7 @@ from pd4dgs_codec.model.sensitivity import omission_error
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train import workers
 from pd4dgs_codec.train.phases import Phase, long_enough
-from pd4dgs_codec.train.phases.levels import held_back_views
+from pd4dgs_codec.train.phases.levels import other_views
 from pd4dgs_codec.train.schedule import PRUNING_ROUNDS
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
@@ -56,8 +56,7 @@ class Prune(Phase):
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
         """Prunes, and logs how many anchors left the model and how many left layer 0."""
         model, levels = state.model, state.measured_levels()
-        share, before, held_back = state.config.prune / PRUNING_ROUNDS, len(model.anchor_q), held_back_views(state)
-        order = [i for i in range(len(state.views)) if i not in held_back]
+        share, before, order = state.config.prune / PRUNING_ROUNDS, len(model.anchor_q), other_views(state)
         stride = -(-len(order) // VIEWS)
         views = [state.views[i] for i in order[self.turn % stride :: stride]]
         errors = added_error(model, levels, views, state.rounding(noisy=False), omission_error).to(state.device)
