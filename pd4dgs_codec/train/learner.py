@@ -173,6 +173,8 @@ class Learner(TrainState):
             if parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
             parameter.grad.add_(gradient.to(parameter.device), alpha=share)
+        if level and self.guiding:
+            self.optimiser.keep_gradients(self.model.deformations.values())
         record["loss"] = float(loss.detach()) + rest.loss
         record |= {name: float(value.detach()) for name, value in terms.items()} | rest.terms
         return picture

@@ -7,6 +7,7 @@ a second.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from typing import Any
 
 import torch
@@ -83,6 +84,13 @@ class Optimiser:
         for p, g in zip(self.parameters, given, strict=True):
             if g is not None:
                 p.grad = g if p.grad is None else p.grad.add_(g)
+
+    def keep_gradients(self, modules: Iterable[nn.Module]) -> None:
+        """Removes the gradients of all parameters outside `modules`."""
+        kept = {p for module in modules for p in module.parameters()}
+        for p in self.parameters:
+            if p not in kept:
+                p.grad = None
 
     def zero_grad(self) -> None:
         for p in self.parameters:

@@ -15,10 +15,12 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from pd4dgs_codec.train.phases.levels import held_back_views
 from pd4dgs_codec.train.phases.opening import window, within
 from pd4dgs_codec.train.schedule import CAPACITY_WEIGHTED, LOWEST, TOP, UNIFORM, Probabilities, rollout_probabilities
+from pd4dgs_codec.train.ssim import REACH
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
 #: Share of the steps after the coarse phase that train level 0, and the share of these near the key instant.
@@ -75,7 +77,7 @@ def _near(state: TrainState, level: int) -> list[int]:
         return [] if len(views) == len(among) or len(views) < NEAR_VIEWS else views
     if state.practising:
         return []
-    still = state.position < state.schedule.coarse_end
+    still = state.position < state.schedule.coarse_end or state.guiding
     drawn = still or float(torch.rand((), generator=state.generator)) < NEAR_ODDS
     return near_key(state, among) if drawn else []
 
@@ -94,8 +96,12 @@ def near_key(state: TrainState, among: list[int]) -> list[int]:
 
 def without_motion(state: TrainState, shown: TrainingView, image: Tensor) -> TrainingView:
     """The view with the pixel weights that train level 0, of which `image` [H, W, 3] is its picture. In a scene with a
-    key instant, pixels that motion has changed have weight 0."""
+    key instant, pixels that motion has changed have weight 0. Where bodies may be small (`TrainState.guided`), those
+    around them have, too, whose SSIM depends on them: otherwise the faint edge of a body that has moved away would be
+    erased, then the next edge, until the body is gone."""
     if state.key is None or state.practising or state.position < state.schedule.coarse_end:
         return shown
-    same = (image.detach() - shown.image).abs().amax(-1) < STILL_CONTRAST
-    return replace(shown, weights=shown.weights * same)
+    change = (image.detach() - shown.image).abs().amax(-1)
+    if state.guided:
+        change = max_pool2d(change[None], 2 * REACH + 1, 1, REACH)[0]
+    return replace(shown, weights=shown.weights * (change < STILL_CONTRAST))

@@ -123,6 +123,7 @@ class TrainState:
     rho: moving average of how much the masks of levels 0 and 2 differ.
     practising: a trial is running; all views and pixels train level 0, see `phases.levels`.
     opened: all views train motion, see `phases.opening`.
+    guided: points of what moves were found, see `phases.matching`.
     """
 
     def __init__(
@@ -147,7 +148,7 @@ class TrainState:
         self.statistics = fresh_statistics(len(model.anchor_q), config.slots)
         self.iteration = self.skipped = 0
         self.share: float | None = None
-        self.rho, self.practising, self.opened = 0.0, False, False
+        self.rho, self.practising, self.opened, self.guided = 0.0, False, False, False
         self.order: list[int] = []
         self._before = -1  #: the previous step's position; a timed run may advance by more than one
 
@@ -171,6 +172,11 @@ class TrainState:
     def steps_in(self, share: float) -> int:
         """How many steps a share of the run takes at its pace so far; in a timed run, N only estimates this pace."""
         return round(share * self.iteration / max(self.schedule.progress(self.position), 1e-9))
+
+    @property
+    def guiding(self) -> bool:
+        """Whether points guide motion at this step."""
+        return self.guided and self.schedule.guidance(self.position) > 0
 
     def rounding(self, *, noisy: bool = True) -> Rounding:
         """How the steps at this position simulate quantisation; without noise if not `noisy`."""
@@ -252,6 +258,7 @@ class TrainState:
             "passed": self._before,
             "rho": self.rho,
             "opened": self.opened,
+            "guided": self.guided,
             "skipped": self.skipped,
             "order": self.order,
             "optimiser": self.optimiser.state(),
@@ -284,7 +291,7 @@ class TrainState:
         self.schedule = Schedule(int(state["total"]) or None)
         if self.share is not None:
             self.share, self._before = float(state["share"]), int(state["passed"])
-        self.rho, self.opened = float(state["rho"]), bool(state["opened"])
+        self.rho, self.opened, self.guided = float(state["rho"]), bool(state["opened"]), bool(state["guided"])
         self.order = [int(index) for index in state["order"]]
 
 

@@ -13,6 +13,7 @@ from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.loop import Trainer
 from pd4dgs_codec.train.phases import levels, matching, opening
 from pd4dgs_codec.train.phases.matching import Match, Points, attraction, moving_points
+from pd4dgs_codec.train.schedule import GUIDED_SHARE
 
 
 @pytest.fixture
@@ -97,14 +98,11 @@ def test_the_nearest_point_of_similar_colour_attracts(dataset):
     assert torch.equal(still, here.position[0])
 
 
-def test_points_far_away_or_of_other_colours_do_not_attract(dataset):
+def test_points_of_other_colours_do_not_attract(dataset):
     learner = trainer_of(dataset).learner
-    unit = learner.model.deformations[1].unit
-    here, colour = points([[0.0, 0.0, 0.0]], [[0.5, 0.5, 0.5]]), [[0.5, 0.5, 0.5]]
-    far = points([[(matching.REACH + 0.01) * unit, 0.0, 0.0]], colour)
-    other = points([[0.3 * unit, 0.0, 0.0]], [[0.5 + 3.1 * matching.SAME_COLOUR, 0.5, 0.5]])
-    for there in (far, other):
-        assert float(attraction(learner, 1, here, there).detach()) == 0
+    here = points([[0.0, 0.0, 0.0]], [[0.5, 0.5, 0.5]])
+    there = points([[0.3, 0.0, 0.0]], [[0.5 + 3.1 * matching.SAME_COLOUR, 0.5, 0.5]])
+    assert float(attraction(learner, 1, here, there).detach()) == 0
 
 
 @pytest.mark.usefixtures("short_runs_match")
@@ -116,8 +114,20 @@ def test_points_guide_higher_levels_until_the_end_of_the_term(dataset):
     while learner.iteration < 60:
         terms.append((learner.iteration, learner.step()))
     with_it = {at for at, record in terms if "match" in record}
-    assert with_it == {at for at, record in terms if record["level"] and at < matching.END * 60}
-    assert with_it and not len(phase.points.time)
+    assert with_it == {at for at, record in terms if record["level"] and at < GUIDED_SHARE * 60}
+    assert with_it and not len(phase.points.time) and not learner.guiding
+
+
+@pytest.mark.usefixtures("short_runs_match")
+def test_guided_pictures_of_motion_train_motion_alone(dataset):
+    learner = trainer_of(dataset, 60, steps=7).learner
+    assert learner.guiding
+    for _ in range(8):
+        before = learner.snapshot()[0]
+        level = learner.step()["level"]
+        deformations = {p for field in learner.model.deformations.values() for p in field.parameters()}
+        changed = {p for p, value in before.items() if not torch.equal(p, value)}
+        assert changed and (changed <= deformations if level else not changed & deformations)
 
 
 @pytest.mark.usefixtures("short_runs_match")

@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -11,6 +12,7 @@ from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.learner import Learner
 from pd4dgs_codec.train.rollout import draw_levels, near_key, next_view, without_motion
 from pd4dgs_codec.train.schedule import LOWEST, Schedule
+from pd4dgs_codec.train.ssim import REACH
 
 
 def learner(dataset, key: float = 0.5, **config) -> Learner:
@@ -52,6 +54,10 @@ def test_level_0_learns_nothing_where_motion_has_changed_the_picture(dataset):
     weights = without_motion(state, view, image).weights
     assert torch.equal(weights == 0, differs | (view.weights == 0))
     assert torch.equal(without_motion(state, view, view.image).weights, view.weights)
+    state.guided = True  # then the pixels up to REACH away have weight 0, too
+    near = np.lib.stride_tricks.sliding_window_view(np.pad(differs.numpy(), REACH), (2 * REACH + 1,) * 2).any((2, 3))
+    assert torch.equal(without_motion(state, view, image).weights == 0, torch.from_numpy(near) | (view.weights == 0))
+    state.guided = False
     for level, counted in ((0, weights), (2, view.weights)):
         errors = (render(state.model, level, *place).image - view.image).abs() * counted[..., None]
         assert state.picture_loss(0, level)[1]["l1"].item() == pytest.approx(errors.sum().item(), rel=1e-5)

@@ -6,6 +6,9 @@ level 0 agree in successive views (photo-consistency: Seitz and Dyer, Photoreali
 coloring, 1997). The deformation moves the points of the key instant to another instant, where the nearest point of
 similar colour attracts each (iterative closest points: Besl and McKay, A method for registration of 3-D shapes, 1992).
 Large surfaces slide along themselves in such matches, so the term ends early. `opening` finds steady motion better.
+
+While points guide motion, pictures of levels 1 and 2 train the deformations alone, and level 0 is trained near the key
+instant alone: a body that is not where its image is would otherwise fade before its motion is learnt.
 """
 
 from __future__ import annotations
@@ -24,8 +27,8 @@ from pd4dgs_codec.train import phases, workers
 from pd4dgs_codec.train.phases.levels import images, other_views
 from pd4dgs_codec.train.state import TrainState
 
-#: Weight of the loss term where it starts; it falls to 0 until END, a share of the run.
-WEIGHT, END = 0.4, 0.35
+#: Weight of the loss term, times `Schedule.guidance`.
+WEIGHT = 0.4
 #: Training views that are searched at most; more views are searched in groups of three, evenly spread.
 MOST_VIEWS = 240
 #: Pixels of a view that are searched, at random, and depths on the ray of each.
@@ -39,9 +42,8 @@ LEAST_FOUND = 1 / 6
 #: Points of the key instant are those of KEY_VIEWS views around it. A step matches SAMPLE of them.
 KEY_VIEWS, SAMPLE = 5, 600
 #: A match has the least distance, to which a difference in colour adds COLOUR_WEIGHT times. It attracts if the colours
-#: differ by at most SAME_COLOUR and the distance is at most REACH. Distances are in units of the deformation, colour
-#: differences are means over RGB.
-COLOUR_WEIGHT, SAME_COLOUR, REACH = 4.0, 0.1, 0.8
+#: differ by at most SAME_COLOUR. Distances are in units of the deformation, colour differences are means over RGB.
+COLOUR_WEIGHT, SAME_COLOUR = 4.0, 0.1
 
 
 class Points(NamedTuple):
@@ -79,19 +81,20 @@ class Match(phases.Phase):
         return state.reached(state.schedule.coarse_end) and state.opened
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
-        """Finds the points, and logs their number."""
+        """Finds the points, which set `TrainState.guided`, and logs their number."""
         self._keep(workers.alike(lambda: moving_points(state)))
         record["moving_points"] = len(self.points.time)
+        state.guided = bool(self._instants)
 
     def weight(self, state: TrainState) -> float:
         """The weight of `term` at this step."""
-        return WEIGHT * max(0.0, 1 - state.schedule.progress(state.position) / END)
+        return WEIGHT * state.schedule.guidance(state.position)
 
     def term(self, state: TrainState, level: int) -> Tensor | None:
         """The `attraction` of points of the key instant that `level` moves to another instant; None if there are no
         points, at level 0 and in trials. The points are dropped once the weight is 0."""
         key, generator = state.key, state.generator
-        if self._instants and not self.weight(state):
+        if self._instants and not state.guiding:
             self._keep(Points.joined([]))
         if key is None or level == 0 or state.practising or not self._instants:
             return None
@@ -125,8 +128,7 @@ def attraction(state: TrainState, level: int, here: Points, there: Points) -> Te
         contrast = torch.cdist(here.colour, there.colour, p=1) / 3
         match = (torch.cdist(moved, place) + COLOUR_WEIGHT * contrast).argmin(1)
         alike = contrast.gather(1, match[:, None])[:, 0] <= SAME_COLOUR
-    distance = (moved - place[match]).norm(dim=1)
-    found: Tensor = (distance * (alike & (distance.detach() <= REACH))).mean()
+    found: Tensor = ((moved - place[match]).norm(dim=1) * alike).mean()
     return found
 
 
