@@ -1,19 +1,26 @@
 """Points of what moves: where they are found, what they attract, and when they guide a run."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from runs import assert_resumes_bit_for_bit, read_log, run_saving
 from test_phases import trainer_of
 
-from pd4dgs_codec.data.bodies import bodies
+from pd4dgs_codec.data.bodies import THINGS, bodies
 from pd4dgs_codec.interchange.teacher import load_source
+from pd4dgs_codec.model.config import PRESETS
+from pd4dgs_codec.model.picture import render_image
+from pd4dgs_codec.quality.image import moving_regions, mpsnr
 from pd4dgs_codec.train import phases
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.loop import Trainer
 from pd4dgs_codec.train.phases import levels, matching, opening
 from pd4dgs_codec.train.phases.matching import Match, Points, attraction, moving_points
 from pd4dgs_codec.train.schedule import GUIDED_SHARE
+
+WHOLE_TINY = PRESETS["tiny"]  # tests have a smaller one
 
 
 @pytest.fixture
@@ -143,3 +150,17 @@ def test_a_guided_run_resumes_bit_for_bit(dataset, tmp_path):
     run_saving(trainer, tmp_path, (9,), log=tmp_path / "log.jsonl")  # before the term ends
     assert sum(record.get("moving_points", 0) for record in read_log(tmp_path / "log.jsonl"))
     assert_resumes_bit_for_bit(config, dataset, tmp_path, (9,))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_small_ball_alone_on_white_is_followed(monkeypatch, tmp_path, seed):
+    """It flies around once, at a fifth of the speed of dart. A white picture has 17.4 dB in its moving region."""
+    (ball,) = THINGS["dart"]
+    monkeypatch.setitem(THINGS, "dart", (replace(ball, at=lambda t: ball.at(t / 5)),))
+    dataset = load_source("synthetic:dart", downscale=1, holdout=8, background=None)
+    trainer = Trainer(TrainConfig(preset="tiny", iterations=1500, seed=seed), dataset, size=WHOLE_TINY)
+    trainer.run(tmp_path / "m.pt")
+    model, moving = trainer.model, moving_regions(dataset.test)
+    scores = [mpsnr(render_image(model, model.level, v.time, v.camera), v.image, mask) for v, mask in moving.items()]
+    assert np.mean(scores) > 22
