@@ -96,7 +96,7 @@ def near_key(state: TrainState, among: list[int]) -> list[int]:
 
 def without_motion(state: TrainState, shown: TrainingView, image: Tensor) -> TrainingView:
     """The view with the pixel weights that train level 0, of which `image` [H, W, 3] is its picture. In a scene with a
-    key instant, pixels that motion has changed have weight 0. Where bodies may be small (`TrainState.guided`), those
+    key instant, pixels that motion has changed have weight 0. In scenes of little else (`TrainState.guided`) those
     around them have, too, whose SSIM depends on them: otherwise the faint edge of a body that has moved away would be
     erased, then the next edge, until the body is gone."""
     if state.key is None or state.practising or state.position < state.schedule.coarse_end:

@@ -123,7 +123,7 @@ class TrainState:
     rho: moving average of how much the masks of levels 0 and 2 differ.
     practising: a trial is running; all views and pixels train level 0, see `phases.levels`.
     opened: all views train motion, see `phases.opening`.
-    guided: points of what moves were found, see `phases.matching`.
+    guided: points of what moves were found, and it is most of what views show, see `phases.matching`.
     """
 
     def __init__(
@@ -175,7 +175,7 @@ class TrainState:
 
     @property
     def guiding(self) -> bool:
-        """Whether points guide motion at this step."""
+        """Whether only the deformations learn from motion at this step."""
         return self.guided and self.schedule.guidance(self.position) > 0
 
     def rounding(self, *, noisy: bool = True) -> Rounding:

@@ -32,6 +32,7 @@ def short_runs_match(monkeypatch):
     monkeypatch.setattr(levels, "MIN_PRACTICE", (3, 3))
     monkeypatch.setattr(matching, "AMBIGUOUS", 1.0)
     monkeypatch.setattr(matching, "LEAST_FOUND", 0.0)
+    monkeypatch.setattr(matching, "ELSEWHERE", 0.0)
     monkeypatch.setattr(matching, "CONSISTENT", 1.0)
 
 
@@ -50,7 +51,8 @@ def test_points_lie_on_the_moving_ball(monkeypatch):
     """A ball that no level follows: its points are found from pictures of a camera that jumps."""
     monkeypatch.setattr(matching, "MOST_VIEWS", 60)
     dataset = load_source("synthetic:dart", downscale=1, holdout=8, background=None)
-    found = moving_points(empty_level_0(trainer_of(dataset)).learner)
+    found, share = moving_points(empty_level_0(trainer_of(dataset)).learner)
+    assert share > matching.ELSEWHERE
     (ball,) = bodies("dart", 0)
     centres = np.array([ball.pose(float(t))[1] for t in found.time])
     away = np.linalg.norm(found.position.numpy() - centres, axis=1)
@@ -62,7 +64,7 @@ def test_a_camera_that_stands_still_shows_no_depth():
     dataset = load_source("synthetic:dart?frames=40&size=48x48", downscale=1, holdout=8, background=None)
     for view in dataset.train:
         view.viewmat[:] = dataset.train[0].viewmat
-    assert not len(moving_points(empty_level_0(trainer_of(dataset)).learner).time)
+    assert not len(moving_points(empty_level_0(trainer_of(dataset)).learner)[0].time)
 
 
 def test_few_points_are_not_trusted(monkeypatch):
@@ -72,14 +74,14 @@ def test_few_points_are_not_trusted(monkeypatch):
     counts = []
     for least in (0.0, 1.0):
         monkeypatch.setattr(matching, "LEAST_FOUND", least)
-        counts.append(len(moving_points(learner).time))
+        counts.append(len(moving_points(learner)[0].time))
     assert counts[0] > 0 and counts[1] == 0
 
 
 def test_views_that_show_nothing_moving_have_no_points(dataset, monkeypatch):
     monkeypatch.setattr(matching, "MOVED", 2.0)
-    found = moving_points(trainer_of(dataset).learner)
-    assert [value.shape for value in found] == [(0,), (0, 3), (0, 3)]
+    found, share = moving_points(trainer_of(dataset).learner)
+    assert share == 0 and [value.shape for value in found] == [(0,), (0, 3), (0, 3)]
 
 
 def test_the_nearest_point_of_similar_colour_attracts(dataset):
@@ -105,11 +107,16 @@ def test_the_nearest_point_of_similar_colour_attracts(dataset):
     assert torch.equal(still, here.position[0])
 
 
-def test_points_of_other_colours_do_not_attract(dataset):
+def test_points_far_away_or_of_other_colours_do_not_attract(dataset):
     learner = trainer_of(dataset).learner
-    here = points([[0.0, 0.0, 0.0]], [[0.5, 0.5, 0.5]])
-    there = points([[0.3, 0.0, 0.0]], [[0.5 + 3.1 * matching.SAME_COLOUR, 0.5, 0.5]])
-    assert float(attraction(learner, 1, here, there).detach()) == 0
+    unit = learner.model.deformations[1].unit
+    here, colour = points([[0.0, 0.0, 0.0]], [[0.5, 0.5, 0.5]]), [[0.5, 0.5, 0.5]]
+    far = points([[(matching.REACH + 0.01) * unit, 0.0, 0.0]], colour)
+    other = points([[0.3 * unit, 0.0, 0.0]], [[0.5 + 3.1 * matching.SAME_COLOUR, 0.5, 0.5]])
+    for there in (far, other):
+        assert float(attraction(learner, 1, here, there).detach()) == 0
+    learner.guided = True
+    assert float(attraction(learner, 1, here, far).detach()) == pytest.approx(matching.REACH + 0.01, abs=1e-5)
 
 
 @pytest.mark.usefixtures("short_runs_match")
@@ -135,6 +142,13 @@ def test_guided_pictures_of_motion_train_motion_alone(dataset):
         deformations = {p for field in learner.model.deformations.values() for p in field.parameters()}
         changed = {p for p, value in before.items() if not torch.equal(p, value)}
         assert changed and (changed <= deformations if level else not changed & deformations)
+
+
+@pytest.mark.usefixtures("short_runs_match")
+def test_attributes_learn_from_motion_where_much_stands_still(dataset, monkeypatch):
+    monkeypatch.setattr(matching, "ELSEWHERE", 1e9)
+    learner = trainer_of(dataset, 60, steps=7).learner
+    assert len(learner.match.points.time) and not learner.guiding
 
 
 @pytest.mark.usefixtures("short_runs_match")

@@ -7,12 +7,14 @@ coloring, 1997). The deformation moves the points of the key instant to another 
 similar colour attracts each (iterative closest points: Besl and McKay, A method for registration of 3-D shapes, 1992).
 Large surfaces slide along themselves in such matches, so the term ends early. `opening` finds steady motion better.
 
-While points guide motion, pictures of levels 1 and 2 train the deformations alone, and level 0 is trained near the key
-instant alone: a body that is not where its image is would otherwise fade before its motion is learnt.
+If most of what the views show is elsewhere in level 0, pictures of levels 1 and 2 train the deformations alone while
+points guide them, and level 0 is trained near the key instant alone: bodies would otherwise fade before their motion is
+learnt. Where much stands still, it would learn too little from so few pictures.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -37,13 +39,17 @@ PIXELS, DEPTHS = 400, 64
 #: the colours of three views differ least, if by at most CONSISTENT, and if a share of at most AMBIGUOUS of the depths
 #: does.
 MOVED, CONSISTENT, AMBIGUOUS = 0.12, 0.16, 0.3
+#: Most of what the views show is elsewhere in level 0 if such pixels are at least this share of those that differ from
+#: the background: a body that has moved away changes the pixels that it had and those that it has.
+ELSEWHERE = 1.0
 #: If fewer of the pixels have a point, the camera moves too little between views for their depths to be trusted.
 LEAST_FOUND = 1 / 6
 #: Points of the key instant are those of KEY_VIEWS views around it. A step matches SAMPLE of them.
 KEY_VIEWS, SAMPLE = 5, 600
 #: A match has the least distance, to which a difference in colour adds COLOUR_WEIGHT times. It attracts if the colours
-#: differ by at most SAME_COLOUR. Distances are in units of the deformation, colour differences are means over RGB.
-COLOUR_WEIGHT, SAME_COLOUR = 4.0, 0.1
+#: differ by at most SAME_COLOUR and, if other bodies may be nearer than the right one (not `TrainState.guided`), the
+#: distance is at most REACH. Distances are in units of the deformation, colour differences are means over RGB.
+COLOUR_WEIGHT, SAME_COLOUR, REACH = 4.0, 0.1, 0.8
 
 
 class Points(NamedTuple):
@@ -81,10 +87,11 @@ class Match(phases.Phase):
         return state.reached(state.schedule.coarse_end) and state.opened
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
-        """Finds the points, which set `TrainState.guided`, and logs their number."""
-        self._keep(workers.alike(lambda: moving_points(state)))
-        record["moving_points"] = len(self.points.time)
-        state.guided = bool(self._instants)
+        """Finds the points and logs their number; sets `TrainState.guided`."""
+        found, share = workers.alike(lambda: moving_points(state))
+        self._keep(found)
+        record |= {"moving_points": len(found.time), "moving_share": share}
+        state.guided = bool(self._instants) and share >= ELSEWHERE
 
     def weight(self, state: TrainState) -> float:
         """The weight of `term` at this step."""
@@ -94,7 +101,7 @@ class Match(phases.Phase):
         """The `attraction` of points of the key instant that `level` moves to another instant; None if there are no
         points, at level 0 and in trials. The points are dropped once the weight is 0."""
         key, generator = state.key, state.generator
-        if self._instants and not state.guiding:
+        if self._instants and not self.weight(state):
             self._keep(Points.joined([]))
         if key is None or level == 0 or state.practising or not self._instants:
             return None
@@ -128,7 +135,9 @@ def attraction(state: TrainState, level: int, here: Points, there: Points) -> Te
         contrast = torch.cdist(here.colour, there.colour, p=1) / 3
         match = (torch.cdist(moved, place) + COLOUR_WEIGHT * contrast).argmin(1)
         alike = contrast.gather(1, match[:, None])[:, 0] <= SAME_COLOUR
-    found: Tensor = ((moved - place[match]).norm(dim=1) * alike).mean()
+    distance = (moved - place[match]).norm(dim=1)
+    near = distance.detach() <= (math.inf if state.guided else REACH)
+    found: Tensor = (distance * (alike & near)).mean()
     return found
 
 
@@ -137,18 +146,21 @@ def attraction(state: TrainState, level: int, here: Points, there: Points) -> Te
 
 class Evidence(NamedTuple):
     """A view for the search. moved: [H, W], the mean difference of its image from level 0. around: [H, W], the largest
-    of these within two pixels. colour: [H, W, 3]. All are means over 3 x 3 pixels."""
+    of these within two pixels. colour: [H, W, 3]. All are means over 3 x 3 pixels. visible: the pixels that differ from
+    the background."""
 
     view: View
     moved: Tensor
     around: Tensor
     colour: Tensor
+    visible: int
 
 
 @torch.no_grad()
-def moving_points(state: TrainState) -> Points:
-    """Points of what moves, on the CPU, from each training view and the views before and after it in time; none if
-    fewer than LEAST_FOUND of the searched pixels have one."""
+def moving_points(state: TrainState) -> tuple[Points, float]:
+    """(points of what moves, on the CPU, from each training view and the views before and after it in time; the pixels
+    that differ from level 0, as a share of those that differ from the background). There are no points if fewer than
+    LEAST_FOUND of the searched pixels have one."""
     order = sorted(other_views(state), key=lambda index: state.views.views[index].time)
     stride = 1 if len(order) <= MOST_VIEWS else -(-3 * len(order) // MOST_VIEWS)
 
@@ -157,18 +169,21 @@ def moving_points(state: TrainState) -> Points:
         shown = state.picture(index)
         different = (images(state, shown, (0,))[0] - shown.image).abs().mean(-1) * (shown.weights > 0)
         moved, *colour = avg_pool2d(torch.cat([different[None], shown.image.permute(2, 0, 1)]), 3, 1, 1).cpu()
-        return Evidence(shown.view, moved, max_pool2d(moved[None], 5, 1, 2)[0], torch.stack(colour, -1))
+        background = shown.image.new_tensor(state.model.info.background)
+        pixels = int((shown.image != background).any(-1).sum())
+        return Evidence(shown.view, moved, max_pool2d(moved[None], 5, 1, 2)[0], torch.stack(colour, -1), pixels)
 
     low, high = torch.from_numpy(state.model.info.box.copy())
-    found, searched, generator = [], 0, torch.Generator().manual_seed(0)
+    found, searched, moving, shown, generator = [], 0, 0, 0, torch.Generator().manual_seed(0)
     for k in range(1, len(order) - 1, stride):
         before, own, after = (evidence(order[j]) for j in (k - 1, k, k + 1))
         pixels = (own.moved > MOVED).nonzero()
+        moving, shown = moving + len(pixels), shown + own.visible
         pixels = pixels[torch.randperm(len(pixels), generator=generator)[:PIXELS]]
         searched += len(pixels)
         found.append(_points(own, pixels, (before, after), low, high, state.model.info.near))
     points = Points.joined(found)
-    return points if len(points.time) >= LEAST_FOUND * searched else Points.joined([])
+    return points if len(points.time) >= LEAST_FOUND * searched else Points.joined([]), moving / max(shown, 1)
 
 
 def _points(
