@@ -8,6 +8,7 @@ import torch
 from runs import assert_resumes_bit_for_bit, read_log, run_saving
 from test_phases import trainer_of
 
+from pd4dgs_codec.data import synthetic
 from pd4dgs_codec.data.bodies import THINGS, bodies
 from pd4dgs_codec.interchange.teacher import load_source
 from pd4dgs_codec.model.config import PRESETS
@@ -172,7 +173,9 @@ def test_a_small_ball_alone_on_white_is_followed(monkeypatch, tmp_path, seed):
     """It flies around once, at a fifth of the speed of dart. A white picture has 17.4 dB in its moving region."""
     (ball,) = THINGS["dart"]
     monkeypatch.setitem(THINGS, "dart", (replace(ball, at=lambda t: ball.at(t / 5)),))
+    synthetic._dataset.cache_clear()  # of pictures of the ball at its own speed
     dataset = load_source("synthetic:dart", downscale=1, holdout=8, background=None)
+    synthetic._dataset.cache_clear()
     trainer = Trainer(TrainConfig(preset="tiny", iterations=1500, seed=seed), dataset, size=WHOLE_TINY)
     trainer.run(tmp_path / "m.pt")
     model, moving = trainer.model, moving_regions(dataset.test)
