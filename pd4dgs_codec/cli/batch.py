@@ -137,7 +137,8 @@ def _batch(args: argparse.Namespace, console: Console) -> int:
 
     manifest = Manifest(args.input, OPS[args.op], check)
     output = store.absolute(args.output)
-    store.Root(output).check()
+    if manifest.lines:  # the check makes the output folder
+        store.Root(output).check()
     failures = [_failed(args.input, number, None, message) for number, message in manifest.faults]
     jobs = (Job(line, args.op, output, threads, args.overwrite) for line in manifest.lines)
     settings = Settings(

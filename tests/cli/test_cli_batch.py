@@ -90,6 +90,11 @@ def test_evaluations_and_packages_of_many(cli, tmp_path, manifest, scene_pd4, sh
     assert json.loads((tmp_path / "site" / "library.json").read_text())["scenes"][0]["name"] == "x"
 
 
+def test_a_manifest_of_broken_lines_leaves_no_folder(cli, tmp_path, manifest):
+    done = cli("batch", manifest("{broken"), "--op", "encode", "-o", "out", "--workers", "0")
+    assert done.code == 1 and "line 1: invalid JSON" in done.err and not (tmp_path / "out").exists()
+
+
 def test_a_store_that_refuses_ends_it_before_any_work(cli, tmp_path, manifest):
     (tmp_path / "taken").touch()
     done = cli("batch", manifest({"source": "models/a.pt"}), "--op", "encode", "-o", "taken", "--workers", "0")
