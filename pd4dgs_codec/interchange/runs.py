@@ -29,8 +29,8 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.archives import read_tensors
-from pd4dgs_codec.data.files import LARGEST, WHITE, Color, read_file
-from pd4dgs_codec.data.view import ROTATION_TOLERANCE, rotation_matrix, world_to_camera
+from pd4dgs_codec.data.files import LARGEST, WHITE, Color, array, number, read_file, whole_number
+from pd4dgs_codec.data.view import check_rotation, rotation_matrix, world_to_camera
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.splats import (
     Splats,
@@ -163,23 +163,22 @@ def read_cameras(path: Path) -> tuple[list[Camera], tuple[float, float, float]]:
     """Reads (cameras, their mean up direction) from a cameras.json of 3D Gaussian splatting. Raises DataError."""
     try:
         rows = json.loads(read_file(path))
-        turns = np.array([row["rotation"] for row in rows], np.float64)
-        places = np.array([row["position"] for row in rows], np.float64)
-        lenses = np.array([[row[key] for key in ("fx", "fy", "width", "height")] for row in rows], np.float64)
-        good = turns.shape == (len(rows), 3, 3) and places.shape == (len(rows), 3) and lenses.shape == (len(rows), 4)
-        good = good and bool((np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)) <= ROTATION_TOLERANCE).all())
-        good = good and bool((np.abs(places) <= LARGEST).all() and (lenses > 0).all() and (lenses <= LARGEST).all())
-        good = good and bool((lenses[:, 2:] == np.round(lenses[:, 2:])).all() and lenses[:, 2:].max() <= 65535)
-    except (ValueError, TypeError, KeyError, IndexError, OverflowError, RecursionError):
-        good = False
-    if not good:
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{path}: cannot be read as JSON: {error}") from None
+    if not (isinstance(rows, list) and rows and all(isinstance(row, dict) for row in rows)):
         raise DataError(f"{path}: expected a list of cameras with position, rotation, fx, fy, width and height")
-    cameras = []
-    for turn, place, (fx, fy, width, height) in zip(turns, places, lenses, strict=True):
+    cameras, downs = [], []
+    for i, row in enumerate(rows):
+        where = f"{path}: camera {i}:"
+        turn = array(row.get("rotation"), (3, 3), f"{where} rotation")
+        check_rotation(turn, f"{where} rotation")
+        place = array(row.get("position"), (3,), f"{where} position")
+        fx, fy = (number(row.get(key), f"{where} {key}", positive=True) for key in ("fx", "fy"))
+        width, height = (whole_number(row.get(key), f"{where} {key}", 1, 65535) for key in ("width", "height"))
         K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], np.float32)
-        cameras.append(Camera(world_to_camera(turn.T, place).astype(np.float32), K, int(width), int(height)))
-    up = -turns[:, :, 1].mean(axis=0)
-    x, y, z = (float(np.float32(v)) for v in up / max(float(np.linalg.norm(up)), 1e-12))
+        cameras.append(Camera(world_to_camera(turn.T, place).astype(np.float32), K, width, height))
+        downs.append(turn[:, 1])
+    x, y, z = (float(np.float32(v)) for v in -unit(np.mean(downs, axis=0)))
     return cameras, (x, y, z)
 
 

@@ -175,9 +175,18 @@ def test_run_files_give_voxel_background_and_camera(tmp_path):
     np.testing.assert_allclose(viewmat @ [1, 2, 3, 1], [0, 0, 0, 1], atol=1e-6)
     np.testing.assert_allclose(viewmat[:3, :3], np.transpose(turn))
     assert (info.camera.width, info.camera.height, info.camera.K[1, 1]) == (64, 48, 51)
-    (tmp_path / "cameras.json").write_text("[{}]")
-    with pytest.raises(DataError, match="cameras.json: expected a list of cameras"):
-        read_scaffold_gs(tmp_path, Choices())
+    for content, message in (
+        ("[]", "expected a list of cameras with position"),
+        ("[3]", "expected a list of cameras"),
+        ("[{}]", "camera 0: rotation is missing"),
+        (json.dumps([row, row | {"position": [1, 2]}]), r"camera 1: position has shape \(2,\), expected \(3,\)"),
+        (json.dumps([row | {"rotation": [[1, 0, 0], [0, 2, 0], [0, 0, 1]]}]), "camera 0: rotation is not a rotation"),
+        (json.dumps([row | {"fx": "wide"}]), "camera 0: fx is 'wide', expected a number > 0"),
+        (json.dumps([row | {"width": 70_000}]), "camera 0: width is 70000, expected a number and at most 65535"),
+    ):
+        (tmp_path / "cameras.json").write_text(content)
+        with pytest.raises(DataError, match=f"cameras.json: {message}"):
+            read_scaffold_gs(tmp_path, Choices())
 
 
 @pytest.mark.parametrize("voxel", [0.001, 0.37, 1 / 3])
