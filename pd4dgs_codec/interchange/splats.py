@@ -327,7 +327,10 @@ def read_gsplat(path: Path) -> Splats:
     if missing or not isinstance(state, dict):
         raise DataError(f"{path}: has no splats.{missing[0]}; expected a checkpoint of gsplat with spherical harmonics")
     *_, base, rest = parts = [state[name].astype(np.float32) for name in wanted]
-    sh = np.concatenate([base, rest], axis=1) if base.ndim == 3 else base
+    if base.ndim != 3 or rest.ndim != 3 or base.shape[::2] != rest.shape[::2]:
+        found = f"sh0 and shN have shapes {base.shape} and {rest.shape}"
+        raise DataError(f"{path}: {found}, expected (n, 1, 3) and (n, any, 3)")
+    sh = np.concatenate([base, rest], axis=1)
     return checked(str(path), sh=sh, **activated(dict(zip(wanted[:4], parts, strict=False))))
 
 

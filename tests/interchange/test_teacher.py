@@ -106,6 +106,10 @@ def test_a_checkpoint_of_gsplat(tmp_path):
     splat_state = {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in state.items()}
     torch.save({"step": 29999, "splats": splat_state}, path)
     _same(read_model(str(path), 30).splats(0.0), splats)
+    for key, shape in (("shN", (20, 24)), ("shN", (19, 8, 3)), ("sh0", (20, 1, 0)), ("sh0", (20, 3))):
+        torch.save({"step": 1, "splats": splat_state | {key: torch.zeros(shape)}}, path)
+        with pytest.raises(DataError, match=r"sh0 and shN have shapes .*, expected \(n, 1, 3\) and"):
+            read_model(str(path), 30)
     torch.save({"step": 1, "splats": {"means": splat_state["means"]}}, path)
     with pytest.raises(DataError, match="has no splats.quats; expected a checkpoint of gsplat"):
         read_model(str(path), 30)
