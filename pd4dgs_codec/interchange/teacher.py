@@ -305,14 +305,16 @@ def _function(module: str, name: str) -> Callable[[float], Splats]:
             function = getattr(importlib.import_module(module), name)
         except (ImportError, AttributeError, SyntaxError) as error:
             raise DataError(f"{module}:{name}: cannot be imported: {error}") from None
+        except Exception as error:  # of the module's own code
+            raise DataError(f"{module}:{name}: importing it raised {type(error).__name__}: {error}") from error
 
     def splats(t: float) -> Splats:
         where = f"{module}:{name} at {t:g}"
         try:
             answer = function(t)
+            found = answer if isinstance(answer, Mapping) else {k: getattr(answer, k, None) for k in (*PARTS, "colors")}
         except Exception as error:
             raise DataError(f"{where}: raised {type(error).__name__}: {error}") from error
-        found = answer if isinstance(answer, Mapping) else {k: getattr(answer, k, None) for k in (*PARTS, "colors")}
 
         def part(key: str) -> np.ndarray:
             value = found.get(key)
@@ -322,7 +324,7 @@ def _function(module: str, name: str) -> Callable[[float], Splats]:
                 raise DataError(f"{where}: {key} is {type(value).__name__}, expected an array of numbers")
             return value.astype(np.float32)
 
-        sh = part("sh") if found.get("sh") is not None else ((part("colors") - 0.5) / SH_C0)[:, None]
+        sh = part("sh") if found.get("sh") is not None else ((np.atleast_1d(part("colors")) - 0.5) / SH_C0)[:, None]
         return checked(where, sh=sh, **{key: part(key) for key in PARTS[:4]})
 
     return splats

@@ -126,6 +126,14 @@ def wrong(t):
     return {"means": np.zeros((3, 2))}
 def nothing(t):
     raise KeyError("model")
+def number(t):
+    return ball(t) | {"colors": np.array(0.5)}
+class Broken:
+    @property
+    def means(self):
+        raise KeyError("means")
+def lazy(t):
+    return Broken()
 """
 
 
@@ -148,9 +156,14 @@ def test_function_source(tmp_path, monkeypatch):
         ("wrong", "colors is NoneType, expected an array"),
         ("nothing", "raised KeyError"),
         ("absent", "cannot be imported"),
+        ("number", r"sh has shape .1, 1., expected .300, 1, 3."),
+        ("lazy", "raised KeyError: 'means'"),
     ):
         with pytest.raises(DataError, match=message):
             load_source(f"teacher:my_model:{name}?views=8")
+    (tmp_path / "my_broken_model.py").write_text("1 / 0")
+    with pytest.raises(DataError, match="my_broken_model:ball: importing it raised ZeroDivisionError"):
+        load_source("teacher:my_broken_model:ball")
 
 
 def test_pictures_are_those_of_the_frame_next_to_each_view(tmp_path):
