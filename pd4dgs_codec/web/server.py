@@ -125,7 +125,7 @@ class Server(ThreadingTCPServer):
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
             super().__init__((host, port), _Handler)
-        except (OSError, OverflowError) as error:
+        except (OSError, OverflowError, TypeError) as error:  # TypeError: a name that IDNA cannot encode
             raise DeliveryError(
                 f"cannot listen on {_authority(host, port)}: {getattr(error, 'strerror', error)}"
             ) from None

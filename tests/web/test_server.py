@@ -256,7 +256,7 @@ def test_a_file_that_shrinks_while_it_is_sent_cuts_the_answer(folder, monkeypatc
 def test_the_folder_and_the_address_must_be_usable(folder, server):
     with pytest.raises(DeliveryError, match="not a folder"):
         Server(folder / "bytes.bin")
-    for host, port in (server.server_address[:2], ("203.0.113.77", 0), ("no such host", 0)):
+    for host, port in (server.server_address[:2], ("203.0.113.77", 0), ("no such host", 0), ("ä..b", 0)):
         with pytest.raises(DeliveryError, match="cannot listen"):
             Server(folder, host, port)
 
