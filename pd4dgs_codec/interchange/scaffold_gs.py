@@ -74,7 +74,8 @@ def read_scaffold_gs(folder: Path, choices: Choices) -> Scene:
     feature, networks = _whitened(table["feature"], networks)
     anchor = table["anchor"]
     voxel = choices.voxel_size or _voxel_size(config)
-    voxel = float(np.float32(voxel if voxel > 0 else _grid(anchor, ply)))
+    with np.errstate(over="ignore"):
+        voxel = float(np.float32(voxel if voxel > 0 else _grid(anchor, ply)))
     camera, up = None, UP
     if (run / "cameras.json").is_file():
         (camera, *_), up = read_cameras(run / "cameras.json")
@@ -254,6 +255,8 @@ def _grid(anchor: np.ndarray, path: Path) -> float:
 
 def _cells(anchor: np.ndarray, voxel: float, path: Path) -> np.ndarray:
     """Returns the anchors in voxels, int32 [N, 3]. Raises DataError if they are not multiples of `voxel`."""
+    if not 0 < voxel < np.inf:
+        raise DataError(f"{path}: the voxel size is {voxel:g} in binary32, expected a positive number")
     exact = anchor.astype(np.float64) / voxel
     cells = np.round(exact)
     if (most := np.abs(cells).max()) > MAX_VOXEL:

@@ -229,6 +229,8 @@ def test_broken_plys(tmp_path, cli):
     place = theirs.write(tmp_path / "run")
     assert "voxels off the grid of 0.007" in _fails(tmp_path, cli, "--voxel-size", 0.007)
     assert "voxels of 1e-09 away" in _fails(tmp_path, cli, "--voxel-size", 1e-9)
+    for size, held in ((1e39, "inf"), (1e-46, "0")):
+        assert f"the voxel size is {held} in binary32" in _fails(tmp_path, cli, "--voxel-size", size)
     theirs.offset[3, 2, 1] = np.nan
     theirs.write(tmp_path / "run")
     assert "f_offset_* holds a NaN" in _fails(tmp_path, cli)
