@@ -154,3 +154,12 @@ def test_foreign_folder_is_not_replaced(room, tmp_path, capsys):
     (tmp_path / "new.partial").mkdir()
     assert main([str(room[0]), "-o", str(tmp_path / "new")]) == 1
     assert "expected nothing here or the partial output of an earlier run" in capsys.readouterr().err
+
+
+def test_a_folder_without_a_name_of_its_own_is_refused(room, tmp_path, monkeypatch, capsys):
+    (tmp_path / "sparse").mkdir()
+    (tmp_path / "report.json").write_text("{}")
+    monkeypatch.chdir(tmp_path)
+    assert main([str(room[0]), "-o", ".", "--overwrite"]) == 1
+    assert ".: has no name of its own, expected the name of an output folder" in capsys.readouterr().err
+    assert (tmp_path / "report.json").is_file()
