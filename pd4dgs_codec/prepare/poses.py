@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.errors import DataError, one_line, required
+from pd4dgs_codec.errors import DataError, required
 from pd4dgs_codec.signals import ENDING
 
 #: Called after each item.
@@ -115,7 +115,7 @@ def match(database: Path, names: Sequence[str], listed: Sequence[tuple[int, int]
 
 
 def reconstruct(database: Path, images: Path, folder: Path, threads: int, advance: Advance) -> Any | None:
-    """The largest model of incremental mapping, a pycolmap.Reconstruction, or None. Raises DataError if it fails."""
+    """The largest model of incremental mapping, a pycolmap.Reconstruction, or None."""
     pycolmap = colmap()
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads, options.random_seed = threads, SEED
@@ -123,10 +123,7 @@ def reconstruct(database: Path, images: Path, folder: Path, threads: int, advanc
     options.ba_global_frames_ratio = options.ba_global_points_ratio = GROWTH
     options.ba_global_max_refinements = options.ba_local_max_refinements = ROUNDS
     folder.mkdir(parents=True, exist_ok=True)
-    try:
-        models = pycolmap.incremental_mapping(database, images, folder, options, next_image_callback=advance)
-    except (RuntimeError, ValueError) as error:
-        raise DataError(f"{images}: COLMAP failed: {one_line(str(error), 160)}") from None
+    models = pycolmap.incremental_mapping(database, images, folder, options, next_image_callback=advance)
     return max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
 
 

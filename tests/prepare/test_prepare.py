@@ -163,3 +163,16 @@ def test_a_folder_without_a_name_of_its_own_is_refused(room, tmp_path, monkeypat
     assert main([str(room[0]), "-o", ".", "--overwrite"]) == 1
     assert ".: has no name of its own, expected the name of an output folder" in capsys.readouterr().err
     assert (tmp_path / "report.json").is_file()
+
+
+def test_a_failure_of_colmap_names_the_recording_and_leaves_nothing(room, tmp_path, monkeypatch, capsys):
+    def fail(*_: object, **__: object) -> None:
+        raise RuntimeError("no space")
+
+    for name in ("extract", "match"):
+        monkeypatch.setattr(poses, name, lambda *_: None)
+    monkeypatch.setattr(poses, "travel", lambda database: -1.0)
+    monkeypatch.setattr(poses.colmap(), "incremental_mapping", fail)
+    assert main([str(room[0]), "-o", str(tmp_path / "out")]) == 1
+    assert f"{room[0]}: COLMAP failed: no space" in capsys.readouterr().err.splitlines()[-1]
+    assert not list(tmp_path.iterdir())
