@@ -244,9 +244,7 @@ def sampson(a: np.ndarray, b: np.ndarray, relative: np.ndarray) -> np.ndarray:
 
     relative: float64 [3, 4], from the first camera to the second. The unit is that of the coordinates.
     """
-    t = relative[:, 3]
-    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
-    essential = cross @ relative[:, :3]
+    essential = np.cross(relative[:, 3], relative[:, :3], axisb=0, axisc=0)  # the shift times each column
     ha, hb = (np.column_stack([p, np.ones(len(p))]) for p in (a, b))
     line_b, line_a = ha @ essential.T, hb @ essential
     error = np.abs((hb * line_b).sum(axis=1))

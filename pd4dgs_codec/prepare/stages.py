@@ -13,7 +13,7 @@ import shutil
 import stat
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -152,8 +152,7 @@ def _frames(
     (work / "images").mkdir()
     with progress(len(choice.chosen), "frames", "writing") as advance:
         times = write_frames(recording, choice.chosen, work / "images", options.downscale, advance)
-    content = {"looks": [list(asdict(each).values()) for each in looks], "times": times}
-    content["choice"] = list(asdict(choice).values())
+    content = {"looks": [astuple(each) for each in looks], "choice": astuple(choice), "times": times}
     write_bytes(done, json.dumps(finite(content)).encode(), overwrite=True)
     return looks, choice, times
 
