@@ -318,12 +318,10 @@ class Learnt:
 def upright(up: Sequence[float]) -> np.ndarray:
     """Returns float64 [3, 3]: the smallest rotation that carries the direction `up` to +y."""
     a, b = unit(np.asarray(up, np.float64)), np.array([0.0, 1.0, 0.0])
-    cross, cosine = np.cross(a, b), float(a @ b)
-    if cosine < -1 + 1e-9:
+    if a @ b < -1 + 1e-9:
         return np.diag([1.0, -1.0, -1.0])
-    x, y, z = cross
-    skew = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.asarray(np.eye(3) + skew + skew @ skew / (1 + cosine))  # Rodrigues
+    # reflections along a and a + b: the first turns a round, the second carries -a to b
+    return np.asarray(np.eye(3) + 2 * np.outer(b, a) - np.outer(a + b, a + b) / (1 + a @ b))
 
 
 def turned_camera(camera: Camera, turn: np.ndarray) -> Camera:
