@@ -245,11 +245,8 @@ def read_splats(path: Path) -> Splats:
 def read_parameters(path: Path) -> dict[str, np.ndarray]:
     """Reads the numbers that `read_splats` activates, float32, by the names of Splats: logarithms of scales, logits of
     opacities, and quaternions of any length. Raises DataError."""
-    compressed = path.name.lower().endswith(".compressed.ply")
-    if path.suffix.lower() == ".spz" or compressed:
-        rows = read_vertices(path, _unpacked(path, "compressed.ply" if compressed else "spz"))
-    else:
-        rows = read_vertices(path)
+    kind = next((kind for kind in ("spz", "compressed.ply") if path.name.lower().endswith(f".{kind}")), None)
+    rows = read_vertices(path, _unpacked(path, kind) if kind else None)
     names = set(rows.dtype.names or ())
 
     def stack(*wanted: str) -> np.ndarray:
