@@ -292,9 +292,8 @@ def _run(
     code, printed, log = command(job.verb, argv)
     work, log = time.process_time() - cpu, log[-LOG_BYTES:]
     if code != 0:
-        message = (
-            [line for line in log.splitlines() if line.strip()] or [f"pd4dgs-{job.verb} exited with code {code}"]
-        )[-1]
+        told = (line for line in reversed(log.splitlines()) if line.strip())
+        message = next(told, f"pd4dgs-{job.verb} exited with code {code}")
         raise CommandFailed(message, final=code == 2, log=log, work=work)
     report = json.loads(printed)
     if report.get("interrupted"):
