@@ -14,7 +14,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
-from common import ONE, TWO, Benchmark, Row, Run, Scene, command, number, table
+from common import ONE, TWO, Benchmark, Row, Run, Scene, command, number, package, table
 
 from pd4dgs_codec.errors import DataError
 
@@ -331,5 +331,5 @@ ERROR = Benchmark("error-time", "Error against run time", ONE, measure_error, er
 STABILITY = Benchmark("stability", "Extreme cases", (), measure_stability, stability_text)
 SPEED = Benchmark("speed", "Speed", TWO, measure_speed, speed_text)
 CODERS = Benchmark("rivals", "Other coders", TWO, measure_coders, coders_text)
-EXPORT = Benchmark("export", "Exported files", ("orbit",), measure_export, export_text)
-BATCH = Benchmark("batch", "Batches", ONE, measure_batch, batch_text)
+EXPORT = Benchmark("export", "Exported files", ("orbit",), measure_export, export_text, measured=package("export"))
+BATCH = Benchmark("batch", "Batches", ONE, measure_batch, batch_text, measured=package("batch"))

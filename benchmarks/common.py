@@ -166,6 +166,27 @@ class Run:
         return path
 
 
+#: Code of the package, by what it is for, on which no rows depend unless a benchmark names it: other commands import it
+#: only for URLs and `pd4dgs-train --watch`, if at all.
+APART = {
+    "delivery": (
+        *("bench/latency.py", "cli/package.py", "cli/serve.py"),
+        *(f"web/{name}.py" for name in ("client", "manifests", "package", "page", "server")),
+    ),
+    "batch": ("batch", "cli/batch.py"),
+    "export": ("interchange/export.py", "cli/export.py"),
+    "import": ("interchange/scaffold_gs.py", "cli/import_model.py"),
+    "prepare": ("prepare", "cli/prepare.py"),
+    "view": ("cli/view.py", "cli/watch.py"),
+}
+
+
+def package(*parts: str) -> tuple[str, ...]:
+    """git pathspecs of the code of the package, and of what is APART in it only these parts."""
+    left_out = [path for part, paths in APART.items() if part not in parts for path in paths]
+    return ("pd4dgs_codec", *(f":!pd4dgs_codec/{path}" for path in left_out))
+
+
 @dataclass(frozen=True)
 class Benchmark:
     """scenes: names in SCENES; none where no scene is measured. measure: the rows of one scene (of None without
@@ -180,7 +201,7 @@ class Benchmark:
     text: Callable[[Sequence[Row]], str]
     pictures: Callable[[Sequence[Row], Path], list[str]] = lambda rows, folder: []
     trainings: Callable[[Run, Any], list[Training]] = lambda run, scene: [Training(scene)]
-    measured: tuple[str, ...] = ("pd4dgs_codec",)
+    measured: tuple[str, ...] = package()
 
 
 def command(name: str, *arguments: object) -> Row:

@@ -11,7 +11,7 @@ from statistics import median
 from typing import Any
 
 from browser import TIMEOUT_MS, launched
-from common import ONE, TWO, Benchmark, Row, Run, Scene, command, levels, number, seconds_at, table
+from common import ONE, TWO, Benchmark, Row, Run, Scene, command, levels, number, package, seconds_at, table
 
 from pd4dgs_codec.bench.latency import python
 from pd4dgs_codec.bench.report import drawing
@@ -212,7 +212,7 @@ def player_text(rows: Sequence[Row]) -> str:
     )
 
 
-LATENCY = Benchmark("latency", "First picture", ONE, measure_latency, latency_text)
+LATENCY = Benchmark("latency", "First picture", ONE, measure_latency, latency_text, measured=package("delivery"))
 #: Whose layer 0 is larger than a slice.
 SLICED = (*TWO, "orbit", "static", "global", "local", "fast")
 SLICES = Benchmark("slices", "Slices", SLICED, measure_slices, slices_text, slices_pictures)
@@ -222,5 +222,5 @@ PLAYER = Benchmark(
     ONE,
     measure_player,
     player_text,
-    measured=("pd4dgs_codec", "player", ":!player/test*", ":!*.md"),
+    measured=(*package("delivery"), "player", ":!player/test*", ":!*.md"),
 )

@@ -157,7 +157,9 @@ def test_trainings_side_by_side_are_those_that_are_measured(tmp_path, monkeypatc
 
 
 def test_sections_whose_code_has_changed_are_named(tmp_path, monkeypatch):
-    """Docstrings and comments do not count; of the player's code only the section that opens it depends."""
+    """Docstrings and comments do not count; on the player's code only the section that opens it depends, and on code
+    that is apart only the section that names it."""
+    assert all((ROOT / "pd4dgs_codec" / path).exists() for paths in common.APART.values() for path in paths)
     monkeypatch.setattr(common, "ROOT", tmp_path)
 
     def commit(name: str, text: str) -> str:
@@ -175,11 +177,14 @@ def test_sections_whose_code_has_changed_are_named(tmp_path, monkeypatch):
     code = commit("pd4dgs_codec/x.py", '"""Adds."""\na = 2\n')
     words = commit("pd4dgs_codec/x.py", '"""Adds one."""\na = 2  # two\n')
     commit("player/x.js", "1;")
+    script = commit("pd4dgs_codec/cli/batch.py", "a = 1\n")
+    batches = commit("pd4dgs_codec/cli/batch.py", "a = 2\n")
     for section in ("quality", "player"):
         assert named(section, first).startswith(f"{section}: made at {first}; changed since: pd4dgs_codec/x.py")
         assert named(section, "abcdef1").startswith(f"{section}: made at abcdef1; changed since:")
     assert named("quality", f"{code}, changed") == named("quality", words) == ""
     assert named("player", words) == f"player: made at {words}; changed since: player/x.js"
+    assert named("batch", script).startswith("batch: ") and named("batch", batches) == named("player", script) == ""
 
 
 def test_several_seeds_are_shown_with_their_spread():
