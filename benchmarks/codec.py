@@ -148,16 +148,8 @@ def speed_text(rows: Sequence[Row]) -> str:
         + (" / ".join(number(1e3 * s, 0) for s in r["steps"]),)
         for r in rows
     ]
-    head = (
-        "scene",
-        "anchors",
-        "encode s",
-        "decode ms",
-        "picture ms",
-        "`pd4dgs-decode` s",
-        "`pd4dgs-render` s",
-        "step ms",
-    )
+    commands = ("`pd4dgs-decode` s", "`pd4dgs-render` s")
+    head = ("scene", "anchors", "encode s", "decode ms", "picture ms", *commands, "step ms")
     return (
         "Medians of wall time on all threads. Encoding includes verification. Commands run in new processes; "
         "`pd4dgs-render` draws one picture. *step*: a training step at levels 0 / 1 (/ 2) on one thread, beside "

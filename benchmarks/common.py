@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from pd4dgs_codec.cli.common import number as number
+from pd4dgs_codec.cli.common import say as say
 from pd4dgs_codec.errors import DataError, TrainError
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -251,11 +252,6 @@ def save_jpeg(image: Any, path: Path, limit: int) -> None:
         image.convert("RGB").save(path, quality=quality, subsampling=0)
         if path.stat().st_size <= limit:
             break
-
-
-def say(line: str) -> None:
-    """Prints a stage as it begins."""
-    print(line, file=sys.stderr, flush=True)
 
 
 def peak_bytes(process: Path = Path("/proc/self")) -> int:

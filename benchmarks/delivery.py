@@ -91,17 +91,8 @@ def slices_text(rows: Sequence[Row]) -> str:
             + (texts[1] if moving else "-", texts[-1], f"{points[-1][0] / whole[-1][0] - 1:+.1%}")
             + (number(max(fall, 0.0), 3), number(share_of_bytes(points, whole)))
         )
-    head = (
-        "scene",
-        "slices",
-        "first slice",
-        "s at 2 Mbps",
-        "mPSNR dB",
-        "layer 0 whole",
-        "first with motion",
-        "whole file",
-    )
-    more = ("cost", "largest drop dB", "share")
+    head = ("scene", "slices", "first slice", "s at 2 Mbps", "mPSNR dB", "layer 0 whole", "first with motion")
+    more = ("whole file", "cost", "largest drop dB", "share")
     return (
         "`pd4dgs-encode --slices 50k --data SOURCE`: the quality of every prefix on held-out views. *layer 0 whole* "
         "and *cost* compare with a file of one slice per layer. *share*: bytes to reach a quality, as a share of the "

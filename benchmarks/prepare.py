@@ -134,9 +134,8 @@ def errors(found: np.ndarray, true: np.ndarray) -> tuple[float, float]:
     p = p @ turn.T
     gaps = p * ((p * q).sum() / (p * p).sum()) - q
     extent = np.linalg.norm(q[:, None] - q, axis=2).max()
-    return float(np.degrees(np.arccos(cosines.clip(-1, 1).min()))), float(
-        100 * np.sqrt((gaps**2).sum(axis=1).mean()) / extent
-    )
+    angle, distance = np.arccos(cosines.clip(-1, 1).min()), np.sqrt((gaps**2).sum(axis=1).mean())
+    return float(np.degrees(angle)), float(100 * distance / extent)
 
 
 def measured(recording: Walk | Capture, package: Path, frames: int) -> str:

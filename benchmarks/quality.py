@@ -131,7 +131,7 @@ def text(rows: Sequence[Row]) -> str:
         "Quality is measured on held-out views, from the prefix of the file whose size is in the same row. *monolith*: "
         "the same scene trained for the highest level alone, without a rate term, stored as float32 under LZMA. "
         "*moving*: mPSNR of the pixels whose true colour changes over time, for fixed test cameras. Each training has "
-        f"one thread and runs beside another one.{told}",
+        f"one thread and runs beside another one.{told}"
     ]
     if shown:
         parts.append(table(("scene", "shows", "`pd4dgs-train`"), shown))
@@ -159,20 +159,13 @@ def levels_table(rows: Sequence[Row], m: str) -> str:
         groups.setdefault((row["scene"], row["level"]), []).append(row)
     cells, moves = [], any("moving_mpsnr" in row for row in rows)
     for (scene, level), found in groups.items():
-        size = median(row["bytes"] for row in found)
+        sizes = [row["bytes"] for row in found]
+        moving = [row["moving_mpsnr"] for row in found if "moving_mpsnr" in row]
+        training = [number(found[0][key], digits) for key, digits in (("anchors", 0), ("steps", 0), ("minutes", 1))]
         cells.append(
-            (
-                scene,
-                level,
-                spread([row["bytes"] for row in found], 0),
-                seconds_at(size),
-                spread([row[f"{m}psnr"] for row in found], 2),
-                *([spread([row["moving_mpsnr"] for row in found if "moving_mpsnr" in row], 2)] if moves else []),
-                number(median(row[f"{m}ssim"] for row in found), 4),
-                number(found[0]["anchors"], 0),
-                number(found[0]["steps"], 0),
-                number(found[0]["minutes"], 1),
-            )
+            (scene, level, spread(sizes, 0), seconds_at(median(sizes)), spread([row[f"{m}psnr"] for row in found], 2))
+            + ((spread(moving, 2),) if moves else ())
+            + (number(median(row[f"{m}ssim"] for row in found), 4), *training)
         )
     scenes = list(dict.fromkeys(scene for scene, _ in groups))
     for name, published in PUBLISHED.items():

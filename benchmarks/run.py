@@ -117,33 +117,23 @@ def main(argv: Sequence[str] | None = None) -> int:
     names = [benchmark.name for benchmark in ALL]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=names, metavar="NAME", help=f"sections: {', '.join(names)}")
-    parser.add_argument(
-        "--scenes", nargs="+", choices=list(SCENES), metavar="SCENE", help=f"scenes: {', '.join(SCENES)}"
-    )
+    parser.add_argument("--scenes", nargs="+", choices=SCENES, metavar="SCENE", help=f"scenes: {', '.join(SCENES)}")
     parser.add_argument("--seeds", type=int, default=1, help="trainings per scene in the section quality (%(default)s)")
     parser.add_argument("--quick", action="store_true", help="a tiny scene; without the player unless --only names it")
     parser.add_argument("--resume", action="store_true", help="keep the sections that were made at this commit")
     parser.add_argument("--render", action="store_true", help="render the page from its figures without measuring")
     what = "name sections whose measured code has changed (without comments); exit code 1 if any"
     parser.add_argument("--check", action="store_true", help=what)
-    parser.add_argument(
-        "-o",
-        "--out",
-        type=Path,
-        default=ROOT / "out" / "benchmarks",
-        help="folder of checkpoints and files (%(default)s)",
-    )
+    out, what = ROOT / "out" / "benchmarks", "folder of checkpoints and files (%(default)s)"
+    parser.add_argument("-o", "--out", type=Path, default=out, help=what)
     parser.add_argument("--docs", type=Path, help="folder of the page (docs; with --quick OUT/docs)")
     args = parser.parse_args(argv)
     os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # each process that is timed would compile its modules anew
     docs = args.docs or (args.out / "docs" if args.quick else ROOT / "docs")
     run = Run(args.out.resolve(), docs / "img", args.quick, args.seeds)
     asked = args.only or [name for name in names if not (args.quick and name == "player")]
-    given = sys.argv[1:] if argv is None else argv
-    made = {
-        "commit": commit(),
-        "command": " ".join(["python benchmarks/run.py", *(w for w in given if w != "--resume")]),
-    }
+    given = [word for word in (sys.argv[1:] if argv is None else argv) if word != "--resume"]
+    made = {"commit": commit(), "command": " ".join(["python benchmarks/run.py", *given])}
     stored = docs / "figures" / "results.json"
     kept = {found["name"]: found for found in json.loads(stored.read_text())["sections"]} if stored.is_file() else {}
     if args.check:
