@@ -75,10 +75,8 @@ class Figures:
         rows += [(f"ends in {name}", count) for name, count in self.outcomes.most_common()]
         rows += [(f"compared with {name}", count) for name, count in self.compared.items()]
         rows += [("faults under two names", self.differences.total()), ("largest memory / bound", f"{self.memory:.0%}")]
-        lines = [
-            "| figure | value |\n|---|---|",
-            *(f"| {n} | {v} |" for n, v in [*rows, ("findings", len(self.findings))]),
-        ]
+        rows += [("findings", len(self.findings))]
+        lines = ["| figure | value |\n|---|---|", *(f"| {name} | {value} |" for name, value in rows)]
         lines += [f"{count} × {name}" for name, count in self.differences.most_common(10)]
         lines += [f"{r['input']} {r['kind']}: {r['message']} ({r['recipe']})" for r in self.findings[:20]]
         return "\n".join(lines)
@@ -133,11 +131,9 @@ def run_safely(files: Sequence[Seed], run: int, inputs: range, names: Sequence[s
                 yield reader.recv()
             except EOFError:
                 child.join()
-                message, recipe = (
-                    f"the process ended with exit code {child.exitcode}",
-                    make_case(files, run, index).recipe,
-                )
-                yield Figures(inputs=1, findings=[_row(index, "crash", message, recipe)])
+                message = f"the process ended with exit code {child.exitcode}"
+                row = _row(index, "crash", message, make_case(files, run, index).recipe)
+                yield Figures(inputs=1, findings=[row])
                 break
         child.join()
         inputs = range(index + 1, inputs.stop)
