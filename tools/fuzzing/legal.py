@@ -10,16 +10,14 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from vectors import blocks, lzma2
 from vectors.blocks import (
-    ATTRIBUTES,
     LZMA,
-    MASKS,
     PLANE,
     POSITIONS,
     SYMBOLS,
@@ -28,15 +26,16 @@ from vectors.blocks import (
     Known,
     Layer,
     Scale,
+    Slices,
     ancillary,
     coded,
     make_file,
     make_layer,
     ordered,
+    positions,
     varint,
 )
 
-from pd4dgs_codec.entropy.positions import position_channels
 from pd4dgs_codec.entropy.priors import Const, Gauss, Mixture, Normal, Prior, Window
 from pd4dgs_codec.errors import DecodeError
 from pd4dgs_codec.format.info import hashes
@@ -210,45 +209,23 @@ class Choices:
         return k
 
 
-class Written:
-    """The slices of one layer: what later ones may refer to."""
-
-    def __init__(self, choices: Choices):
-        self.choices, rng = choices, choices.rng
-        self.sections = {name: Section(rng) for name in ("positions", "masks", "attributes")}
-
-    def add(self, layer: Layer) -> Layer:
-        """The slice with its anchors coded as chance has it."""
-        found: dict[int, bytes | None] = {}
-        if layer.codes.size:
-            head, channels = position_channels(layer.cells)
-            found[POSITIONS] = head + self.sections["positions"].coded(channels)
-        if self.choices.mode == LZMA:
-            return layer.with_sections(found | _lzma(self.choices.rng, layer))
-        if layer.rises.size or layer.codes.size:
-            found[MASKS] = self.sections["masks"].coded([layer.rises, layer.codes])
-        if layer.codes.size:
-            found[ATTRIBUTES] = self._attributes(layer)
-        return layer.with_sections(found)
-
-    def _attributes(self, layer: Layer) -> bytes:
-        rng, k, classes = self.choices.rng, layer.attributes, layer.classes
-        grades = b""
-        if classes.size:
-            section = Section(rng).coded([classes])
-            grades = varint(len(section)) + section
-        parts = [c[classes == q] for c in k for q in range(7)] if classes.size else list(k)
-        return grades + self.sections["attributes"].coded(parts)
+def _written(rng: random.Random) -> Slices:
+    """Writes the slices of a layer under priors as chance has it."""
+    anchors = (Section(rng).coded for _ in range(3))
+    return Slices(*anchors, grades=lambda channels: Section(rng).coded(channels))
 
 
-def _lzma(rng: random.Random, layer: Layer) -> dict[int, bytes | None]:
-    none: dict[int, bytes | None] = dict.fromkeys((MASKS, ATTRIBUTES, PLANE, WEIGHTS))
-    if not any(channel.size for channel in layer.channels):
-        return none
-    stream = rng.choice((lzma2.stored, lzma2.packed))
-    base = rng.choice((0, 0, None, K, -K, 1000))
-    how = {"base": base, "width": rng.choice((None, 2)), "planar": rng.random() < 0.5, "stream": stream}
-    return none | {SYMBOLS: blocks.lzma_symbols(layer.channels, **how)}  # type: ignore[arg-type]
+def _lzma(rng: random.Random, layer: Layer) -> Layer:
+    """The only slice of a layer, with its positions and section SYMBOLS."""
+    found: dict[int, bytes | None] = {}
+    if layer.codes.size:
+        found[POSITIONS] = positions(layer.cells, Section(rng).coded)
+    if any(channel.size for channel in layer.channels):
+        stream = rng.choice((lzma2.stored, lzma2.packed))
+        base = rng.choice((0, 0, None, K, -K, 1000))
+        how = {"base": base, "width": rng.choice((None, 2)), "planar": rng.random() < 0.5, "stream": stream}
+        found[SYMBOLS] = blocks.lzma_symbols(layer.channels, **how)  # type: ignore[arg-type]
+    return layer.with_sections(found)
 
 
 # -- layers ------------------------------------------------------------------------------------------------------------
@@ -329,10 +306,10 @@ def legal(rng: random.Random) -> File:
     """A file of random layers, slices, widths, forms and priors. `File.hashes` says what it decodes to."""
     choices, layers = Choices(rng), list[Layer]()
     for number in sorted({0, *rng.sample((1, 2), rng.randrange(3))}):
-        written, own = Written(choices), list[Layer]()
-        slices = 1 if choices.mode == LZMA else rng.choice((1, 1, 2, 3, rng.choice((5, 12))))
-        for index in range(slices):
-            own.append(written.add(_slice(choices, number, not index)))
+        write, count = partial(_lzma, rng), 1
+        if choices.mode != LZMA:
+            write, count = _written(rng).add, rng.choice((1, 1, 2, 3, rng.choice((5, 12))))
+        own = [write(_slice(choices, number, not index)) for index in range(count)]
         order = morton_order(np.concatenate([x.cells for x in own]))
         codes = np.concatenate([x.codes for x in own])[order]
         choices.codes = np.concatenate([choices.codes + own[0].rises, codes])
@@ -393,8 +370,7 @@ def _with_what_is_ignored(rng: random.Random, file: File) -> File:
         packed = blocks.canonical.pack({**meta, 2: {**meta[2], **lengths}, rng.choice((64, 70000)): rng.choice(extra)})
         chunks[at] = replace(chunks[at], payload=layer.payload(packed))
     while rng.random() < 0.3:
-        made = ancillary(
-            rng.choice((3, 4, 1 << 15, 65535, rng.randint(3, 65535))), rng.randbytes(rng.choice((0, 1, 30, 500)))
-        )
+        kind, size = rng.choice((3, 4, 1 << 15, 65535, rng.randint(3, 65535))), rng.choice((0, 1, 30, 500))
+        made = ancillary(kind, rng.randbytes(size))
         chunks.insert(rng.randint(1, len(chunks)), made)
     return replace(file, chunks=tuple(chunks))

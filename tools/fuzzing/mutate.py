@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from vectors.blocks import varint
+from vectors.blocks import PLANE, varint
 
 from pd4dgs_codec.entropy.varint import VARINT_MAX, ByteReader
 from pd4dgs_codec.errors import DecodeError, EncodeError
@@ -27,7 +27,6 @@ from pd4dgs_codec.scene import Widths
 
 from .legal import Seed, legal
 
-PLANES = 3  # the section that may be in stages
 SECTIONS = 2  # key of the layer parameters
 _POWERS = (7, 8, 12, 14, 15, 16, 20, 21, 22, 23, 24, 26, 28, 31, 32)
 #: Around every limit of the format and every width of an integer.
@@ -229,7 +228,7 @@ def put_together(parts: Parts, header: bytes | None = None) -> bytes:
 
 def stages_of(section: bytes, number: int, header: dict[int, Any], meta: dict[int, Any]) -> list[bytes]:
     """The stages of a section, which is one itself unless it holds planes."""
-    if number != PLANES:
+    if number != PLANE:
         return [section]
     reader = ByteReader(section)
     fields, widths = canonical.Fields(meta, "layer", set(meta)), Widths(*header[15][:2])

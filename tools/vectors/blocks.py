@@ -13,21 +13,14 @@ import struct
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Any
 
 import numpy as np
 
 from pd4dgs_codec.entropy.ans import ans_encode
 from pd4dgs_codec.entropy.positions import position_channels
-from pd4dgs_codec.entropy.priors import (
-    FIRST_REUSE,
-    Const,
-    Gauss,
-    Normal,
-    Prior,
-    Window,
-)
+from pd4dgs_codec.entropy.priors import FIRST_REUSE, Const, Gauss, Normal, Prior, Window
 from pd4dgs_codec.entropy.varint import put_varint, put_zigzag
 from pd4dgs_codec.format import canonical
 from pd4dgs_codec.format.container import MAJOR, SIGNATURE
@@ -121,6 +114,7 @@ def default_prior(symbols: np.ndarray) -> Prior:
 
 
 Known = list[bytes]  # definitions of priors
+Coder = Callable[[Iterable[np.ndarray]], bytes]  # of the channels of a section
 
 
 def coded(
@@ -163,30 +157,18 @@ def _exceptions(k: np.ndarray, inside: np.ndarray, window: Window) -> bytes:
     return out
 
 
-def positions(cells: np.ndarray, known: Known | None = None) -> bytes:
+def positions(cells: np.ndarray, coder: Coder) -> bytes:
     """Section POSITIONS of int32 [n, 3] in Morton order (clause 10)."""
     head, channels = position_channels(cells)
-    return head + coded(channels, known=known)
+    return head + coder(channels)
 
 
-def graded_part(classes: np.ndarray, length: int | None = None) -> bytes:
+def graded_part(classes: np.ndarray, length: int | None = None, coder: Coder = coded) -> bytes:
     """The step classes of the rows as the attributes section has them. length: stated instead of the true one."""
     if not classes.size:
         return b""
-    section = coded([classes])
+    section = coder([classes])
     return varint(len(section) if length is None else length) + section
-
-
-def coded_attributes(
-    k: np.ndarray,
-    priors: Mapping[int, Prior] | None = None,
-    known: Known | None = None,
-    *,
-    classes: np.ndarray = NO_CLASSES,
-) -> bytes:
-    """Section ATTRIBUTES of int32 [channels, n] (clause 8.5)."""
-    channels = [c[classes == q] for c in k for q in range(7)] if classes.size else k
-    return graded_part(classes) + coded(channels, priors, known)
 
 
 def relative_magnitude(e: np.ndarray) -> np.ndarray:
@@ -415,21 +397,15 @@ def make_layer(
         weights=[w for own in networks.values() for w in own],  # type: ignore[misc]
         meta=meta,
     )
-    return layer if mode is None else layer.with_sections(_sections(layer, mode))
-
-
-def _sections(layer: Layer, mode: int) -> dict[int, bytes | None]:
-    n, channels = len(layer.cells), layer.channels
-    some = any(c.size for c in channels)
-    sections: dict[int, bytes | None] = {POSITIONS: positions(layer.cells) if n else None}
+    if mode is None:
+        return layer
     if mode == LZMA:
-        return sections | {SYMBOLS: lzma_symbols(channels, stream=lzma2.packed) if some else None}
-    return sections | {
-        MASKS: coded([layer.rises, layer.codes]) if layer.rises.size or n else None,
-        ATTRIBUTES: coded_attributes(layer.attributes, classes=layer.classes) if n else None,
-        PLANE: coded_planes(layer.residuals) if layer.residuals else None,
-        WEIGHTS: coded(w.ravel() for w in layer.weights) if layer.weights else None,
-    }
+        some = any(c.size for c in layer.channels)
+        symbols = lzma_symbols(layer.channels, stream=lzma2.packed) if some else None
+        return layer.with_sections({POSITIONS: positions(layer.cells, coded) if n else None, SYMBOLS: symbols})
+    planes = coded_planes(layer.residuals) if layer.residuals else None
+    weights = coded(w.ravel() for w in layer.weights) if layer.weights else None
+    return Slices().add(layer.with_sections({PLANE: planes, WEIGHTS: weights}))
 
 
 def later(number: int, cells: Sequence[Sequence[int]], **fields: Any) -> Layer:
@@ -437,22 +413,30 @@ def later(number: int, cells: Sequence[Sequence[int]], **fields: Any) -> Layer:
     return make_layer(number, ordered(cells), networks={}, **fields)
 
 
+def _coder() -> Coder:
+    """Of a section that knows what the slices before defined."""
+    return partial(coded, known=[])
+
+
 @dataclass
 class Slices:
-    """Writes the slices of a layer in turn, each with what those before defined."""
+    """Writes the slices of a layer in turn, each with what those before defined. grades: codes step classes."""
 
-    positions: Known = field(default_factory=list)
-    masks: Known = field(default_factory=list)
-    attributes: Known = field(default_factory=list)
+    positions: Coder = field(default_factory=_coder)
+    masks: Coder = field(default_factory=_coder)
+    attributes: Coder = field(default_factory=_coder)
+    grades: Coder = coded
 
     def add(self, layer: Layer) -> Layer:
         """The slice as it is written."""
-        sections = dict[int, bytes | None]()
-        if layer.rises.size or layer.codes.size:
-            sections[MASKS] = coded([layer.rises, layer.codes], known=self.masks)
+        sections, k, classes = dict[int, bytes | None](), layer.attributes, layer.classes
         if layer.codes.size:
             sections[POSITIONS] = positions(layer.cells, self.positions)
-            sections[ATTRIBUTES] = coded_attributes(layer.attributes, known=self.attributes, classes=layer.classes)
+        if layer.rises.size or layer.codes.size:
+            sections[MASKS] = self.masks([layer.rises, layer.codes])
+        if layer.codes.size:
+            channels = [c[classes == q] for c in k for q in range(7)] if classes.size else list(k)
+            sections[ATTRIBUTES] = graded_part(classes, coder=self.grades) + self.attributes(channels)
         return layer.with_sections(sections)
 
 

@@ -59,7 +59,6 @@ from .blocks import (
     Slices,
     Vector,
     coded,
-    coded_attributes,
     coded_planes,
     constant,
     gauss,
@@ -166,11 +165,8 @@ def _patched(file: File, patch: str, edits: list[Any], names: dict[str, Any]) ->
         edits.append((target, chunk, *rest))
         return file, (chunk, "end")
     if target == "file":
-        at = PREAMBLE.get(keys[0])
-        return replace(file, **{keys[0]: value(getattr(file, keys[0]))}), (
-            None,
-            file.start(len(file.chunks)) if keys[0] == "tail" else at,
-        )
+        at = file.start(len(file.chunks)) if keys[0] == "tail" else PREAMBLE.get(keys[0])
+        return replace(file, **{keys[0]: value(getattr(file, keys[0]))}), (None, at)
     if target == "chunks":
         return replace(file, chunks=tuple(value())), None
     if target == "header":
@@ -284,7 +280,7 @@ def with_section(number: int, data: bytes, file: File, chunk: int = 0) -> File:
 def with_priors(priors: dict[int, Any], k: np.ndarray | None = None) -> File:
     """40 anchors, whose attributes are coded under these priors, by channel."""
     k = pattern(68, ROWS) if k is None else k
-    return with_section(ATTRIBUTES, coded_attributes(k, priors), rows(ROWS, attributes=k))
+    return with_section(ATTRIBUTES, coded(k, priors), rows(ROWS, attributes=k))
 
 
 def of_highs(*highs: int) -> np.ndarray:
@@ -319,7 +315,7 @@ def tables_of_slices(over: int) -> File:
         k = np.full((68, 1), number, np.int32)
         layer = later(0, line(1, z=4), attributes=k) if number else make_layer(0, line(1), attributes=k)
         priors = {c: gauss(min(c, count - 1) - 20, n) for c in range(68)}
-        layers.append(layer.with_sections({ATTRIBUTES: coded_attributes(k, priors, known)}))
+        layers.append(layer.with_sections({ATTRIBUTES: coded(k, priors, known)}))
     return make_file(*layers)
 
 
