@@ -4,8 +4,6 @@ Hypothesis draws the shape of a scene and a seed; numpy fills the arrays. Values
 said otherwise, so that a test knows every symbol that must come back.
 """
 
-from __future__ import annotations
-
 import math
 import tracemalloc
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,5 @@
 """Files of torch that stand for more than their bytes, or for anything but tensors, are refused before they unpack."""
 
-from __future__ import annotations
-
 import io
 import pickle
 import zipfile

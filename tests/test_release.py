@@ -1,7 +1,5 @@
 """What is published: one version, licences, addresses, the npm package, and the Pythons that CI installs on."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """Signals end a command at any call without a traceback, and leave the old output or the new one and nothing else."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """The tutorial is run as its notebook, and the demo, with a smaller scene, fewer pictures and steps."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import sys

@@ -1,7 +1,5 @@
 """What costs milliseconds to train, pack and draw: a preset, pictures, scenes before a camera, checkpoints, a trap."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

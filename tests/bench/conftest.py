@@ -1,7 +1,5 @@
 """A small scene with a camera as scene, bytes and checkpoint."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

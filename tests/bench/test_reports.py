@@ -1,7 +1,5 @@
 """The reports codec, render, train and latency: figures by hand, and a tiny model end to end."""
 
-from __future__ import annotations
-
 import json
 import math
 import platform

@@ -1,7 +1,5 @@
 """All benchmarks on a tiny scene, and the page that they make."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

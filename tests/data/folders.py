@@ -1,7 +1,5 @@
 """What the tests of all readers share: poses and pictures, files written and changed, and how views are compared."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

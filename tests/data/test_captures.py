@@ -1,7 +1,5 @@
 """Folders of phones and rigs: written, read back, damaged."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Folders of COLMAP models, with pictures or synchronised videos: written, read back, damaged."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Values in JSON files are replaced, removed, nested or made huge, and so are word
 headers; bytes are flipped and files cut. A seed makes a case.
 """
 
-from __future__ import annotations
-
 import copy
 import json
 import random

@@ -1,7 +1,5 @@
 """Every broken input of every reader is one DataError of one line that says what and where."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from importlib import import_module

@@ -1,7 +1,5 @@
 """Every pixel format of picture files is converted to sRGB or refused."""
 
-from __future__ import annotations
-
 import io
 import zlib
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Blender-like folders: axes, intrinsics, times, splits, background, points, box; written and damaged."""
 
-from __future__ import annotations
-
 import io
 import json
 import struct

@@ -1,7 +1,5 @@
 """The cache of video frames: decoded once, bounded, and made anew when it is lost."""
 
-from __future__ import annotations
-
 import errno
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Checkpoints: they come back whole, run nothing, and are refused in one line when anything about them is wrong."""
 
-from __future__ import annotations
-
 import errno
 import os
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Every layer prefix of any file renders: a finite picture at any time, from any camera."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

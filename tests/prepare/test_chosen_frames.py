@@ -1,7 +1,5 @@
 """Choice of frames: sharp, spread over time, without repetitions."""
 
-from __future__ import annotations
-
 import subprocess
 from pathlib import Path
 

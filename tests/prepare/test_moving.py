@@ -1,7 +1,5 @@
 """Epipolar residuals, and moving features found by them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from rooms import FOCAL, WIDTH, pose

@@ -1,7 +1,5 @@
 """`pd4dgs-prepare` on a room whose camera poses are known."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

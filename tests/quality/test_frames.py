@@ -1,7 +1,5 @@
 """Camera paths, panels and movies."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Several workers on one scene learn what one process learns, write one checkpoint, and go on in another number."""
 
-from __future__ import annotations
-
 import json
 import socket
 import subprocess
