@@ -8,7 +8,7 @@ import math
 import tracemalloc
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import cache
 
 import numpy as np
@@ -232,14 +232,9 @@ def assert_same_scene(a: Scene, b: Scene) -> None:
     """Every array of two scenes is equal, bit for bit."""
     assert (a.layers, a.rows, a.widths) == (b.layers, b.rows, b.widths)
     for name in ("anchor_q", "feature", "scaling_log", "offset"):
-        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
-        assert getattr(a, name).dtype == getattr(b, name).dtype
-    assert (a.grading is None) == (b.grading is None)
-    if a.grading is not None and b.grading is not None:
-        np.testing.assert_array_equal(a.grading.classes, b.grading.classes)
-        np.testing.assert_array_equal(a.grading.centre, b.grading.centre)
-    for x, y in zip(a.mask, b.mask, strict=True):
-        np.testing.assert_array_equal(x, y)
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name, strict=True)
+    np.testing.assert_equal(*(scene.grading and asdict(scene.grading) for scene in (a, b)))
+    np.testing.assert_equal(a.mask, b.mask)
     assert_same_networks(a.networks, b.networks)
     for layer in (1, 2):
         assert_same_deformation(a.deformation(layer), b.deformation(layer))
@@ -250,31 +245,18 @@ def assert_same_deformation(a: Deformation | None, b: Deformation | None) -> Non
     assert (a is None) == (b is None)
     if a is not None and b is not None:
         assert_same_networks(a.networks, b.networks)
-        for p, q in zip(a.planes, b.planes, strict=True):
-            assert list(p) == list(q)
-            for name in p:
-                np.testing.assert_array_equal(p[name], q[name], err_msg=name)
+        np.testing.assert_equal(a.planes, b.planes)
+        assert [list(scale) for scale in a.planes] == [list(scale) for scale in b.planes], "planes in another order"
 
 
 def assert_same_networks(a: dict[str, Network], b: dict[str, Network]) -> None:
     """Equal names and equal weights."""
-    assert set(a) == set(b)
-    for name in a:
-        for (wa, ba), (wb, bb) in zip(a[name], b[name], strict=True):
-            np.testing.assert_array_equal(wa, wb, err_msg=name)
-            np.testing.assert_array_equal(ba, bb, err_msg=name)
+    np.testing.assert_equal(a, b)
 
 
 def assert_same_info(a: SceneInfo, b: SceneInfo) -> None:
     """What the header says beside the steps."""
-    for name in ("voxel_size", "time_range", "background", "near", "far", "up", "unit"):
-        assert getattr(a, name) == getattr(b, name), name
-    np.testing.assert_array_equal(a.box, b.box)
-    assert (a.camera is None) == (b.camera is None)
-    if a.camera is not None and b.camera is not None:
-        np.testing.assert_array_equal(a.camera.viewmat, b.camera.viewmat)
-        np.testing.assert_array_equal(a.camera.K, b.camera.K)
-        assert (a.camera.width, a.camera.height) == (b.camera.width, b.camera.height)
+    np.testing.assert_equal(asdict(a), asdict(b))
 
 
 def assert_same_symbols(found: Sequence[np.ndarray], expected: Sequence[np.ndarray]) -> None:
