@@ -12,6 +12,7 @@ import math
 import os
 import shutil
 import signal
+import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -122,6 +123,20 @@ def kernel_threads() -> Iterator[Callable[[int], None]]:
     before = threads.kernel_threads()
     yield threads.set_kernel_threads
     threads.set_kernel_threads(before)
+
+
+@pytest.fixture(scope="session")
+def python() -> Callable[..., str]:
+    """python(code, *arguments, **variables) -> what the code prints in a process of its own, which must not fail."""
+
+    def call(code: str, *arguments: object, **variables: str) -> str:
+        command = [sys.executable, "-c", code, *map(str, arguments)]
+        options: dict[str, Any] = {"capture_output": True, "text": True, "timeout": 900}
+        done = subprocess.run(command, env=os.environ | variables, cwd=ROOT, **options)
+        assert done.returncode == 0, done.stderr
+        return done.stdout
+
+    return call
 
 
 @pytest.fixture(scope="session")

@@ -1,9 +1,6 @@
 """Pictures without torch: those of the torch model, to rounding, and in a process where torch cannot be imported."""
 
-import subprocess
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -22,7 +19,6 @@ from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.scene import SCAFFOLD_NETWORKS, Camera, Deformation, Scene, Widths, instant
 
 KEYED = {"key": 40_000}
-ROOT = Path(__file__).parents[2]
 
 
 def _camera(seed: int) -> Camera:
@@ -161,11 +157,9 @@ sys.exit(code)
 """
 
 
-def test_rendering_a_file_needs_no_torch_and_no_datasets(tmp_path):
+def test_rendering_a_file_needs_no_torch_and_no_datasets(tmp_path, python):
     file = tmp_path / "scene.pd4"
     scene = _scene()
     file.write_bytes(encode(replace(scene, info=replace(scene.info, camera=_camera(0))), layers=2, effort=1))
-    command = [sys.executable, "-c", RENDER, file, tmp_path / "out.png"]
-    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
+    python(RENDER, file, tmp_path / "out.png")
     assert Image.open(tmp_path / "out.png").size == (48, 36)

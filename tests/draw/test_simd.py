@@ -1,18 +1,11 @@
 """Vectors in kernels: their operations, the same bits for any width of the CPU's, and what is compiled and cached."""
 
-import os
 import platform
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
 from pd4dgs_codec.draw import simd
 from pd4dgs_codec.draw.simd import WIDE
-
-ROOT = Path(__file__).parents[2]
-
 
 PICTURE = """
 import hashlib
@@ -35,13 +28,10 @@ print(WIDE, hashlib.sha256(values.tobytes() + picture.tobytes()).hexdigest())
 
 
 @pytest.mark.skipif(platform.machine() not in ("x86_64", "AMD64"), reason="names two CPUs of this kind")
-def test_bits_do_not_depend_on_the_width_of_vectors():
+def test_bits_do_not_depend_on_the_width_of_vectors(python):
     """One cache serves both CPUs, as a folder that two machines share does."""
     found = []
     for features in ({}, {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": "+avx,+avx2,+fma"}) * 2:
-        environment = os.environ | features | {"PYTHONPATH": str(ROOT)}
-        done = subprocess.run([sys.executable, "-c", PICTURE], env=environment, capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr
-        found.append(done.stdout.split())
+        found.append(python(PICTURE, **features).split())
     assert [int(width) for width, _ in found] == [WIDE, simd.LANES] * 2
     assert len({digest for _, digest in found}) == 1

@@ -1,6 +1,5 @@
 """LPIPS, ST-LPIPS, FLIP: mask and mean by hand, the packages' own values, and absent packages."""
 
-import subprocess
 import sys
 from types import ModuleType, SimpleNamespace
 
@@ -185,11 +184,10 @@ def test_vgg_is_called_as_3d_gaussian_splatting_calls_it(monkeypatch, tmp_path):
         np.testing.assert_allclose(found[0].permute(1, 2, 0), picture / 255, atol=1e-6)
 
 
-def test_st_lpips_may_be_what_imports_torch(distance):
+def test_st_lpips_may_be_what_imports_torch(distance, python):
     """As pd4dgs-eval of a .pd4 does."""
     distance("stlpips")
-    program = "from pd4dgs_codec.quality.perceptual import load_perceptual as load; assert not load(['stlpips']).absent"
-    subprocess.run([sys.executable, "-c", program], check=True)
+    python("from pd4dgs_codec.quality.perceptual import load_perceptual as load; assert not load(['stlpips']).absent")
 
 
 def test_stand_ins_do_not_stay(distance):
