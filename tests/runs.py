@@ -1,4 +1,4 @@
-"""What tests ask of runs: their logs, their weights, and that resuming changes nothing."""
+"""What tests ask of runs: runs of a size, their logs, their weights, and that resuming changes nothing."""
 
 import json
 import signal
@@ -6,12 +6,27 @@ import signal
 import torch
 
 from pd4dgs_codec.model import checkpoint
+from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.loop import Trainer
 
 
 def read_log(path) -> list[dict]:
     """The records of a log."""
     return [json.loads(line) for line in path.read_text().splitlines()]
+
+
+def trainer_of(dataset, iterations: int | None = 30, steps: int = 0, **options) -> Trainer:
+    """A run of the preset tiny after so many steps."""
+    trainer = Trainer(TrainConfig(preset="tiny", iterations=iterations, **options), dataset)
+    for _ in range(steps):
+        trainer.learner.step()
+    return trainer
+
+
+def records_of(trainer, folder) -> list[dict]:
+    """Runs a trainer to folder/m.pt; its log."""
+    trainer.run(folder / "m.pt", log=folder / "log.jsonl")
+    return read_log(folder / "log.jsonl")
 
 
 def assert_same_weights(path, other, rtol: float = 0.0, atol: float = 0.0) -> None:

@@ -1,15 +1,14 @@
 """The one dial: what it costs is monotone over its range, on a run of seconds; docs/training.md has what it shows."""
 
 import pytest
-from runs import read_log
+from runs import records_of, trainer_of
 from trainer_rate import train_rate_bits
 
 from pd4dgs_codec.format.encoder import encode_with_report
 from pd4dgs_codec.model.model import to_scene
 from pd4dgs_codec.quality.measure import level_psnr
 from pd4dgs_codec.train import phases
-from pd4dgs_codec.train.config import TrainConfig, at_quality
-from pd4dgs_codec.train.loop import Trainer
+from pd4dgs_codec.train.config import at_quality
 from pd4dgs_codec.train.phases import opening
 
 
@@ -18,7 +17,7 @@ def test_bytes_rise_with_the_dial(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(opening, "MIN_TRIAL", 6)
     files, sizes, psnr = [], [], []
     for quality in (0, 100):
-        trainer = Trainer(TrainConfig(preset="tiny", iterations=60, **at_quality(quality)), dataset)
+        trainer = trainer_of(dataset, 60, **at_quality(quality))
         trainer.run(tmp_path / "m.pt")
         model = trainer.model
         psnr.append(level_psnr(model, 2, dataset.train))
@@ -33,9 +32,8 @@ def test_bytes_rise_with_the_dial(dataset, tmp_path, monkeypatch):
 
 def test_what_is_coded_of_planes_is_what_the_log_says(dataset, tmp_path):
     """The trainer's own sum of R(a) of the planes, at the end of a run, is the encoder's within 2 %."""
-    trainer = Trainer(TrainConfig(preset="tiny", iterations=40, plane_rate=1e-6), dataset)
-    trainer.run(tmp_path / "m.pt", log=tmp_path / "log.jsonl")
-    records = read_log(tmp_path / "log.jsonl")
+    trainer = trainer_of(dataset, 40, plane_rate=1e-6)
+    records = records_of(trainer, tmp_path)
     logged = records[-1]
     assert {"global_rate_proxy", "local_rate_proxy"} <= set().union(*records)  # logged apart
     scene = to_scene(trainer.model)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from runs import assert_goes_on_as_one_run, assert_same_weights, interrupt, read_log
+from runs import assert_goes_on_as_one_run, assert_same_weights, interrupt, read_log, records_of, trainer_of
 
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import DataError, TrainError
@@ -24,9 +24,7 @@ from pd4dgs_codec.train.schedule import PRUNING_ROUNDS, Schedule
 
 
 def test_it_learns_and_logs_every_term(dataset, tmp_path):
-    trainer = Trainer(TrainConfig(preset="tiny", iterations=90), dataset)
-    trainer.run(tmp_path / "m.pt", log=tmp_path / "log.jsonl")
-    records = read_log(tmp_path / "log.jsonl")
+    records = records_of(trainer_of(dataset, 90), tmp_path)
     assert [r["iteration"] for r in records] == list(range(90))
     assert np.mean([r["l1"] for r in records[-10:]]) < 0.6 * np.mean([r["l1"] for r in records[:5]])
     assert {"l1", "dssim", "volume", "rate", "tmc_binary", "tmc_smooth", "rho", "pi", "anchors"} <= set(records[-1])
@@ -39,8 +37,7 @@ def test_it_learns_and_logs_every_term(dataset, tmp_path):
 
 @pytest.mark.parametrize("max_layer", [0, 1])
 def test_a_model_without_upper_layers_is_packed_as_it_was_trained(dataset, tmp_path, max_layer):
-    config = TrainConfig(preset="tiny", iterations=40, max_layer=max_layer)
-    Trainer(config, dataset).run(tmp_path / "m.pt")
+    trainer_of(dataset, 40, max_layer=max_layer).run(tmp_path / "m.pt")
     model = checkpoint.load(tmp_path / "m.pt")[0]
     assert model.level == max_layer
     own = [float((model.masks(level) - model.masks(level - 1)).detach().max()) > 1e-6 for level in (1, 2)]
@@ -51,7 +48,7 @@ def test_a_model_without_upper_layers_is_packed_as_it_was_trained(dataset, tmp_p
 
 @pytest.mark.parametrize("options, off_grid", [({}, 0.0), (ABLATIONS["noise"], 0.5)])
 def test_a_finished_checkpoint_is_rounded_unless_without_quantisation(dataset, tmp_path, options, off_grid):
-    Trainer(TrainConfig(preset="tiny", iterations=20, **options), dataset).run(tmp_path / "m.pt")
+    trainer_of(dataset, 20, **options).run(tmp_path / "m.pt")
     model = checkpoint.load(tmp_path / "m.pt")[0]
     weights = model.networks["color"].linears[0].weight.detach()
     rest = (weights / model.steps.weights_scaffold).frac().abs()
@@ -61,7 +58,7 @@ def test_a_finished_checkpoint_is_rounded_unless_without_quantisation(dataset, t
 
 def test_seeds_differ_and_repeat(dataset, tmp_path):
     for name, seed in (("a", 0), ("b", 0), ("c", 1)):
-        Trainer(TrainConfig(preset="tiny", iterations=12, seed=seed), dataset).run(tmp_path / f"{name}.pt")
+        trainer_of(dataset, 12, seed=seed).run(tmp_path / f"{name}.pt")
     assert_same_weights(tmp_path / "a.pt", tmp_path / "b.pt")
     a, c = (checkpoint.load(tmp_path / f"{name}.pt")[0] for name in "ac")
     assert not torch.equal(a.feature[:10], c.feature[:10])
@@ -99,7 +96,7 @@ def timed(dataset, monkeypatch, clock, machine, limit: float = LIMIT) -> Trainer
     monkeypatch.setattr(loop, "TIMED_STEPS", 6)
     monkeypatch.setattr(phases, "MIN_ITERATIONS", 0)
     monkeypatch.setattr(opening, "MIN_TRIAL", 6)
-    trainer = Trainer(TrainConfig(preset="tiny", max_seconds=limit), dataset)
+    trainer = trainer_of(dataset, None, max_seconds=limit)
     step, level_psnr, begun = trainer.learner.step, trainer.learner.level_psnr, clock.now
 
     def slow_step():
@@ -122,14 +119,13 @@ def test_a_time_limit_is_kept_and_the_schedule_completes(dataset, tmp_path, monk
     turns, apply = [], Prune.apply
     monkeypatch.setattr(Prune, "apply", lambda self, *args: turns.append(self.turn) or apply(self, *args))
     trainer, begun = timed(dataset, monkeypatch, clock, machine), clock.now
-    trainer.run(tmp_path / "m.pt", log=tmp_path / "log.jsonl")
+    records = records_of(trainer, tmp_path)
     assert trainer.seconds == pytest.approx(clock.now - begun) == pytest.approx(LIMIT, rel=0.03)
     assert trainer.finished and turns == list(range(PRUNING_ROUNDS))
     schedule, stored = trainer.learner.schedule, checkpoint.load(tmp_path / "m.pt")[1]
     position = trainer.learner.position
     assert position == schedule.iterations and schedule.phases_not_reached(position) == []
     assert json.loads(stored["config"])["iterations"] is None
-    records = read_log(tmp_path / "log.jsonl")
     coarse = [r["seconds"] for r in records if r["level"] == 0 and "rate" not in r]
     assert {r["level"] for r in records} == {0, 1, 2} and any("grown" in r for r in records)
     assert max(coarse) < (0.5 if machine == "stopped" else 0.4) * LIMIT  # the rate term begins at a third
@@ -171,7 +167,7 @@ def test_a_pause_beyond_the_limit_leaves_a_cut_run_that_says_so(dataset, tmp_pat
 
 @pytest.mark.parametrize("iterations, limit, done", [(30, 5.5, 6), (None, 0.5, 1)])
 def test_a_run_cut_at_its_limit_leaves_a_checkpoint(dataset, tmp_path, monkeypatch, clock, iterations, limit, done):
-    trainer = Trainer(TrainConfig(preset="tiny", iterations=iterations, max_seconds=limit), dataset)
+    trainer = trainer_of(dataset, iterations, max_seconds=limit)
     step = trainer.learner.step
     monkeypatch.setattr(trainer.learner, "step", lambda: setattr(clock, "now", clock.now + 1) or step())
     trainer.run(tmp_path / "m.pt")
@@ -193,7 +189,7 @@ def test_the_first_signal_ends_the_run_after_a_whole_step(dataset, tmp_path, num
 
 
 def test_a_second_signal_ends_it_at_once_and_saves_nothing(dataset, tmp_path, monkeypatch):
-    trainer = Trainer(TrainConfig(preset="tiny", iterations=8), dataset)
+    trainer = trainer_of(dataset, 8)
     before = signal.getsignal(signal.SIGINT)
     twice = lambda *_: [signal.raise_signal(signal.SIGINT) for _ in range(2)]  # noqa: E731
     monkeypatch.setattr(trainer.learner.optimiser, "step", twice)
@@ -204,7 +200,7 @@ def test_a_second_signal_ends_it_at_once_and_saves_nothing(dataset, tmp_path, mo
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_log_that_cannot_be_written_ends_the_run_with_a_checkpoint(dataset, tmp_path):
-    trainer = Trainer(TrainConfig(preset="tiny", iterations=8), dataset)
+    trainer = trainer_of(dataset, 8)
     with pytest.raises(DataError, match="/dev/full: .*No space left"):
         trainer.run(tmp_path / "m.pt", log=Path("/dev/full"))
     assert checkpoint.load(tmp_path / "m.pt")[1]["iteration"] == 1
@@ -240,7 +236,7 @@ BROKEN_STATES = {
 
 @pytest.mark.parametrize("name", BROKEN_STATES)
 def test_broken_training_state_is_refused_in_one_line(dataset, tmp_path, name):
-    trainer = Trainer(TrainConfig(preset="tiny", iterations=5), dataset)
+    trainer = trainer_of(dataset, 5)
     trainer.save(tmp_path / "m.pt")
     model, training = checkpoint.load(tmp_path / "m.pt")
     for broken in (training | {name: BROKEN_STATES[name]}, {k: v for k, v in training.items() if k != name}):
@@ -252,4 +248,4 @@ def test_broken_training_state_is_refused_in_one_line(dataset, tmp_path, name):
 
 def test_points_that_all_lie_far_outside_are_as_good_as_none(dataset):
     far = dataclasses.replace(dataset, points=np.full((20, 3), 1e4, np.float32))
-    assert len(Trainer(TrainConfig(preset="tiny", iterations=5), far).model.anchor_q) > 100
+    assert len(trainer_of(far, 5).model.anchor_q) > 100

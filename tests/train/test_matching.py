@@ -5,8 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from runs import assert_resumes_bit_for_bit, read_log, run_saving
-from test_phases import trainer_of
+from runs import assert_resumes_bit_for_bit, read_log, run_saving, trainer_of
 
 from pd4dgs_codec.data import synthetic
 from pd4dgs_codec.data.bodies import THINGS, bodies

@@ -8,7 +8,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from runs import assert_goes_on_as_one_run, assert_resumes_bit_for_bit, interrupt, read_log, run_saving
+from runs import (
+    assert_goes_on_as_one_run,
+    assert_resumes_bit_for_bit,
+    interrupt,
+    read_log,
+    records_of,
+    run_saving,
+    trainer_of,
+)
 from tiny import TINY, disc
 from trainer_rate import train_rate_bits
 
@@ -38,20 +46,6 @@ def short_runs_have_phases(monkeypatch):
     monkeypatch.setattr(phases, "MIN_ITERATIONS", 10)
     monkeypatch.setattr(opening, "MIN_TRIAL", 6)
     monkeypatch.setattr(levels, "MIN_PRACTICE", (3, 3))
-
-
-def trainer_of(dataset, iterations: int = 30, steps: int = 0, **options) -> Trainer:
-    """A run of the preset tiny after so many steps."""
-    trainer = Trainer(TrainConfig(preset="tiny", iterations=iterations, **options), dataset)
-    for _ in range(steps):
-        trainer.learner.step()
-    return trainer
-
-
-def records_of(trainer: Trainer, folder) -> list[dict]:
-    """Runs it to its end; its log."""
-    trainer.run(folder / "m.pt", log=folder / "log.jsonl")
-    return read_log(folder / "log.jsonl")
 
 
 @pytest.mark.usefixtures("short_runs_have_phases")
