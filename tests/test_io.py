@@ -7,6 +7,7 @@ import sys
 from functools import partial
 from itertools import count
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -150,11 +151,7 @@ def test_a_process_killed_at_any_call_leaves_the_old_file_or_the_new_one(tmp_pat
 def test_a_call_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch, name, code):
     target = tmp_path / "x.bin"
     target.write_bytes(b"old")
-
-    def fail(*args, **options):
-        raise OSError(code, os.strerror(code), "a name that nobody knows")
-
-    monkeypatch.setattr(os, name, fail)
+    monkeypatch.setattr(os, name, Mock(side_effect=OSError(code, os.strerror(code), "a name that nobody knows")))
     with pytest.raises(OSError, match=os.strerror(code)) as caught:
         io.write_bytes(target, b"new", overwrite=True)
     monkeypatch.undo()

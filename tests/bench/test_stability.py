@@ -3,6 +3,7 @@
 import json
 import math
 import sys
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -121,10 +122,6 @@ class TwoLines(EncodeError):
         return "two\nlines"
 
 
-def refuse(error):
-    raise error
-
-
 @pytest.mark.parametrize(
     "measure, refuses, status",
     [
@@ -132,10 +129,10 @@ def refuse(error):
         (lambda: ("too far", 1.1), None, "fail"),
         (lambda: ("nowhere", math.nan), None, "fail"),
         (lambda: 1 / 0, None, "fail"),
-        (lambda: refuse(EncodeError("no")), None, "fail"),
-        (lambda: refuse(EncodeError("no")), EncodeError, "refused"),
-        (lambda: refuse(EncodeError("no")), DataError, "fail"),
-        (lambda: refuse(TwoLines("")), EncodeError, "fail"),
+        (Mock(side_effect=EncodeError("no")), None, "fail"),
+        (Mock(side_effect=EncodeError("no")), EncodeError, "refused"),
+        (Mock(side_effect=EncodeError("no")), DataError, "fail"),
+        (Mock(side_effect=TwoLines("")), EncodeError, "fail"),
         (lambda: ("fine", 0.0), EncodeError, "fail"),
     ],
 )

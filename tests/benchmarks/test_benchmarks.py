@@ -5,6 +5,7 @@ import re
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import Mock
 
 import browser
 import codec
@@ -118,10 +119,7 @@ def test_a_training_is_kept_for_the_same_command_and_package(made, monkeypatch, 
 
 
 def test_a_run_stops_at_the_benchmark_that_fails(made, tmp_path, monkeypatch, capsys):
-    def fail(run, scene):
-        raise DataError("nothing to measure")
-
-    bad = common.Benchmark("bad", "Bad", (), fail, str)
+    bad = common.Benchmark("bad", "Bad", (), Mock(side_effect=DataError("nothing to measure")), str)
     good = common.Benchmark("good", "Good", (), lambda run, scene: [{"n": 1}], lambda rows: f"n is {rows[0]['n']}.")
     monkeypatch.setattr(run, "ALL", (good, bad, good))
     assert run.main(["--quick", "-o", str(tmp_path)]) == 1

@@ -3,6 +3,7 @@
 import errno
 import shutil
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -32,11 +33,7 @@ def folder(written, tmp_path):
 def test_frames_are_decoded_once(folder, monkeypatch, cache):
     first = load(folder)
     assert sum(file.suffix == ".frames" for file in cache.iterdir()) == CAMERAS
-
-    def never(*_: object) -> None:
-        raise AssertionError("decoded twice")
-
-    monkeypatch.setattr(cached, "_store", never)
+    monkeypatch.setattr(cached, "_store", Mock(side_effect=AssertionError("decoded twice")))
     np.testing.assert_array_equal(first.train[3].image, load(folder).train[3].image)
     with pytest.raises(DataError, match="decoded twice"):
         load(folder, downscale=2)
@@ -64,10 +61,7 @@ def test_the_cache_stays_within_its_size(folder, monkeypatch, cache, refused):
 
 
 def test_a_full_disk_keeps_no_part_of_a_video(folder, monkeypatch, cache):
-    def full(*_: object) -> None:
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(cached.os, "replace", full)
+    monkeypatch.setattr(cached.os, "replace", Mock(side_effect=OSError(errno.ENOSPC, "No space left on device")))
     with pytest.raises(DataError, match="cannot keep the frames of cam0.mp4: the disk is full"):
         load(folder)
     assert not list(cache.iterdir())

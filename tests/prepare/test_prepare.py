@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -40,20 +41,12 @@ def prepared(room, once):
 def prepare(room, output):
     arguments = [str(room[0]), "-o", str(output), "--fps", "10", "--camera", "SIMPLE_PINHOLE", "-j", "2"]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(poses, "reconstruct", _interrupted)
+        patch.setattr(poses, "reconstruct", Mock(side_effect=KeyboardInterrupt))
         assert main(arguments) == 1
     assert not output.exists() and output.with_name("out.partial").is_dir()
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(stages, "write_frames", _never)
+        patch.setattr(stages, "write_frames", Mock(side_effect=AssertionError("the frames were written before")))
         assert main(arguments) == 0
-
-
-def _interrupted(*_: object) -> None:
-    raise KeyboardInterrupt
-
-
-def _never(*_: object) -> None:
-    raise AssertionError("the frames were written before")
 
 
 def test_the_poses_are_those_of_the_camera(prepared, room):
@@ -89,7 +82,7 @@ def test_report(prepared):
 
 
 def test_an_interruption_says_how_to_go_on(room, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(poses, "extract", _interrupted)
+    monkeypatch.setattr(poses, "extract", Mock(side_effect=KeyboardInterrupt))
     assert main([str(room[0]), "-o", str(tmp_path / "out")]) == 1
     line = f"interrupted; the same command resumes from {tmp_path / 'out'}.partial"
     assert capsys.readouterr().err.splitlines()[-1].endswith(line)
@@ -127,9 +120,8 @@ def test_a_camera_that_stands_still_is_told(tmp_path, capsys):
 def test_the_estimate_grows_with_frames_and_shrinks_with_cores():
     assert 100 < poses.estimate(80, (854, 480), 2) < 150  # 226 CPU seconds were measured
     assert poses.estimate(80, (854, 480), 1) == 2 * poses.estimate(80, (854, 480), 2)
-    assert poses.estimate(80, (3840, 2160), 2) == pytest.approx(
-        poses.estimate(80, (1600, 900), 2)
-    )  # of which the features are
+    large, shrunk = (poses.estimate(80, size, 2) for size in ((3840, 2160), (1600, 900)))
+    assert large == pytest.approx(shrunk)  # of which the features are
 
 
 def test_unregistrable_recording_is_refused_and_leaves_nothing(tmp_path, capsys):

@@ -1,6 +1,7 @@
 """Sizes met with the least loss: the search on functions whose best is known, then on a scene's layers."""
 
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -67,9 +68,7 @@ def test_a_size_out_of_reach_is_refused_after_the_given_and_the_smallest_setting
         tried.append(tuple(setting.values()))
         return size(setting)
 
-    def never(setting):
-        raise AssertionError(f"{setting} was measured")
-
+    never = Mock(side_effect=AssertionError("a setting was measured"))
     with pytest.raises(Unreachable):
         least_loss({"a": GRID, "b": GRID}, never, never, final, 3_999)
     assert {*tried} == {(0.0, 0.0), (4.0, 4.0)}
@@ -193,27 +192,19 @@ def test_a_layer_that_is_not_there_meets_any_target(scene):
 
 
 def test_a_later_target_out_of_reach_is_refused_before_any_search(scene):
-    def never(decoded):
-        raise AssertionError("a loss was measured")
-
+    never = Mock(side_effect=AssertionError("a loss was measured"))
     with pytest.raises(EncodeError, match=r"layer 2 takes at least [\d,]+ bytes .* expected at most 100$"):
         Fitter(scene, {0: 4000, 2: 100}, never, error, EncodeOptions(**FAST)).fit()
 
 
 def test_measurements_are_kept_for_another_growth(scene):
-    loss, losses = coarseness(scene), []
-
-    def counted(decoded):
-        losses.append(decoded)
-        return loss(decoded)
-
-    whole = added(encode(scene, **FAST))
+    loss, whole = Mock(wraps=coarseness(scene)), added(encode(scene, **FAST))
     targets = {layer: round(0.9 * whole[layer]) for layer in (0, 1)}
-    fitters = [Fitter(scene, targets, counted, error, EncodeOptions(**FAST)) for _ in range(2)]
+    fitters = [Fitter(scene, targets, loss, error, EncodeOptions(**FAST)) for _ in range(2)]
     given = fitters[0].fit()[2]
     for fitter in fitters:
         fitter.growth[1] = 1.03
-    grown, once = fitters[0].fit()[2], len(losses)
+    grown, once = fitters[0].fit()[2], loss.call_count
     assert given[0] == grown[0] and given[1] != grown[1]
     assert fitters[1].fit()[2] == grown
-    assert len(losses) == 2 * once
+    assert loss.call_count == 2 * once

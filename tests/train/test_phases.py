@@ -4,6 +4,7 @@ import json
 import math
 import signal
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -71,9 +72,7 @@ def test_a_run_with_all_phases_resumes_bit_for_bit(dataset, tmp_path, monkeypatc
 
 @pytest.mark.usefixtures("short_runs_have_phases")
 def test_phases_that_meet_infinity_are_skipped(dataset, tmp_path, monkeypatch):
-    def diverged(*_, **__):
-        raise NotFinite("colors: found inf")
-
+    diverged = Mock(side_effect=NotFinite("colors: found inf"))
     monkeypatch.setattr(prefixes, "FEWEST", 20)
     for owner, name in ((prune, "omission_error"), (quantisation, "grade"), (prefixes, "utility")):
         monkeypatch.setattr(owner, name, diverged)
@@ -238,12 +237,11 @@ def test_pruning_adds_about_its_share_of_error_and_keeps_the_masks_above(trained
     before = [error_of(trained, level) for level in range(3)]
     for turn in range(PRUNING_ROUNDS):
         rounds, masks = round_of(model.anchor_q), [model.masks(level).detach() for level in range(3)]
-        kept, keep = [], learner.keep_anchors
-        monkeypatch.setattr(learner, "keep_anchors", lambda rows, keep=keep, kept=kept: kept.append(rows) or keep(rows))
-        record: dict = {}
+        keep, record = Mock(wraps=learner.keep_anchors), {}
+        monkeypatch.setattr(learner, "keep_anchors", keep)
         Prune(turn).apply(learner, record)
         monkeypatch.undo()
-        rows = kept[0]
+        (rows,) = keep.call_args.args
         assert 0 < len(model.anchor_q) == len(rows) == len(rounds) - record["left_model"]
         assert len(learner.statistics["opacity"]) == len(rows)
         assert torch.isin((rounds != turn).nonzero()[:, 0], rows).all()
