@@ -2,20 +2,16 @@
 
 import re
 import shlex
-import sys
 from importlib.metadata import entry_points
 from pathlib import Path
 
+from notebook import cells, notebook
 from tiny import TINY
 
 from pd4dgs_codec.model.config import PRESETS
 from pd4dgs_codec.quality import packing
 
 ROOT = Path(__file__).resolve().parents[1]
-sys.path.insert(0, str(ROOT / "tools"))
-
-from notebook import cells, notebook  # noqa: E402
-
 DEMO = (ROOT / "tools" / "demo.sh").read_text(encoding="utf-8")
 PAGE = (ROOT / "docs" / "tutorial.md").read_text(encoding="utf-8")
 SMALLER = {"synthetic:local": "'synthetic:local?size=64x48&frames=8'", "--max-seconds 150": "--iterations 4"}

@@ -151,9 +151,8 @@ def test_presets_are_trained_and_compared(tmp_path, capsys, monkeypatch):
 
 
 def test_a_process_prints_text_and_ends_with_its_block():
-    with latency.python(
-        "-c", "import os, time; print(os.environ['WORD'], flush=True); time.sleep(60)", WORD="ä"
-    ) as out:
+    program = "import os, time; print(os.environ['WORD'], flush=True); time.sleep(60)"
+    with latency.python("-c", program, WORD="ä") as out:
         assert out.readline() == "ä\n"
         start = time.monotonic()
     assert time.monotonic() - start < 30 and out.closed
@@ -163,9 +162,8 @@ def test_latency_of_a_file(scene_pd4, data, capsys, monkeypatch):
     monkeypatch.setattr(latency, "first_start", lambda data, rate: 12.3)  # takes seconds to compile the kernels
     assert bench.main(["latency", str(scene_pd4), "--rates", "50M", "--runs", "1", "--json"]) == 0
     (found,) = json.loads(capsys.readouterr().out)["files"]
-    assert [(row["level"], row["bytes"]) for row in found["times"]] == [
-        (r["layer"], r["end"]) for r in info(data)["layers"]
-    ]
+    layers = [(row["layer"], row["end"]) for row in info(data)["layers"]]
+    assert [(row["level"], row["bytes"]) for row in found["times"]] == layers
     assert found["first_start"] == 12.3
     for row in found["times"]:
         assert row["expected"] == 8 * row["bytes"] / 50e6

@@ -3,8 +3,8 @@
 import importlib.metadata
 import math
 import sys
-import threading
 import types
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -246,19 +246,9 @@ def test_one_and_two_threads_give_the_same_bits():
 @pytest.mark.usefixtures("kernel_threads")
 def test_two_callers_at_once():
     expected = [_draw_in_threads(2, seed) for seed in (0, 1)]
-    results = [[], []]
-
-    def work(n):
-        for _ in range(5):
-            results[n].append(_draw_in_threads(2, n))
-
-    workers = [threading.Thread(target=work, args=(n,)) for n in (0, 1)]
-    for w in workers:
-        w.start()
-    for w in workers:
-        w.join(60)
-    assert all(len(r) == 5 for r in results)
-    assert all(_same(r, expected[n]) for n in (0, 1) for r in results[n])
+    results = ThreadPoolExecutor(2).map(lambda n: [_draw_in_threads(2, n) for _ in range(5)], (0, 1), timeout=120)
+    for n, found in enumerate(results):
+        assert len(found) == 5 and all(_same(each, expected[n]) for each in found)
 
 
 # -- degenerate and extreme input --------------------------------------------------------------------------------------
