@@ -23,9 +23,9 @@ def trainer_of(dataset, iterations: int | None = 30, steps: int = 0, **options) 
     return trainer
 
 
-def records_of(trainer, folder) -> list[dict]:
-    """Runs a trainer to folder/m.pt; its log."""
-    trainer.run(folder / "m.pt", log=folder / "log.jsonl")
+def records_of(trainer, folder, name: str = "m.pt") -> list[dict]:
+    """Runs a trainer to the checkpoint `name` in the folder; its log."""
+    trainer.run(folder / name, log=folder / "log.jsonl")
     return read_log(folder / "log.jsonl")
 
 
@@ -47,8 +47,9 @@ def interrupt(trainer, number, when) -> None:
     trainer.learner.optimiser.step = interrupted
 
 
-def run_saving(trainer, folder, cuts, **options) -> None:
-    """Runs a trainer to folder/whole.pt. Before each of the steps `cuts` it saves what a run cut there leaves."""
+def run_saving(trainer, folder, cuts) -> list[dict]:
+    """Runs a trainer to folder/whole.pt; its log. Before each of the steps `cuts` it saves what a run cut there
+    leaves."""
     step = trainer.learner.step
 
     def saved_before():
@@ -57,7 +58,7 @@ def run_saving(trainer, folder, cuts, **options) -> None:
         return step()
 
     trainer.learner.step = saved_before
-    trainer.run(folder / "whole.pt", **options)
+    return records_of(trainer, folder, "whole.pt")
 
 
 def assert_goes_on_as_one_run(config, dataset, part) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from runs import assert_goes_on_as_one_run, assert_same_weights, interrupt, read_log, records_of, trainer_of
+from runs import assert_goes_on_as_one_run, assert_same_weights, interrupt, records_of, trainer_of
 
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import DataError, TrainError
@@ -144,10 +144,10 @@ def test_a_resumed_timed_run_spends_what_is_left(dataset, tmp_path, monkeypatch,
     second.resume(tmp_path / "m.pt")
     assert second.learner.share == first.learner.share and second.total == first.total
     begun = clock.now
-    second.run(tmp_path / "n.pt", log=tmp_path / "log.jsonl")
+    records = records_of(second, tmp_path, "n.pt")
     assert second.finished and second.seconds == pytest.approx(limit, rel=0.03)
     assert second.seconds - first.seconds == pytest.approx(clock.now - begun)
-    positions = [r["position"] for r in read_log(tmp_path / "log.jsonl")]
+    positions = [r["position"] for r in records]
     assert positions == sorted(positions) and positions[0] == first.learner.position
 
 

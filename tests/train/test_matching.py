@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from runs import assert_resumes_bit_for_bit, read_log, run_saving, trainer_of
+from runs import assert_resumes_bit_for_bit, run_saving, trainer_of
 
 from pd4dgs_codec.data import synthetic
 from pd4dgs_codec.data.bodies import THINGS, bodies
@@ -161,8 +161,8 @@ def test_steady_motion_needs_no_points(dataset, monkeypatch):
 def test_a_guided_run_resumes_bit_for_bit(dataset, tmp_path):
     config = TrainConfig(preset="tiny", iterations=40, seed=3)
     trainer = Trainer(config, dataset)
-    run_saving(trainer, tmp_path, (9,), log=tmp_path / "log.jsonl")  # before the term ends
-    assert sum(record.get("moving_points", 0) for record in read_log(tmp_path / "log.jsonl"))
+    records = run_saving(trainer, tmp_path, (9,))  # before the term ends
+    assert sum(record.get("moving_points", 0) for record in records)
     assert_resumes_bit_for_bit(config, dataset, tmp_path, (9,))
 
 

@@ -9,15 +9,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
-from runs import (
-    assert_goes_on_as_one_run,
-    assert_resumes_bit_for_bit,
-    interrupt,
-    read_log,
-    records_of,
-    run_saving,
-    trainer_of,
-)
+from runs import assert_goes_on_as_one_run, assert_resumes_bit_for_bit, interrupt, records_of, run_saving, trainer_of
 from tiny import TINY, disc
 from trainer_rate import train_rate_bits
 
@@ -58,8 +50,7 @@ def test_a_run_with_all_phases_resumes_bit_for_bit(dataset, tmp_path, monkeypatc
     trainer, schedule, whitenings = Trainer(config, dataset), Schedule(44), []
     monkeypatch.setattr(quantisation, "whiten", lambda *args: whitenings.append(trainer.iteration) or whiten(*args))
     cuts = (12, schedule.prune[2], 36)
-    run_saving(trainer, tmp_path, cuts, log=tmp_path / "log.jsonl")
-    records = read_log(tmp_path / "log.jsonl")
+    records = run_saving(trainer, tmp_path, cuts)
     pruned, drawn = ([r for r in records if name in r] for name in ("left_model", "prefix"))
     assert [r["iteration"] for r in pruned] == list(schedule.prune) and sum(r["left_model"] for r in pruned) > 0
     assert records[schedule.prune[0] - 1]["anchors"] - pruned[-1]["anchors"] == sum(r["left_model"] for r in pruned)
@@ -362,10 +353,9 @@ def test_a_removed_level_stays_away(dataset, tmp_path, monkeypatch):
     trainer = Trainer(config, views)
     held_back, seen, original = held_back_views(trainer.learner), [], learner.next_view
     monkeypatch.setattr(learner, "next_view", lambda *at: seen.append(original(*at)) or seen[-1])
-    run_saving(trainer, tmp_path, [25], log=tmp_path / "log.jsonl")
+    records = run_saving(trainer, tmp_path, [25])
     start = Schedule(30).rounding
     assert len(held_back) == 4 and not set(seen[:start]) & held_back
-    records = read_log(tmp_path / "log.jsonl")
     assert [r["iteration"] for r in records if "left_out" in r] == [start]
     assert records[start]["left_out"][0]["level"] == 2 and max(r["level"] for r in records[start:]) == 1
     model, training = checkpoint.load(tmp_path / "whole.pt")

@@ -5,20 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from runs import trainer_of
 
 from pd4dgs_codec.model.picture import render
 from pd4dgs_codec.train import rollout
-from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.learner import Learner
 from pd4dgs_codec.train.rollout import draw_levels, near_key, next_view, without_motion
-from pd4dgs_codec.train.schedule import LOWEST, Schedule
+from pd4dgs_codec.train.schedule import LOWEST
 from pd4dgs_codec.train.ssim import REACH
 
 
 def learner(dataset, key: float = 0.5, **config) -> Learner:
     views = replace(dataset, train=dataset.train * 6)
-    config = TrainConfig(preset="tiny", key_instant=key, **config)
-    return Learner(config, views, Schedule(1000), torch.device("cpu"))
+    return trainer_of(views, 1000, key_instant=key, **config).learner
 
 
 def times(state: Learner, indices: list[int]) -> set[float]:
