@@ -1,7 +1,5 @@
 """Batches of stand-in scenes: small texts, which the stand-in command writes in capitals."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

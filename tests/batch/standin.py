@@ -1,7 +1,5 @@
 """Stand-ins for commands: functions that workers of every engine find by name."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

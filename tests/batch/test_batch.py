@@ -1,7 +1,5 @@
 """A batch in this process: records, finished work, broken lines, options and scans."""
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path
@@ -27,19 +25,16 @@ def test_outputs_have_a_record_and_are_not_done_twice(library):
     assert library.made() == ["text of a.pt", "text of b.pt"]
 
 
-def test_a_killed_run_goes_on_after_its_last_record(library):
+@pytest.mark.parametrize("left", ["no record", "a truncated output"])
+def test_what_a_killed_run_left_is_made_again(library, left):
     library.add("a.pt", "text")
     library.run()
-    (library.out / "a.pd4.done.json").unlink()  # killed between the file and its record
-    assert library.run()["done"] == 1
-    assert (library.out / "a.pd4.done.json").exists()
-
-
-def test_missing_or_truncated_output_is_made_again(library):
-    library.add("a.pt", "text")
-    library.run()
-    (library.out / "a.pd4").write_text("TE")
+    if left == "no record":  # killed between the file and its record
+        (library.out / "a.pd4.done.json").unlink()
+    else:
+        (library.out / "a.pd4").write_text("TE")
     assert library.run()["done"] == 1 and (library.out / "a.pd4").read_text() == "TEXT"
+    assert (library.out / "a.pd4.done.json").exists()
 
 
 def test_foreign_files_stay_without_overwrite(library):
@@ -177,30 +172,28 @@ def test_two_lines_with_one_output_are_named(library):
     assert library.run()["done"] == 1 and (library.out / "x.pd4").read_text() == "FIRST"
 
 
-def test_a_source_that_is_not_there_is_named(library):
+@pytest.mark.parametrize(
+    "put, says",
+    [
+        (lambda path: None, "a.pt: No such file"),
+        (os.mkfifo, "a.pt: is a pipe or a device, expected a file"),
+        (lambda path: path.symlink_to("/dev/zero"), "a.pt: is a pipe or a device, expected a file"),
+    ],
+    ids=["nothing", "pipe", "device"],
+)
+def test_a_source_that_is_not_there_or_for_which_a_reader_would_wait_is_named(library, put, says):
     library.add("a.pt", "x")
     (library.folder / "in" / "a.pt").unlink()
+    put(library.folder / "in" / "a.pt")
     library.add("b.pt", "y")
     assert library.run()["done"] == 1
     outcome, tries = library.outcomes["a.pd4"]
-    assert tries == 1 and "a.pt" in outcome.message and "No such file" in outcome.message
+    assert tries == 1 and says in outcome.message
 
 
-@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
-@pytest.mark.parametrize("kind", ["pipe", "device"])
-def test_a_source_for_which_a_reader_would_wait_is_named(library, kind):
-    library.add("a.pt", "x")
-    (library.folder / "in" / "a.pt").unlink()
-    if kind == "pipe":
-        os.mkfifo(library.folder / "in" / "a.pt")
-    else:
-        (library.folder / "in" / "a.pt").symlink_to("/dev/zero")
-    library.add("b.pt", "y")
-    assert library.run()["done"] == 1
+def test_a_manifest_for_which_a_reader_would_wait_is_named():
     with pytest.raises(DataError, match="is a device"):
         Manifest("/dev/zero", OPS["encode"], lambda source, options: None)
-    outcome, tries = library.outcomes["a.pd4"]
-    assert tries == 1 and "a.pt: is a pipe or a device, expected a file" in outcome.message
 
 
 @pytest.mark.parametrize("options", [{"output": "x"}, {"threads": 3}, {"-o": "x"}, {"a b": 1}, {"effort": {"a": 1}}])

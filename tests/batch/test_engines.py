@@ -1,7 +1,5 @@
 """The engines: dying and slow workers, failing stores, equal outputs."""
 
-from __future__ import annotations
-
 import json
 import random
 import subprocess
@@ -59,18 +57,13 @@ def test_a_job_whose_worker_dies_is_tried_again(filled, temporary):
     assert len(filled.made()) == 9
 
 
-def test_a_job_that_always_kills_its_worker_is_named(filled, temporary):
-    filled.add("z.pt", "die")
+@pytest.mark.parametrize("text, tries, says", [("die", 2, "worker"), ("die no-such-folder/flag", 1, "no-such-folder")])
+def test_a_job_that_always_kills_its_worker_or_raises_is_named(filled, temporary, text, tries, says):
+    """The flag in a folder that is not there cannot be made."""
+    filled.add("z.pt", text)
     assert filled.run(workers=1, retries=1)["done"] == 8
-    outcome, tries = filled.outcomes["z.pd4"]
-    assert outcome.state == "failed" and tries == 2 and "worker" in outcome.message
-
-
-def test_what_a_job_raises_is_its_outcome(filled):
-    filled.add("z.pt", f"die {filled.folder}/no-such-folder/flag")  # which cannot be made
-    assert filled.run(workers=1, retries=1)["done"] == 8
-    outcome, tries = filled.outcomes["z.pd4"]
-    assert outcome.state == "failed" and tries == 1 and "no-such-folder" in outcome.message
+    outcome, found = filled.outcomes["z.pd4"]
+    assert outcome.state == "failed" and found == tries and says in outcome.message
 
 
 def test_slow_job_is_ended_and_tried_again(filled, temporary):
