@@ -1,7 +1,5 @@
 """A small scene as a checkpoint and as a `.pd4`, and a small dataset."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

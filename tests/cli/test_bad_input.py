@@ -1,7 +1,5 @@
 """Bad input to every command: one line on stderr, exit 1 or 2, no traceback, nothing written, no code in it run."""
 
-from __future__ import annotations
-
 import errno
 import io
 import json

@@ -1,7 +1,5 @@
 """`pd4dgs-batch` from the command line: what it writes, says and returns."""
 
-from __future__ import annotations
-
 import json
 import shutil
 

@@ -1,7 +1,5 @@
 """encode, decode and info, as their users call them."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

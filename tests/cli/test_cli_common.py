@@ -1,7 +1,5 @@
 """Options, help, usage errors and the dispatcher."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """`pd4dgs-export`: what it writes, and one line for what it cannot."""
 
-from __future__ import annotations
-
 import pytest
 from tiny import sighted
 

@@ -1,7 +1,5 @@
 """render and eval."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

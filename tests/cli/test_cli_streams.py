@@ -1,7 +1,5 @@
 """Closed, full and broken standard streams: an exit code, at most one line, and never a traceback."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """encode with quality in renderings: target sizes, layers with too little gain, the effect of single anchors."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """train: what it writes, how it ends and how it goes on."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

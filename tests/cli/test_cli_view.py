@@ -1,7 +1,5 @@
 """`pd4dgs-view`: a page, the player and the scene from one address, until a signal comes."""
 
-from __future__ import annotations
-
 import re
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """`pd4dgs-train --view`: a browser's part is played by a socket that speaks viser's messages."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import time
 

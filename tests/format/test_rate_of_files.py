@@ -1,8 +1,6 @@
 """What files of Gaussian scenes cost: against the rate model, against the better priors, against LZMA, and against the
 trainer's own sum."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 

@@ -1,7 +1,5 @@
 """A scene to export: the one of a trained file's kind, decoded, and the same with networks that see no direction."""
 
-from __future__ import annotations
-
 import pytest
 from tiny import sighted, trained_like_scene
 

@@ -1,7 +1,5 @@
 """Imported files with bytes changed, cut out or repeated are read or raise DataError."""
 
-from __future__ import annotations
-
 import random
 import struct
 from collections.abc import Callable

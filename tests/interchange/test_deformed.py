@@ -1,8 +1,6 @@
 """Runs of 4DGaussians and Deformable-3DGS: synthetic ones in their layouts, evaluated with the plain torch modules of
 `benchmarks/teachers.py`, which follow the published formulas."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -4,8 +4,6 @@ It is looked for in the `node_modules` that PD4DGS_NODE_MODULES names, else in t
 `npm install --ignore-scripts @playcanvas/splat-transform@3.7.0`.
 """
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

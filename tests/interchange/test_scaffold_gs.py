@@ -1,7 +1,5 @@
 """Checkpoints of Scaffold-GS: synthetic ones in its layout, evaluated by its published formulas in float64."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

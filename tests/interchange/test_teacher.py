@@ -1,7 +1,5 @@
 """Gaussians of other programs as datasets for training."""
 
-from __future__ import annotations
-
 import gzip
 import json
 import struct

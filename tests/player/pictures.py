@@ -1,7 +1,5 @@
 """Pictures of the player in the browser tests' page, beside those of the package's rasteriser."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -4,8 +4,6 @@ PD4DGS_BROWSER names the browser, else one is looked for. Where there is none, o
 skipped, unless PD4DGS_REQUIRE_BROWSER is 1.
 """
 
-from __future__ import annotations
-
 import functools
 import gzip
 import http.server

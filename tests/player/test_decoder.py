@@ -3,8 +3,6 @@
 Types are checked where `npm install --no-package-lock` was called in player/.
 """
 
-from __future__ import annotations
-
 import json
 import re
 import shutil

@@ -1,7 +1,5 @@
 """spec/audit.md names what there is: vectors, registered numbers, and the sizes of the decoders."""
 
-from __future__ import annotations
-
 import json
 import re
 from fnmatch import fnmatch

@@ -1,7 +1,5 @@
 """A small scene of three layers, and a server of the folder it lies in."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

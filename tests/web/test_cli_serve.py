@@ -1,7 +1,5 @@
 """`pd4dgs-serve` as its users start and stop it."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess

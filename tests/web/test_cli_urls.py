@@ -1,7 +1,5 @@
 """`pd4dgs-info URL` and `pd4dgs-decode URL`: the same results as from the file, from as few bytes as they need."""
 
-from __future__ import annotations
-
 import pytest
 from faulty import Fault, FaultyServer
 

@@ -1,7 +1,5 @@
 """The resuming client: whatever the server does, only complete slices of one file are yielded."""
 
-from __future__ import annotations
-
 import http.client
 import math
 import random

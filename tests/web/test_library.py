@@ -1,7 +1,5 @@
 """Names that never change, what caches are told, and the index of a library."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

@@ -3,8 +3,6 @@
 The slow tests hold it against the wall clock: within max(3 %, 10 ms).
 """
 
-from __future__ import annotations
-
 import contextlib
 import statistics
 import time

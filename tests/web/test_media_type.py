@@ -1,7 +1,5 @@
 """What tells systems of the media type: packaging/, by the programs that read it."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

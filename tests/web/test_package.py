@@ -1,7 +1,5 @@
 """Packages: boxes, manifests and playlists; payloads come back bit for bit."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import struct

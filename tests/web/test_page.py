@@ -1,7 +1,5 @@
 """The one-file page: it needs nothing else, and a notebook gets it in a frame."""
 
-from __future__ import annotations
-
 import html
 import re
 import shutil

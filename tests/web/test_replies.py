@@ -1,7 +1,5 @@
 """What a server may answer instead of the file: the client ends in time, with scenes or in one line."""
 
-from __future__ import annotations
-
 import contextlib
 import random
 import socket

@@ -1,7 +1,5 @@
 """The range server as HTTP clients see it."""
 
-from __future__ import annotations
-
 import contextlib
 import gzip
 import http.client

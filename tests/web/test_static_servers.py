@@ -1,7 +1,5 @@
 """The configurations in docs/player-and-delivery.md, run by a real nginx and a real Caddy where there are any."""
 
-from __future__ import annotations
-
 import http.client
 import os
 import re
