@@ -104,6 +104,12 @@ CASES = [
     (2, "export SCENE -o out --to ply-seq --time 0.5", "--time needs --to ply, spz or glb"),
     (2, "export SCENE -o out --to ply --fps 5", "--fps needs --to ply-seq or 4dgs"),
     (2, "export SCENE -o a.PLY --to spz", "-o a.PLY ends in .ply, but --to is spz"),
+    *((2, f"serve empty --port {port}", "--port") for port in (65536, -1)),
+    *((2, f"serve empty --rate {rate}", "--rate") for rate in ("2X", "0", "nan")),
+    (2, "serve empty --latency -1ms", "--latency"),
+    (2, "serve empty --host ''", "--host"),
+    (1, "serve empty --host 203.0.113.77 --port 0", "cannot listen"),
+    (1, "serve notes --port 0", "is not a folder"),
     (2, "batch m.jsonl -o out", "--op"),
     (2, "batch m.jsonl -o out --op explode", "explode"),
     (2, "batch m.jsonl -o out --op encode --slurm partition", "KEY=VALUE"),
@@ -119,6 +125,9 @@ CASES = [
     *((1, f"{verb} MODEL", "(a checkpoint? pd4dgs-encode takes one)") for verb in ("info", "export -o a.ply --to ply")),
     *((1, f"{verb} empty", "is a folder") for verb in ("info", "render -o a.gif", "encode -o s.pd4", "view")),
     (2, "view SCENE -o a.pd4", "ends in .html"),
+    (2, "view cut.pd4 -o cut.pd4 -f", "-o names the input"),
+    (1, "view notes --no-browser", "checkpoint"),
+    (1, "view late.pd4 --no-browser", "CRC"),
     (1, "export cut.pd4 -o a.ply --to ply", "cut.pd4"),
     (1, "export SCENE -o a.4dgs --to 4dgs --fps 1e9", "frames per second are"),
     (1, "render flipped.pd4 -o a.gif", "flipped.pd4"),
@@ -153,6 +162,8 @@ CASES = [
         )
     ),
     (1, "encode MODEL -o nowhere/s.pd4", "nowhere"),
+    (1, "view SCENE -o kept.html", "exists already"),
+    (1, "view SCENE -o none/a.html", "no folder"),
     (1, "encode MODEL -o empty", "is a folder"),
     (1, "render SCENE -o a.gif --threads 100000", "100000"),
 ]  # fmt: skip
@@ -165,6 +176,7 @@ def bad_files(tmp_path_factory, model_pt, scene_pd4, scene):
     data = scene_pd4.read_bytes()
     (folder / "cut.pd4").write_bytes(data[:-10])
     (folder / "flipped.pd4").write_bytes(flipped(data, 400))
+    (folder / "late.pd4").write_bytes(flipped(data, -30))
     (folder / "blind.pd4").write_bytes(encode(replace(scene, info=replace(scene.info, camera=None)), effort=1))
     for name, value in (("nan", float("nan")), ("inf", float("inf")), ("huge", 1e20)):
         model, _ = checkpoint.load(model_pt)
@@ -172,7 +184,7 @@ def bad_files(tmp_path_factory, model_pt, scene_pd4, scene):
         checkpoint.save(folder / f"{name}.pt", model)
     torch.save({"format": "pd4dgs-checkpoint", "version": 1, "state": Trap(folder / "ran")}, folder / "evil.pt")
     (folder / "cut.pt").write_bytes(model_pt.read_bytes()[:-200])
-    for name in ("kept.npz", "kept.gif", "notes"):
+    for name in ("kept.npz", "kept.gif", "kept.html", "notes"):
         (folder / name).write_text("precious")
     (folder / "empty").mkdir()
     views = json.loads((write_views(folder / "sizes") / "transforms.json").read_text())
@@ -205,7 +217,7 @@ def test_bad_input(cli, bad_files, model_pt, scene_pd4, shared_dataset, monkeypa
     _check(cli(module, *argv), shown, code, says)
     told = cli(module, *argv, "--json")
     assert told.code == code and len(told.error_lines) == 1
-    assert told.json["error"]["message"] in told.err and told.json["error"]["type"]
+    assert told.json["error"]["message"] in told.err and (told.json["error"]["type"] == "UsageError") == (code == 2)
     assert _listing(bad_files) == before
 
 
@@ -302,11 +314,6 @@ def test_an_engine_that_is_not_installed_names_its_extra(cli, tmp_path, monkeypa
     result = cli("batch", tmp_path / "m.jsonl", "-o", tmp_path / "out", "--op", "train", "--on", engine)
     line = f"the module {module} is not installed: pip install 'pd4dgs-codec[cluster]'"
     _check(result, "batch", 1, line)
-
-
-def test_usage_errors_as_json(cli):
-    result = cli("info", "--json", "--nothing")
-    assert result.code == 2 and json.loads(result.out)["error"]["type"] == "UsageError"
 
 
 EVIL = "\x1b]0;title\x07\n\x9b2J\u202e"

@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -29,17 +30,22 @@ CASES = {
 }
 
 
+def _run(arguments: str, streams: str, folder: Path) -> tuple[int, str]:
+    """The exit code of a command and what it says on stderr."""
+    script = f"{{ '{sys.executable}' -m pd4dgs_codec {arguments}; echo $? >'{folder}/code'; }} {streams}"
+    command, nothing = ["sh", "-c", script], subprocess.DEVNULL
+    done = subprocess.run(command, stdin=nothing, capture_output=True, text=True, timeout=120)
+    return int((folder / "code").read_text()), done.stderr
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_streams(name, scene_pd4, tmp_path):
     arguments, streams, code, says = CASES[name]
     arguments = arguments.replace("FILE", f"'{scene_pd4}'").replace("OUT", str(tmp_path / "out"))
-    script = f"{{ '{sys.executable}' -m pd4dgs_codec {arguments}; echo $? >'{tmp_path}/code'; }} {streams}"
-    if not streams.startswith("|"):
-        script = f"'{sys.executable}' -m pd4dgs_codec {arguments} {streams}; echo $? >'{tmp_path}/code'"
-    done = subprocess.run(["sh", "-c", script], capture_output=True, text=True, timeout=120)
-    assert int((tmp_path / "code").read_text()) == code, done.stderr
-    assert says in done.stderr and "Traceback" not in done.stderr
-    assert code == 0 or len(done.stderr.splitlines()) == bool(says)
+    found, told = _run(arguments, streams, tmp_path)
+    assert found == code, told
+    assert says in told and "Traceback" not in told
+    assert code == 0 or len(told.splitlines()) == bool(says)
     if "OUT" in CASES[name][0]:
         import numpy as np
 
@@ -51,10 +57,6 @@ def test_streams(name, scene_pd4, tmp_path):
 @pytest.mark.parametrize("verb", VERBS)
 def test_help_and_errors_of_every_command(verb, streams, tmp_path):
     for arguments in ("--help", f"none -o '{tmp_path}/none/out'"):
-        script = f"{{ '{sys.executable}' -m pd4dgs_codec {verb} {arguments}; echo $? >'{tmp_path}/code'; }} {streams}"
-        done = subprocess.run(
-            ["sh", "-c", script], capture_output=True, text=True, timeout=120, stdin=subprocess.DEVNULL
-        )
-        code = int((tmp_path / "code").read_text())
-        assert code in (0, 1, 2) and "Traceback" not in done.stderr and len(done.stderr.splitlines()) < 2, done.stderr
+        code, told = _run(f"{verb} {arguments}", streams, tmp_path)
+        assert code in (0, 1, 2) and "Traceback" not in told and len(told.splitlines()) < 2, told
         assert code or arguments == "--help"
