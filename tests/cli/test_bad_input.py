@@ -286,7 +286,7 @@ def test_a_folder_without_write_permission(cli, model_pt, tmp_path, monkeypatch)
 
 @pytest.mark.parametrize("kind, package", [("spz", "gaussforge"), ("4dgs", "fourdgs")])
 def test_a_missing_package_is_named(cli, scene_pd4, tmp_path, monkeypatch, kind, package):
-    monkeypatch.setitem(__import__("sys").modules, package, None)
+    monkeypatch.setitem(sys.modules, package, None)
     result = cli("export", scene_pd4, "-o", tmp_path / "out", "--to", kind)
     _check(result, "export", 1, f"need the package {package}")
     assert "pip install 'pd4dgs-codec[interchange]'" in result.err

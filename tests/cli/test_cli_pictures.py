@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
-from tiny import TINY, write_views
+from tiny import TINY
 
 from pd4dgs_codec import decode
 from pd4dgs_codec.data.dataset import load
@@ -74,39 +74,41 @@ def test_eval_measures_what_moves_where_cameras_stand_still(cli, scene_pd4):
     assert "moving dB" in shown and f"views of fixed cameras ({100 * np.mean(shares):.1f} %)" in shown
 
 
-@pytest.mark.parametrize("given", [None, "0,0.6,1"])
-def test_truth_and_scene_have_the_background_of_the_file_or_the_option(cli, scene, tmp_path, given):
-    """The pictures are transparent: what they show is the background alone."""
-    folder, file = write_views(tmp_path / "set"), tmp_path / "green.pd4"
-    for picture in folder.glob("*.png"):
+@pytest.fixture
+def transparent(dataset):
+    """A dataset whose pictures show the background alone."""
+    for picture in dataset.glob("*.png"):
         Image.fromarray(np.zeros((HEIGHT, WIDTH, 4), np.uint8)).save(picture)
+    return dataset
+
+
+@pytest.mark.parametrize("given", [None, "0,0.6,1"])
+def test_truth_and_scene_have_the_background_of_the_file_or_the_option(cli, scene, tmp_path, transparent, given):
+    file = tmp_path / "green.pd4"
     file.write_bytes(encode(replace(scene, info=replace(scene.info, background=(0.0, 1.0, 0.0))), effort=1))
     behind, options = (0.0, 1.0, 0.0), ["--max-layer", 0, "--json"]
     if given:
         behind, options = (0.0, 0.6, 1.0), [*options, "--background", given]
-    (view,), level = load(str(folder)).test, load_levels(file, 0)[-1]
+    (view,), level = load(str(transparent)).test, load_levels(file, 0)[-1]
     level.model.info = replace(level.model.info, background=behind)
     truth = np.broadcast_to(np.float32(behind), (HEIGHT, WIDTH, 3))
     expected = mpsnr(level.picture(view.camera, view.time), truth)
-    assert cli("eval", file, folder, *options).json["levels"][0]["mpsnr"] == pytest.approx(expected)
-    done = cli("render", file, "-o", tmp_path / "a.png", "--data", folder, "--side-by-side", *options)
+    assert cli("eval", file, transparent, *options).json["levels"][0]["mpsnr"] == pytest.approx(expected)
+    done = cli("render", file, "-o", tmp_path / "a.png", "--data", transparent, "--side-by-side", *options)
     assert done.code == 0
     sheet = np.asarray(Image.open(tmp_path / "a.png"))[-HEIGHT:]
     assert (sheet[:, -WIDTH:] == np.rint(255 * truth)).all()
     np.testing.assert_array_equal(sheet[:, :WIDTH], np.rint(255 * level.picture(view.camera, view.time)))
 
 
-def test_a_model_keeps_the_background_that_it_is_trained_on(cli, tmp_path, monkeypatch):
+def test_a_model_keeps_the_background_that_it_is_trained_on(cli, tmp_path, transparent, monkeypatch):
     monkeypatch.setitem(PRESETS, "tiny", TINY)
-    folder = write_views(tmp_path / "set")
-    for picture in folder.glob("*.png"):
-        Image.fromarray(np.zeros((HEIGHT, WIDTH, 4), np.uint8)).save(picture)
     options = ("--preset", "tiny", "--iterations", 1, "--background", "0,0.5,1")
-    assert cli("train", folder, "-o", tmp_path / "m.pt", *options).code == 0
+    assert cli("train", transparent, "-o", tmp_path / "m.pt", *options).code == 0
     assert checkpoint.load(tmp_path / "m.pt")[0].info.background == (0, 0.5, 1)
     assert cli("encode", tmp_path / "m.pt", "-o", tmp_path / "m.pd4").code == 0
     assert decode((tmp_path / "m.pd4").read_bytes()).info.background == (0, 0.5, 1)
-    assert cli("eval", tmp_path / "m.pd4", folder, "--background", "red").code == 2
+    assert cli("eval", tmp_path / "m.pd4", transparent, "--background", "red").code == 2
 
 
 def test_eval_by_the_protocol_of_3dgs(cli, scene_pd4, monkeypatch):

@@ -1,6 +1,7 @@
 """`pd4dgs-train --view`: a browser's part is played by a socket that speaks viser's messages."""
 
 import importlib.metadata
+import sys
 import time
 
 import numpy as np
@@ -11,6 +12,7 @@ from pd4dgs_codec.cli import watch
 from pd4dgs_codec.cli.train import main
 from pd4dgs_codec.cli.watch import RESTING_PIXELS, WatchedProgress, camera_of
 from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.interchange.splats import quaternions
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.loop import Trainer
@@ -43,14 +45,11 @@ class Browser:
     def __init__(self, progress: WatchedProgress, view):
         import msgspec
         from viser import _messages
-        from websockets.sync.client import connect
 
         self.encode, self.messages, self.progress = msgspec.msgpack.encode, _messages, progress
-        version = importlib.metadata.version("viser")
-        address = progress.url.replace("http", "ws")
-        self.socket = connect(address, subprotocols=[f"viser-v{version}"], max_size=None)
+        self.socket = connected(progress, max_size=None)
         eye = np.linalg.inv(view.viewmat.astype(np.float64))
-        self.pose = (wxyz_of(eye[:3, :3]), tuple(map(float, eye[:3, 3])))
+        self.pose = tuple(quaternions(eye[None, :3, :3])[0].tolist()), tuple(eye[:3, 3].tolist())
         look_at = tuple(map(float, eye[:3, 3] + eye[:3, 2]))
         self.send(_messages.ViewerCameraMessage(*self.pose, FOV, 0.01, 100.0, HEIGHT, WIDTH, look_at, (0.0, 0.0, 1.0)))
         wait_for(lambda: progress.server.get_clients())
@@ -63,11 +62,12 @@ class Browser:
         wait_for(lambda: handle.value == value)
 
 
-def wxyz_of(rotation: np.ndarray) -> tuple[float, float, float, float]:
-    w = np.sqrt(max(0.0, 1 + np.trace(rotation))) / 2
-    assert w > 0.01
-    x, y, z = (rotation[i, j] - rotation[j, i] for i, j in ((2, 1), (0, 2), (1, 0)))
-    return float(w), *(float(v / (4 * w)) for v in (x, y, z))
+def connected(progress: WatchedProgress, **options):
+    """The socket of a browser."""
+    from websockets.sync.client import connect
+
+    address, version = progress.url.replace("http", "ws"), importlib.metadata.version("viser")
+    return connect(address, subprotocols=[f"viser-v{version}"], **options)
 
 
 def wait_for(condition) -> None:
@@ -112,13 +112,11 @@ def test_a_browser_sees_the_scene_from_its_camera(watched, trainer, dataset, mon
 def test_a_page_of_another_site_sees_nothing(watched, origin):
     """A site can open a socket to this machine in its visitor's browser, which says whose page it is."""
     from websockets.exceptions import InvalidStatus
-    from websockets.sync.client import connect
 
-    address, version = watched.url.replace("http", "ws"), importlib.metadata.version("viser")
     with pytest.raises(InvalidStatus) as refused:
-        connect(address, subprotocols=[f"viser-v{version}"], origin=origin)
+        connected(watched, origin=origin)
     assert refused.value.response.status_code == 403
-    connect(address, subprotocols=[f"viser-v{version}"], origin=watched.url).close()
+    connected(watched, origin=watched.url).close()
 
 
 def test_nothing_is_drawn_while_nobody_looks(watched, trainer, monkeypatch):
@@ -152,7 +150,7 @@ def test_being_watched_changes_no_bit(dataset, trainer, watched):
 
 
 def test_without_viser_it_is_one_line(trainer, monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "viser", None)
+    monkeypatch.setitem(sys.modules, "viser", None)
     with pytest.raises(DataError, match=r"need the package viser.*\[watch\]"):
         WatchedProgress(trainer, 0)
 
