@@ -21,10 +21,8 @@ def scene_off_the_grid():
     """Values between the multiples of their steps, halves among them."""
     scene = make_scene(2, anchors=30)
     rng = np.random.default_rng(0)
-    moved = {
-        name: getattr(scene, name) + rng.uniform(-4, 4, getattr(scene, name).shape).astype(np.float32)
-        for name in ("feature", "scaling_log", "offset")
-    }
+    given = scene.attributes.items()
+    moved = {name: values + rng.uniform(-4, 4, values.shape).astype(np.float32) for name, values in given}
     moved["feature"][:, 0] = 2.5 * scene.steps.feature
     return replace(scene, **moved)
 

@@ -10,10 +10,7 @@ from pd4dgs_codec.format import container
 from pd4dgs_codec.format.container import (
     CHUNK_OVERHEAD,
     FLAG_ANCILLARY,
-    MAJOR,
-    SIGNATURE,
     read_chunk,
-    read_preamble,
     slice_flags,
     write_chunk,
     write_preamble,
@@ -35,11 +32,6 @@ def test_the_flags_of_slices():
     chunks = [read_chunk(write_chunk(0, f, bytes(8), b""), 0) for f in flags]
     assert [(c.slice, c.more, c.ancillary) for c in chunks] == [(n, n < 1023, False) for n in (0, 1, 1022, 1023)]
     assert slice_flags(0, 1) == 0
-
-
-def test_a_later_minor_version_is_read():
-    front = SIGNATURE + struct.pack("<HHI", MAJOR, 9, 0)
-    assert read_preamble(front + struct.pack("<I", zlib.crc32(front))).minor == 9
 
 
 @pytest.mark.parametrize("args", [(-1, 0, bytes(8)), (1 << 16, 0, bytes(8)), (0, 4, bytes(8)), (0, 0, bytes(7))])

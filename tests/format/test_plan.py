@@ -42,9 +42,8 @@ def scene_with(global_value=None, local_value=None, weights_step=FINE):
 
 
 def active_codes(scene, index):
-    full = np.zeros(len(scene.anchor_q), np.uint8)
-    full[: len(scene.mask[index])] = scene.mask[index]
-    return {tuple(c): int(m) for c, m in zip(scene.anchor_q.tolist(), full, strict=True) if m}
+    codes = scene.full_masks()[index]
+    return {tuple(c): int(m) for c, m in zip(scene.anchor_q.tolist(), codes, strict=True) if m}
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Layer prefixes, cut files and incremental decoding."""
+"""Layer prefixes, cut files and incremental decoding; tests/spec/test_vectors.py feeds faulty files to a stream."""
 
 from dataclasses import replace
 from functools import partial
@@ -87,17 +87,6 @@ def test_a_stream_does_not_depend_on_where_it_is_cut(layers, cuts):
         assert_same_scene(scene, decode(data, max_layer=layer))
 
 
-def test_a_fault_stays_and_earlier_layers_remain():
-    end = info(small_file())["layers"][1]["end"]
-    stream = open_stream()
-    scenes_before = stream.feed(flipped(small_file(), end - 9, 4))
-    assert [s.layers for s in scenes_before] == [(0,)]
-    for call in (lambda: stream.feed(b""), lambda: stream.feed(b"x"), stream.finish):
-        with pytest.raises(ChecksumMismatch):
-            call()
-    assert not stream.complete
-
-
 def streamed(data):
     stream = open_stream()
     stream.feed(data)
@@ -139,17 +128,6 @@ def test_of_two_faults_every_door_names_that_of_the_earlier_layer(first, later):
     assert offset == info(bytes(front))["layers"][which]["offset"]
 
 
-def test_a_stream_that_ends_early_says_so():
-    stream = open_stream()
-    assert stream.feed(small_file((0, 1))[:-1])[0].layers == (0,)
-    with pytest.raises(Truncated):
-        stream.finish()
-
-
-def test_a_stream_refuses_other_data_at_once_and_extra_bytes():
+def test_a_stream_refuses_other_data_at_once():
     with pytest.raises(BadSignature):
         open_stream().feed(b"PNG")
-    stream = open_stream()
-    assert len(stream.feed(small_file((0,)) + b"!")) == 1
-    with pytest.raises(Malformed, match="follow"):
-        stream.finish()

@@ -52,8 +52,7 @@ def _gaussian_network(rng: np.random.Generator, network: Network, step: float) -
     )
 
 
-def _gaussian_deformation(rng: np.random.Generator, field: Deformation | None, step: float) -> Deformation:
-    assert field is not None
+def _gaussian_deformation(rng: np.random.Generator, field: Deformation, step: float) -> Deformation:
     planes = tuple(
         {name: rng.normal(1, 4 * step, plane.shape).astype(np.float32) for name, plane in scale.items()}
         for scale in field.planes

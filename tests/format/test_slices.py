@@ -13,7 +13,7 @@ from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import DecodeError, EncodeError, Truncated
 from pd4dgs_codec.format import encoder
 from pd4dgs_codec.format.container import CHUNK_OVERHEAD, read_preamble
-from pd4dgs_codec.format.decoder import decode_partial, every_prefix, open_stream
+from pd4dgs_codec.format.decoder import decode_partial, every_prefix
 from pd4dgs_codec.format.encoder import encode_with_report
 from pd4dgs_codec.format.info import hashes, info
 from pd4dgs_codec.morton import morton_order
@@ -123,12 +123,3 @@ def test_slices_that_cannot_be_are_refused(monkeypatch):
     monkeypatch.setattr(encoder, "MAX_CHUNKS", 5)
     with pytest.raises(EncodeError, match=r"\d slices, expected at most 5"):
         encode(scene(), effort=1, slices=2000)
-
-
-def test_a_thousand_slices_at_once_make_one_scene():
-    """Else 10 kB with 8,192 rows in 60 slices ask a stream for 83 MB, and 131 kB in 1,000 slices for 17 times that."""
-    stream = open_stream()
-    scenes = stream.feed(sliced())
-    assert [scene.layers[-1] for scene in scenes] == [0, 1, 2] and stream.slices == len(slice_ends(sliced()))
-    assert_same_scene(scenes[0], decode(sliced(), max_layer=0))
-    assert_same_scene(scenes[-1], decode(sliced()))
