@@ -18,18 +18,13 @@ from pd4dgs_codec.interchange.export import (
     upright,
 )
 from pd4dgs_codec.interchange.splats import harmonics, picture, unit
+from pd4dgs_codec.quality.frames import turned
 from pd4dgs_codec.scene import Camera
 
 
 def _cameras(count: int = 12) -> list[Camera]:
     """Cameras on a half circle around the scene."""
-    cameras = []
-    for angle in np.linspace(-1.2, 1.2, count):
-        camera = camera_ahead()
-        c, s = np.cos(angle), np.sin(angle)
-        camera.viewmat[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
-        cameras.append(camera)
-    return cameras
+    return [turned(camera_ahead(), np.zeros(3), (0, 1, 0), angle) for angle in np.linspace(-1.2, 1.2, count)]
 
 
 @pytest.mark.parametrize("degree", [0, 3])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from teachers import Deformable, FourD
-from test_formats import make_splats
+from test_formats import gsplat_state, make_splats
 
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.runs import read_cameras, read_torch
@@ -36,10 +36,7 @@ def damaged(data: bytes, rng: random.Random) -> bytes:
 
 
 def _gsplat(path: Path) -> None:
-    splats = make_splats(4, 1)
-    parts = {"means": splats.means, "quats": splats.quats, "scales": splats.scales, "opacities": splats.opacities}
-    parts |= {"sh0": splats.sh[:, :1].copy(), "shN": splats.sh[:, 1:].copy()}
-    torch.save({"splats": {name: torch.from_numpy(value) for name, value in parts.items()}}, path)
+    torch.save({"splats": gsplat_state(make_splats(4, 1))}, path)
 
 
 def _script(path: Path) -> None:
@@ -82,16 +79,8 @@ def _cameras(path: Path) -> None:
     [
         ("ckpt.pt", _gsplat, lambda path: read_model(str(path), 30).splats(0)),
         ("mlp.pt", _script, read_torch),
-        (
-            "run/point_cloud/iteration_7/deformation.pth",
-            _run(FourD),
-            _moved,
-        ),
-        (
-            "run/deform/iteration_7/deform.pth",
-            _run(Deformable),
-            _moved,
-        ),
+        ("run/point_cloud/iteration_7/deformation.pth", _run(FourD), _moved),
+        ("run/deform/iteration_7/deform.pth", _run(Deformable), _moved),
         ("a.ply", _ply, read_splats),
         ("a.4dgs", _fourdgs, lambda path: read_model(str(path), 30).splats(0.5)),
         ("cameras.json", _cameras, read_cameras),

@@ -1,9 +1,14 @@
 """Exported files through independent readers."""
 
 import io
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
+from teachers import parameters
 
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.splats import Splats, fourdgs_bytes, glb_bytes, ply_bytes, spz_bytes, unit
@@ -18,6 +23,27 @@ def make_splats(n: int = 40, degree: int = 3, seed: int = 0) -> Splats:
         rng.uniform(0.05, 0.95, n).astype(np.float32),
         rng.normal(0, 0.2, (n, (degree + 1) ** 2, 3)).astype(np.float32),
     )
+
+
+def gsplat_state(splats: Splats) -> dict[str, torch.Tensor]:
+    """The Gaussians in a checkpoint of gsplat, whose quaternions have any length."""
+    state = parameters(splats)
+    sh = state.pop("sh")
+    return state | {"quats": 3 * state["quats"], "sh0": sh[:, :1].clone(), "shN": sh[:, 1:].clone()}
+
+
+def read_glb(path: Path) -> tuple[Any, dict[str, np.ndarray]]:
+    """By pygltflib: the document of a glTF file, and the attributes of its Gaussians by name, float32 [n, width]."""
+    document, attributes = pytest.importorskip("pygltflib").GLTF2().load(str(path)), {}
+    for name, index in vars(document.meshes[0].primitives[0].attributes).items():
+        if index is not None and name != "COLOR_0":  # for viewers that know no splats
+            row = document.accessors[index]
+            view = document.bufferViews[row.bufferView]
+            width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[row.type]
+            start = view.byteOffset + (row.byteOffset or 0)
+            values = np.frombuffer(document.binary_blob(), "<f4", row.count * width, start)
+            attributes[name] = values.reshape(-1, width)
+    return document, attributes
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -56,25 +82,19 @@ def test_pygltflib_and_fourdgs_read_the_glb(tmp_path, degree):
     pygltflib, fourdgs = pytest.importorskip("pygltflib"), pytest.importorskip("fourdgs")
     splats, path = make_splats(degree=degree), tmp_path / "scene.glb"
     path.write_bytes(glb_bytes(splats))
-    document = pygltflib.GLTF2().load(str(path))
+    document, found = read_glb(path)
     (primitive,) = document.meshes[0].primitives
     assert document.extensionsUsed == ["KHR_gaussian_splatting"] and primitive.mode == pygltflib.POINTS
     assert primitive.extensions["KHR_gaussian_splatting"]["kernel"] == "ellipse"
 
-    def accessor(name):
-        row = document.accessors[getattr(primitive.attributes, name)]
-        view = document.bufferViews[row.bufferView]
-        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[row.type]
-        return np.frombuffer(document.binary_blob(), "<f4", row.count * width, view.byteOffset).reshape(-1, width)
-
     prefix = "KHR_gaussian_splatting:"
-    np.testing.assert_array_equal(accessor("POSITION"), splats.means)
-    np.testing.assert_array_equal(accessor(prefix + "SCALE"), splats.scales)
-    np.testing.assert_array_equal(accessor(prefix + "OPACITY")[:, 0], splats.opacities)
-    np.testing.assert_array_equal(accessor(prefix + "ROTATION")[:, [3, 0, 1, 2]], splats.quats)
+    np.testing.assert_array_equal(found["POSITION"], splats.means)
+    np.testing.assert_array_equal(found[prefix + "SCALE"], splats.scales)
+    np.testing.assert_array_equal(found[prefix + "OPACITY"][:, 0], splats.opacities)
+    np.testing.assert_array_equal(found[prefix + "ROTATION"][:, [3, 0, 1, 2]], splats.quats)
     names = [f"SH_DEGREE_{l}_COEF_{i}" for l in range(degree + 1) for i in range(2 * l + 1)]
     for j, name in enumerate(names):
-        np.testing.assert_array_equal(accessor(prefix + name), splats.sh[:, j])
+        np.testing.assert_array_equal(found[prefix + name], splats.sh[:, j])
     row = document.accessors[primitive.attributes.POSITION]
     np.testing.assert_array_equal([row.min, row.max], [splats.means.min(axis=0), splats.means.max(axis=0)])
 
@@ -112,7 +132,7 @@ def test_spz_refuses_positions_out_of_range():
 def test_fourdgs_reads_moving_gaussians():
     fourdgs = pytest.importorskip("fourdgs")
     first, second = make_splats(30, 1, 1), make_splats(20, 1, 1)
-    second = Splats(first.means[:20] + np.float32(0.1), *list(vars(second).values())[1:])
+    second = replace(second, means=first.means[:20] + np.float32(0.1))
     data = fourdgs_bytes([(0.0, first, np.arange(30)), (0.5, second, np.arange(20))], 1.0)
     back = fourdgs.read(data)
     assert back.header.duration_sec == 1.0 and back.gaussians.sh_degree == 1

@@ -8,13 +8,9 @@ from pd4dgs_codec.data.view import rotation_matrix
 from pd4dgs_codec.interchange.splats import SH_C0, Splats, camera_eye, harmonics, picture, quaternions, unit
 
 
-def _directions(n: int, seed: int = 0) -> np.ndarray:
-    return unit(np.random.default_rng(seed).normal(size=(n, 3)))
-
-
 def test_harmonics_are_the_real_ones_with_the_condon_shortley_phase():
     special = pytest.importorskip("scipy.special")
-    directions = _directions(50)
+    directions = unit(np.random.default_rng(0).normal(size=(50, 3)))
     polar, azimuth = np.arccos(directions[:, 2]), np.arctan2(directions[:, 1], directions[:, 0])
     expected = []
     for degree in range(4):

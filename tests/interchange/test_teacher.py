@@ -4,13 +4,14 @@ import gzip
 import json
 import struct
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from common import SHARED
-from test_formats import make_splats
+from test_formats import gsplat_state, make_splats
 from tiny import write_views
 
 from pd4dgs_codec.data.dataset import load
@@ -36,7 +37,7 @@ def _same(found: Splats, expected: Splats, **tolerance: float) -> None:
 
 
 def _moved(splats: Splats, x: float) -> Splats:
-    return Splats(splats.means + np.float32([x, 0, 0]), *list(vars(splats).values())[1:])
+    return replace(splats, means=splats.means + np.float32([x, 0, 0]))
 
 
 def _sequence(folder: Path, frames: int = 3) -> Path:
@@ -95,20 +96,14 @@ def test_frames_are_in_the_order_of_their_numbers(tmp_path):
 
 def test_a_checkpoint_of_gsplat(tmp_path):
     splats = make_splats(20, 2)
-    p = splats.opacities
-    state = {
-        "means": splats.means, "quats": splats.quats * 3, "scales": np.log(splats.scales),
-        "opacities": np.log(p / (1 - p)), "sh0": splats.sh[:, :1], "shN": splats.sh[:, 1:],
-    }  # fmt: skip
-    path = tmp_path / "ckpt_29999_rank0.pt"
-    splat_state = {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in state.items()}
-    torch.save({"step": 29999, "splats": splat_state}, path)
+    path, state = tmp_path / "ckpt_29999_rank0.pt", gsplat_state(splats)
+    torch.save({"step": 29999, "splats": state}, path)
     _same(read_model(str(path), 30).splats(0.0), splats)
     for key, shape in (("shN", (20, 24)), ("shN", (19, 8, 3)), ("sh0", (20, 1, 0)), ("sh0", (20, 3))):
-        torch.save({"step": 1, "splats": splat_state | {key: torch.zeros(shape)}}, path)
+        torch.save({"step": 1, "splats": state | {key: torch.zeros(shape)}}, path)
         with pytest.raises(DataError, match=r"sh0 and shN have shapes .*, expected \(n, 1, 3\) and"):
             read_model(str(path), 30)
-    torch.save({"step": 1, "splats": {"means": splat_state["means"]}}, path)
+    torch.save({"step": 1, "splats": {"means": state["means"]}}, path)
     with pytest.raises(DataError, match="has no splats.quats; expected a checkpoint of gsplat"):
         read_model(str(path), 30)
 
@@ -227,14 +222,12 @@ def test_bad_teachers_are_one_line(tmp_path, source, message):
     places["empty"].mkdir()
     whole = ply_bytes(make_splats(degree=1))
     splats = make_splats(degree=0)
-    faint = Splats(splats.means, splats.quats, splats.scales, np.full(40, 0.01, np.float32), splats.sh)
-    nan = Splats(splats.means + np.float32(np.nan), *list(vars(splats).values())[1:])
     for name, data in {
         "rest": whole.replace(b"property float nx", b"property float f_rest_9"),
         "plain": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
         b"end_header\n0 0 0\n",
-        "nan": ply_bytes(nan),
-        "faint": ply_bytes(faint),
+        "nan": ply_bytes(replace(splats, means=splats.means + np.float32(np.nan))),
+        "faint": ply_bytes(replace(splats, opacities=np.full(40, 0.01, np.float32))),
         "cut": whole[:-40],
     }.items():
         places[name] = tmp_path / f"{name}.ply"
