@@ -11,7 +11,7 @@ from browser import call, pixels
 from pd4dgs_codec import decode
 from pd4dgs_codec.draw.gaussians import Gaussians
 from pd4dgs_codec.draw.player import Player
-from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.quality.frames import turned
 from pd4dgs_codec.scene import Camera, Scene
 
 
@@ -39,20 +39,13 @@ def resized(camera: Camera, width: int, height: int) -> Camera:
 def cameras(scene: Scene, turns: Sequence[tuple[float, float]]) -> Iterator[Camera]:
     """The scene's own camera, then for each (angle, nearer) that camera turned about the middle of the anchors by
     `angle`, around its vertical, and brought nearer by the share `nearer`."""
-    own = scene.info.camera
-    if own is None:
-        raise DataError("the scene has no camera of its own")
+    own, middle = scene.info.camera, np.median(scene.anchor, axis=0)
     yield own
-    R, t = own.viewmat[:3, :3].astype(np.float64), own.viewmat[:3, 3]
-    x, y, z = axis = R[1]
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    middle = np.median(scene.anchor, axis=0)
     for angle, nearer in turns:
-        turn = np.cos(angle) * np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * np.outer(axis, axis)
-        viewmat = np.eye(4)
-        viewmat[:3, :3] = R @ turn.T
-        viewmat[:3, 3] = -viewmat[:3, :3] @ (middle + (1 - nearer) * turn @ (-R.T @ t - middle))
-        yield replace(own, viewmat=viewmat.astype(np.float32))
+        camera = turned(own, middle, own.viewmat[1, :3], angle)
+        way = camera.viewmat[:3, :3] @ middle + camera.viewmat[:3, 3]  # from the camera to the middle, in its axes
+        camera.viewmat[:3, 3] -= nearer * way
+        yield camera
 
 
 @dataclass(frozen=True, eq=False)

@@ -239,7 +239,6 @@ def test_a_rendered_video_is_packaged(cli, folder, tmp_path, monkeypatch):
     monkeypatch.setattr("pd4dgs_codec.model.picture.render_image", lambda *_: grey)
     scene = make_scene(7, layers=(0, 1, 2), anchors=40)
     camera = scene.info.camera
-    assert camera is not None
     K = camera.K * [[0.1], [0.1], [1]]
     small = replace(camera, width=65, height=48, K=K.astype("float32"))
     (folder / "small.pd4").write_bytes(encode(replace(scene, info=replace(scene.info, camera=small)), effort=1))

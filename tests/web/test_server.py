@@ -18,6 +18,17 @@ from pd4dgs_codec.web.server import Link, Server
 CONTENT = bytes(i % 251 for i in range(1000))
 
 
+def told(server: Server, request: bytes) -> bytes:
+    """What the server sends on a connection of its own until it ends that."""
+    received = b""
+    with socket.create_connection(server.server_address[:2], timeout=20) as raw:
+        raw.sendall(request)
+        with contextlib.suppress(ConnectionResetError):  # what nobody reads may reset it
+            while block := raw.recv(65536):
+                received += block
+    return received
+
+
 def test_the_whole_file_with_its_validators(server):
     answer = ask(server, "/bytes.bin")
     assert answer.status == 200 and answer.body == CONTENT
@@ -166,23 +177,13 @@ SMUGGLED = b"GET /scene.pd4 HTTP/1.1\r\nHost: x\r\n\r\n"
 )  # fmt: skip
 def test_a_body_is_not_the_next_request(server, method, field):
     """However it is announced: the server reads no body, so it ends the connection."""
-    with socket.create_connection(server.server_address[:2], timeout=10) as raw:
-        head = f"{method} /bytes.bin HTTP/1.1\r\nHost: x\r\n{field.format(len(SMUGGLED))}\r\n\r\n"
-        raw.sendall(head.encode("latin-1") + SMUGGLED)
-        received = b""
-        with contextlib.suppress(ConnectionResetError):  # what nobody reads may reset it
-            while block := raw.recv(65536):
-                received += block
+    head = f"{method} /bytes.bin HTTP/1.1\r\nHost: x\r\n{field.format(len(SMUGGLED))}\r\n\r\n"
+    received = told(server, head.encode("latin-1") + SMUGGLED)
     assert received.count(b"HTTP/1.1 ") <= 1 and b"scene" not in received
 
 
 def test_a_body_that_drips_is_not_waited_for(server):
-    with socket.create_connection(server.server_address[:2], timeout=20) as raw:
-        raw.sendall(b"POST /bytes.bin HTTP/1.1\r\nHost: x\r\nContent-Length: 1000000000\r\n\r\nx")
-        received = b""
-        with contextlib.suppress(ConnectionResetError):
-            while block := raw.recv(65536):  # up to the end of the connection, of which there is one
-                received += block
+    received = told(server, b"POST /bytes.bin HTTP/1.1\r\nHost: x\r\nContent-Length: 1000000000\r\n\r\nx")
     assert received.count(b"HTTP/1.1 ") <= 1
 
 
@@ -224,10 +225,8 @@ def test_a_private_server_answers_no_other_site(private, method, headers):
 )
 def test_a_private_server_takes_no_request_that_names_two_sites(private, target, field):
     own = "{}:{}".format(*private.server_address[:2])
-    with socket.create_connection(private.server_address[:2], timeout=10) as raw:
-        fields = f"Host: {own}\r\n{field.format(own)}\r\nConnection: close"
-        raw.sendall(f"GET {target} HTTP/1.1\r\n{fields}\r\n\r\n".encode())
-        assert raw.makefile("rb").read().startswith(b"HTTP/1.1 4")
+    fields = f"Host: {own}\r\n{field.format(own)}\r\nConnection: close"
+    assert told(private, f"GET {target} HTTP/1.1\r\n{fields}\r\n\r\n".encode()).startswith(b"HTTP/1.1 4")
 
 
 def test_a_file_that_shrinks_while_it_is_sent_cuts_the_answer(folder, monkeypatch):
@@ -262,9 +261,7 @@ def test_the_folder_and_the_address_must_be_usable(folder, server):
 def test_request_lines_cannot_act_on_the_terminal(folder):
     lines: list[str] = []
     with Server(folder, log=lines.append) as server, server.running():
-        with socket.create_connection(server.server_address[:2], timeout=10) as raw:
-            raw.sendall(b"GET /\x1b[31m\x9b HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
-            raw.recv(65536)
+        told(server, b"GET /\x1b[31m\x9b HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
     assert len(lines) == 1 and lines[0].isprintable() and "404" in lines[0]
 
 
@@ -279,10 +276,7 @@ def test_request_lines_cannot_act_on_the_terminal(folder):
     ],
 )
 def test_what_is_no_request_is_refused_like_any_other(server, request_line, status):
-    host, port = server.server_address[:2]
-    with socket.create_connection((host, port), timeout=20) as client:
-        client.sendall(f"{request_line}\r\n\r\n".encode())
-        answer = client.makefile("rb").read().decode()
+    answer = told(server, f"{request_line}\r\n\r\n".encode()).decode()
     assert answer.startswith(f"HTTP/1.1 {status} ") and "Access-Control-Allow-Origin: *" in answer
     assert answer.endswith(f"\r\n\r\n{status} {HTTPStatus(status).phrase}\n")
 

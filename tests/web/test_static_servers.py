@@ -1,6 +1,5 @@
 """The configurations in docs/player-and-delivery.md, run by a real nginx and a real Caddy where there are any."""
 
-import http.client
 import os
 import re
 import shutil
@@ -8,8 +7,10 @@ import socket
 import subprocess
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
+from faulty import ask
 from strategies import assert_same_scene
 
 from pd4dgs_codec import decode
@@ -56,7 +57,8 @@ def _caddy(program: str, number: int, folder: Path, tmp_path: Path) -> list[str]
 
 
 @pytest.fixture(params=["nginx", "caddy"])
-def port(request, folder, tmp_path):
+def server(request, folder, tmp_path):
+    """The address of one that runs."""
     program = PROGRAMS[request.param]
     if program is None:
         pytest.skip(f"no {request.param} on this machine")
@@ -72,41 +74,37 @@ def port(request, folder, tmp_path):
             except OSError:
                 assert process.poll() is None, process.communicate()[1]
                 time.sleep(0.05)
-        yield number
+        yield SimpleNamespace(server_address=("127.0.0.1", number))
     finally:
         process.terminate()
         process.communicate(timeout=10)
 
 
-def ask(port: int, method: str = "GET", target: str = "/scene.pd4", **headers: str) -> http.client.HTTPResponse:
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-    connection.request(method, target, headers={k.replace("_", "-"): v for k, v in headers.items()})
-    return connection.getresponse()
-
-
-def test_a_page_of_another_site_may_fetch_and_resume(port, folder, scene_bytes):
+def test_a_page_of_another_site_may_fetch_and_resume(server, folder, scene_bytes):
     (folder / "scene.mpd").write_text("<MPD/>")
-    assert ask(port, target="/scene.mpd").headers["Content-Type"] == "application/dash+xml"
-    whole = ask(port)
-    assert whole.read() == scene_bytes and whole.headers["Content-Type"] == "model/vnd.pd4dgs"
+    assert ask(server, "/scene.mpd").headers["Content-Type"] == "application/dash+xml"
+    whole = ask(server, "/scene.pd4")
+    assert whole.body == scene_bytes and whole.headers["Content-Type"] == "model/vnd.pd4dgs"
     assert whole.headers["Access-Control-Allow-Origin"] == "*"
     assert whole.headers["Cache-Control"] == "no-cache"
     (folder / "scene-0123456789abcdef.pd4").write_bytes(scene_bytes)
-    assert "immutable" in ask(port, "HEAD", "/scene-0123456789abcdef.pd4").headers["Cache-Control"]
-    part = ask(port, Range="bytes=5-9", If_Range=whole.headers["ETag"])
-    assert part.status == 206 and part.read() == scene_bytes[5:10]
+    assert "immutable" in ask(server, "/scene-0123456789abcdef.pd4", "HEAD").headers["Cache-Control"]
+    part = ask(server, "/scene.pd4", Range="bytes=5-9", If_Range=whole.headers["ETag"])
+    assert part.status == 206 and part.body == scene_bytes[5:10]
     assert "Content-Range" in part.headers["Access-Control-Expose-Headers"]
-    preflight = ask(port, "OPTIONS", Access_Control_Request_Method="GET", Origin="http://example.org")
+    site = "http://example.org"
+    preflight = ask(server, "/scene.pd4", "OPTIONS", Access_Control_Request_Method="GET", Origin=site)
     assert preflight.status == 204 and "If-Range" in preflight.headers["Access-Control-Allow-Headers"]
 
 
-def test_the_client_streams_upgrades_and_sees_a_change(port, folder, scene_bytes, other_bytes):
-    with SceneClient(f"http://127.0.0.1:{port}/scene.pd4") as client:
+def test_the_client_streams_upgrades_and_sees_a_change(server, folder, scene_bytes, other_bytes):
+    url = "http://{}:{}/scene.pd4".format(*server.server_address)
+    with SceneClient(url) as client:
         (base,) = client.scenes(max_layer=0)
         assert_same_scene(base, decode(scene_bytes, max_layer=0))
         assert_same_scene(list(client.scenes())[-1], decode(scene_bytes))
         assert client.transfer.changes == 0
-    with SceneClient(f"http://127.0.0.1:{port}/scene.pd4") as client:
+    with SceneClient(url) as client:
         list(client.scenes(max_layer=0))
         (folder / "new").write_bytes(other_bytes)
         (folder / "new").replace(folder / "scene.pd4")
