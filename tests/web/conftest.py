@@ -14,12 +14,6 @@ def scene_bytes() -> bytes:
     return encode(make_scene(7, anchors=250, kind="gaussian", extent=20), layers=2, effort=1)
 
 
-@pytest.fixture(scope="session")
-def other_bytes() -> bytes:
-    """Another scene in a file of another length."""
-    return encode(make_scene(8, anchors=120, kind="gaussian", extent=20), layers=2, effort=1)
-
-
 @pytest.fixture
 def folder(tmp_path, scene_bytes) -> Path:
     """Holds scene.pd4 and bytes.bin (1,000 bytes, each its own position modulo 251)."""

@@ -11,9 +11,9 @@ from types import SimpleNamespace
 
 import pytest
 from faulty import ask
-from strategies import assert_same_scene
+from strategies import assert_same_scene, make_scene
 
-from pd4dgs_codec import decode
+from pd4dgs_codec import decode, encode
 from pd4dgs_codec.web.client import SceneClient
 
 PAGE = Path(__file__).parents[2] / "docs/player-and-delivery.md"
@@ -97,7 +97,7 @@ def test_a_page_of_another_site_may_fetch_and_resume(server, folder, scene_bytes
     assert preflight.status == 204 and "If-Range" in preflight.headers["Access-Control-Allow-Headers"]
 
 
-def test_the_client_streams_upgrades_and_sees_a_change(server, folder, scene_bytes, other_bytes):
+def test_the_client_streams_upgrades_and_sees_a_change(server, folder, scene_bytes):
     url = "http://{}:{}/scene.pd4".format(*server.server_address)
     with SceneClient(url) as client:
         (base,) = client.scenes(max_layer=0)
@@ -106,7 +106,8 @@ def test_the_client_streams_upgrades_and_sees_a_change(server, folder, scene_byt
         assert client.transfer.changes == 0
     with SceneClient(url) as client:
         list(client.scenes(max_layer=0))
-        (folder / "new").write_bytes(other_bytes)
+        other = make_scene(8, anchors=120, kind="gaussian", extent=20)
+        (folder / "new").write_bytes(encode(other, layers=2, effort=1))  # of another length
         (folder / "new").replace(folder / "scene.pd4")
         assert [scene.layers for scene in client.scenes()] == [(0,), (0, 1), (0, 1, 2)]
         assert client.transfer.changes == 1
