@@ -16,11 +16,11 @@ const STEP_CLASSES = 7;
  */
 export function decodeAttributes(bytes, rows, kind, known) {
   const count = channelCount(kind.widths);
-  const attributes = new Int32Array(count * rows);
   if (!kind.stepClasses) {
-    decodeChannels(bytes, new Array(count).fill(rows), attributes, known);
+    const attributes = decodeChannels(bytes, new Array(count).fill(rows), known);
     return { stepClasses: new Int32Array(0), attributes };
   }
+  const attributes = new Int32Array(count * rows);
   const reader = new ByteReader(bytes);
   const stepClasses = readStepClasses(reader, rows);
   const groups = groupByClass(stepClasses, STEP_CLASSES);
@@ -32,8 +32,7 @@ export function decodeAttributes(bytes, rows, kind, known) {
 /** The step class of each row. Later slices do not use its priors. @param {ByteReader} reader @param {number} rows */
 function readStepClasses(reader, rows) {
   const length = reader.varint(reader.remaining, "the length of the step classes");
-  const classes = new Int32Array(rows);
-  decodeChannels(reader.take(length, "the end of the step classes"), [rows], classes);
+  const classes = decodeChannels(reader.take(length, "the end of the step classes"), [rows]);
   for (const c of classes) {
     if (c < 0 || c >= STEP_CLASSES) throw malformed(`a step class of ${c}, expected 0..${STEP_CLASSES - 1}`);
   }

@@ -23,20 +23,19 @@ const FIRST_REUSE = 8;
 /** Symbols outside the window, at ascending positions. @typedef {{positions: number[], values: number[]}} Exceptions */
 
 /**
- * Decodes a section of coded channels of these lengths, one behind the other into `out`, which they fill.
+ * The symbols of a section of coded channels of these lengths, one behind the other.
  *
- * @param {Uint8Array} bytes @param {ArrayLike<number>} counts @param {Int32Array} out
+ * @param {Uint8Array} bytes @param {number[]} counts
  * @param {Prior[]} [priors] defined by the slices before, in order; those of this section are added
  */
-export function decodeChannels(bytes, counts, out, priors = []) {
+export function decodeChannels(bytes, counts, priors = []) {
   const reader = new ByteReader(bytes);
+  const symbols = counts.reduce((sum, count) => sum + count, 0);
+  const most = symbols + (priors.length ? MORE_ENTRIES : FREE_ENTRIES);
   let entries = 0;
-  let most = priors.length ? MORE_ENTRIES : FREE_ENTRIES;
-  for (let i = 0; i < counts.length; i++) most += counts[i];
   /** @type {{count: number, prior: Prior, exceptions: Exceptions | null}[]} */
   const channels = [];
-  for (let i = 0; i < counts.length; i++) {
-    const count = counts[i];
+  for (const count of counts) {
     if (!count) continue;
     const token = reader.varint(2 * (MAX_COUNT + FIRST_REUSE), "a channel's prior");
     const family = token >> 1;
@@ -53,12 +52,14 @@ export function decodeChannels(bytes, counts, out, priors = []) {
     channels.push({ count, prior, exceptions: token & 1 ? readExceptions(reader, count, prior.window) : null });
   }
   const stream = new AnsDecoder(reader.rest());
+  const out = new Int32Array(symbols);
   let at = 0;
   for (const { count, prior, exceptions } of channels) {
     takeChannel(stream, prior, exceptions, out, at, count);
     at += count;
   }
   stream.finish();
+  return out;
 }
 
 /** @param {AnsDecoder} stream @param {Prior} prior @param {Exceptions | null} exceptions @param {Int32Array} out

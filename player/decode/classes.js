@@ -32,17 +32,8 @@ export function channelsOf(values, count) {
  * @param {(Groups | null)[]} groups @param {import("./channels.js").Prior[]} [known] see decodeChannels
  */
 export function decodeSplit(bytes, channels, groups, known) {
-  /** @type {number[]} */
-  const counts = [];
-  let all = 0;
-  channels.forEach((channel, i) => {
-    all += channel.length;
-    const split = groups[i];
-    if (split) for (const size of split.sizes) counts.push(size);
-    else counts.push(channel.length);
-  });
-  const coded = new Int32Array(all);
-  decodeChannels(bytes, counts, coded, known);
+  const counts = channels.flatMap(({ length }, i) => [...(groups[i]?.sizes ?? [length])]);
+  const coded = decodeChannels(bytes, counts, known);
   let at = 0;
   channels.forEach((channel, i) => {
     const split = groups[i];

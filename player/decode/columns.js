@@ -5,11 +5,7 @@ const MOST_GROWTH = 4;
 
 /** @typedef {Int32Array | Uint32Array | Float32Array | Uint8Array} Values */
 
-/**
- * An array [rows, width] that grows. What was read from it before stays as it is.
- *
- * @template {Values} A
- */
+/** An array [rows, width] that grows. What was read from it before stays as it is. @template {Values} A */
 export class Column {
   /** @param {new (length: number) => A} type @param {number} width */
   constructor(type, width) {

@@ -39,10 +39,7 @@ const DIGEST_SIZE = 16;
 const MAX_CAMERA_SIDE = 65535;
 const MAX_VIEWS = 7;
 
-/**
- * @param {Uint8Array} bytes
- * @returns {Header}
- */
+/** @param {Uint8Array} bytes @returns {Header} */
 export function readHeader(bytes) {
   const { value, firstEntryEnd } = unpack(bytes, "header");
   const fields = new Fields(value, "header", KEYS);

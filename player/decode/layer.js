@@ -41,12 +41,12 @@ export function decodeLayer(payload, kind, before, continuation, later) {
   const parameters = readParameters(payload, kind, before, later);
   const { rows, sections, scales, networks } = parameters;
   const { positions, masks, attributes: section, planes, weights } = sections;
-  const voxels = positions ? decodePositions(positions, rows, continuation.positions) : new Int32Array(0);
-  const codes = new Int32Array(earlierRows + rows);
-  if (masks) decodeChannels(masks, [earlierRows, rows], codes, continuation.masks);
+  const empty = new Int32Array(0);
+  const voxels = positions ? decodePositions(positions, rows, continuation.positions) : empty;
+  const codes = masks ? decodeChannels(masks, [earlierRows, rows], continuation.masks) : empty;
   checkRange(codes.subarray(0, earlierRows), 0, MOST_CODE, "a rise of a mask code");
   checkRange(codes.subarray(earlierRows), LEAST_OWN_CODE, MOST_CODE, "a mask code");
-  const none = { stepClasses: new Int32Array(0), attributes: new Int32Array(0) };
+  const none = { stepClasses: empty, attributes: empty };
   const { stepClasses, attributes } = section ? decodeAttributes(section, rows, kind, continuation.attributes) : none;
   checkRange(attributes, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of an attribute");
   return {
@@ -65,8 +65,7 @@ export function decodeLayer(payload, kind, before, continuation, later) {
 /** @param {Uint8Array} bytes @param {NetworkShape[]} networks */
 function decodeWeights(bytes, networks) {
   const counts = networks.flatMap(({ layers }) => layers.flatMap(({ inputs, outputs }) => [inputs * outputs, outputs]));
-  const all = new Int32Array(counts.reduce((sum, count) => sum + count, 0));
-  decodeChannels(bytes, counts, all);
+  const all = decodeChannels(bytes, counts);
   checkRange(all, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of a weight");
   let at = 0;
   return counts.map((count) => all.subarray(at, (at += count)));

@@ -39,8 +39,7 @@ export function decodePositions(bytes, rows, known) {
     only = single;
   }
   lengths.push(...patterns);
-  const symbols = new Int32Array(lengths.reduce((sum, length) => sum + length, 0));
-  decodeChannels(reader.rest(), lengths, symbols, known);
+  const symbols = decodeChannels(reader.rest(), lengths, known);
   return placed(grow(levels, patterns, symbols, rows), minimum, depth);
 }
 

@@ -6,12 +6,13 @@ import { DecodeError, limitExceeded, malformed, unsupported } from "./errors.js"
 import { LAYER_TYPES, readHeader } from "./header.js";
 import { MOST_CODE, decodeLayer, dequantise, transposed } from "./layer.js";
 import { layerKind } from "./parameters.js";
-import { Continuation, mortonOrder } from "./slices.js";
+import { mortonOrder } from "./slices.js";
 import { VoxelTable } from "./voxels.js";
 /** @import { Header } from "./header.js" */
 /** @import { LayerSymbols } from "./layer.js" */
 /** @import { Declared, NetworkShape, PlaneShape } from "./parameters.js" */
 /** @import { Deformation, Network, Scale, Scene, Steps } from "./scene.js" */
+/** @import { Continuation } from "./slices.js" */
 
 /**
  * Reads a whole file, or its layers up to maxLayer; of a cut file, if allowPartial, the slices that are there, at least
@@ -164,7 +165,7 @@ export class LayerReader {
     if (next !== null && more !== (next === layer)) {
       throw flagged(`layer ${layer} ${more ? "announces a further slice" : "ends"}, but layer ${next} follows`);
     }
-    const continuation = later ? latest.continuation : new Continuation();
+    const continuation = later ? latest.continuation : { positions: [], masks: [], attributes: [] };
     const symbols = decodeLayer(payload, layerKind(layer, header), this._declared, continuation, later);
     this._accept(symbols, continuation, later, header);
     this._declared = symbols.parameters.declared;
@@ -214,14 +215,14 @@ export class LayerReader {
 
   /** Returns a function that undoes a slice, of which a part may have been added: it may be fetched again. */
   _mark() {
-    const { length } = this._layers;
-    const forget = this._layers[length - 1]?.continuation.mark();
+    const latest = this._layers[this._layers.length - 1];
+    const lists = [this._layers, ...Object.values(latest?.continuation ?? {})];
+    const lengths = lists.map(({ length }) => length);
     const columns = [...Object.values(this._columns), ...this._layers.map(({ codes }) => codes)];
     const counts = columns.map(({ rows }) => rows);
     const loose = [...this._loose];
     return () => {
-      forget?.();
-      this._layers.length = length;
+      lists.forEach((list, i) => (list.length = lengths[i]));
       columns.forEach((column, i) => (column.rows = counts[i]));
       this._loose = loose;
     };

@@ -1,23 +1,7 @@
 // Clauses 3.6, 8 and 12.2: state from slice to slice of a layer, and the order of their rows.
 
-/** What later slices of a layer may refer to: the priors of each section, in their order. */
-export class Continuation {
-  constructor() {
-    /** @type {import("./channels.js").Prior[]} */
-    this.positions = [];
-    /** @type {import("./channels.js").Prior[]} */
-    this.masks = [];
-    /** @type {import("./channels.js").Prior[]} of the channels of 11.2 */
-    this.attributes = [];
-  }
-
-  /** Returns a function that undoes later additions: a damaged slice may be fetched again. */
-  mark() {
-    const lists = [this.positions, this.masks, this.attributes];
-    const sizes = lists.map((priors) => priors.length);
-    return () => lists.forEach((priors, i) => (priors.length = sizes[i]));
-  }
-}
+/** What later slices of a layer may refer to: the priors of each section, in their order.
+ * @typedef {Record<"positions" | "masks" | "attributes", import("./channels.js").Prior[]>} Continuation */
 
 /** Whether the highest bit of a is lower than that of b, both below 2^31. @param {number} a @param {number} b */
 const isLower = (a, b) => a < b && a < (a ^ b);
