@@ -154,12 +154,8 @@ export class GpuEvaluator {
     this._list = null;
     /** @type {List} */
     this._listed = { width: 16, rows: 0, entries: new Uint32Array(0), starts: new Uint32Array(slots + 1), count: 0 };
-    /** What the textures hold: level, time, camera's centre. @type {number | null} */
-    this._level = null;
-    /** @type {number | null} */
-    this._time = null;
-    /** @type {number[] | null} */
-    this._eye = null;
+    /** What the textures hold. @type {{level: number, t: number, eye: number[]} | null} */
+    this._held = null;
     /** Stands for the time and the list. */
     this._shape = {};
   }
@@ -250,10 +246,11 @@ void main() {
     const gpu = this._gpu;
     const { number, rows, codes, motion } = levelOf(this.scene, level);
     const lines = Math.ceil(rows / this._width);
-    const levelMoved = number !== this._level;
-    const anchorsMoved = levelMoved || (t !== this._time && !!motion);
-    const eyeMoved = !this._eye || [0, 1, 2].some((k) => this._eye?.[k] !== eye[k]);
-    this._level = null; // until all is done, the textures hold nothing in particular
+    const held = this._held;
+    const levelMoved = number !== held?.level;
+    const anchorsMoved = levelMoved || (t !== held.t && !!motion);
+    const eyeMoved = levelMoved || eye.some((x, k) => x !== held.eye[k]);
+    this._held = null; // until all is done, the textures hold nothing in particular
     if (levelMoved) {
       const padded = new Uint8Array(this._width * this._height);
       padded.set(codes);
@@ -276,9 +273,7 @@ void main() {
     }
     if (gaussiansMoved) this._shape = {};
     const splats = this._runShapes(eye, into);
-    this._level = number;
-    this._time = t;
-    this._eye = eye;
+    this._held = { level: number, t, eye };
     return { splats, means: gaussiansMoved ? await gpu.read(splats.field, 0, 1, this._listed.rows) : null };
   }
 

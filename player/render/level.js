@@ -37,11 +37,7 @@ function motionOf(scene, level) {
   return motion;
 }
 
-/**
- * The unit of the head position: a quarter of the longest side of the box, scene units.
- *
- * @param {Scene} scene
- */
+/** The unit of the head position: a quarter of the longest side of the box, scene units. @param {Scene} scene */
 export function deformationUnit({ info: { box } }) {
   return 0.25 * Math.max(...[0, 1, 2].map((k) => box[1][k] - box[0][k]));
 }

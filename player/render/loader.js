@@ -12,10 +12,7 @@ import { WORKERS } from "./workers.js";
  * @typedef {{url: string, worker: Worker | null, begin: (code: string) => void}} Early
  */
 
-/**
- * @param {(news: News) => void} told
- * @param {string | Blob} [from] what it will be asked to open
- */
+/** @param {(news: News) => void} told @param {string | Blob} [from] what it will be asked to open */
 export function startLoader(told, from) {
   const code = WORKERS.loader;
   const { early } = /** @type {{early?: Early}} */ (globalThis);

@@ -17,9 +17,7 @@ const WHEEL = 1.0015;
 const SAMPLES = 4000;
 
 export class Orbit {
-  /**
-   * @param {Player} player @param {HTMLElement} surface takes pointers, wheel and keys
-   */
+  /** @param {Player} player @param {HTMLElement} surface takes pointers, wheel and keys */
   constructor(player, surface) {
     this._player = player;
     this._surface = surface;
@@ -101,10 +99,7 @@ export class Orbit {
     });
   }
 
-  /**
-   * A key. @param {KeyboardEvent} event
-   * @returns {boolean} whether it was one of ours
-   */
+  /** A key. @param {KeyboardEvent} event @returns {boolean} whether it was one of ours */
   key({ key, shiftKey }) {
     const step = Math.min(this._surface.clientWidth, this._surface.clientHeight) * KEY_STEP;
     /** @type {Record<string, [number, number]>} */

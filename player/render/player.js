@@ -355,8 +355,7 @@ export class Player extends Clip {
     }
     this._step(now);
     const size = this._size(now);
-    const sized = size[0] === this.canvas.width && size[1] === this.canvas.height;
-    if (this._front && !this._drawing && (this._dirty || !sized)) this._show(size);
+    if (this._front && !this._drawing && (this._dirty || !this._isSized(size))) this._show(size);
     if (this._playing || !this._isSettled()) this._wake();
   }
 
@@ -385,7 +384,7 @@ export class Player extends Clip {
   }
 
   _isSettled() {
-    const [width, height] = this._size(performance.now());
+    const now = performance.now();
     return (
       !!this._front &&
       !this._dirty &&
@@ -394,9 +393,8 @@ export class Player extends Clip {
       !this._sorting &&
       this._isEvaluated() &&
       this._isSorted() &&
-      !this._moving(performance.now()) &&
-      width === this.canvas.width &&
-      height === this.canvas.height
+      !this._moving(now) &&
+      this._isSized(this._size(now))
     );
   }
 
@@ -516,13 +514,15 @@ export class Player extends Clip {
     return [side(clientWidth), side(clientHeight)];
   }
 
+  /** Whether the canvas has this size. @param {[number, number]} size */
+  _isSized([width, height]) {
+    return width === this.canvas.width && height === this.canvas.height;
+  }
+
   /** Draws, and records when that is done. @param {[number, number]} size */
-  async _show([width, height]) {
+  async _show(size) {
     const gpu = /** @type {Gpu} */ (this._gpu);
-    if (this.canvas.width !== width || this.canvas.height !== height) {
-      this.canvas.width = width;
-      this.canvas.height = height;
-    }
+    if (!this._isSized(size)) [this.canvas.width, this.canvas.height] = size;
     const opened = this._started;
     const started = performance.now();
     const alone = !this._evaluating;

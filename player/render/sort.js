@@ -103,26 +103,17 @@ export class DepthSort {
       depths[i] = depth; // positive: its bits rise with it
       first[count++] = i;
     }
-    // descending, hence the complement
-    counts.fill(0);
-    for (let i = 0; i < count; i++) counts[~keys[first[i]] & 0xffff]++;
-    accumulate(counts);
-    for (let i = 0; i < count; i++) second[counts[~keys[first[i]] & 0xffff]++] = first[i];
-    counts.fill(0);
-    for (let i = 0; i < count; i++) counts[~keys[second[i]] >>> 16]++;
-    accumulate(counts);
     const out = new Uint32Array(count);
-    for (let i = 0; i < count; i++) out[counts[~keys[second[i]] >>> 16]++] = second[i];
+    for (const shift of [0, 16]) {
+      const [from, to] = shift ? [second, out] : [first, second];
+      counts.fill(0);
+      for (let i = 0; i < count; i++) counts[(~keys[from[i]] >>> shift) & 0xffff]++; // descending, hence the complement
+      for (let k = 0, place = 0; k < HALF; k++) {
+        place += counts[k];
+        counts[k] = place - counts[k];
+      }
+      for (let i = 0; i < count; i++) to[counts[(~keys[from[i]] >>> shift) & 0xffff]++] = from[i];
+    }
     return out;
-  }
-}
-
-/** Counts to places, in place. @param {Uint32Array} counts */
-function accumulate(counts) {
-  let sum = 0;
-  for (let i = 0; i < counts.length; i++) {
-    const n = counts[i];
-    counts[i] = sum;
-    sum += n;
   }
 }
