@@ -2,7 +2,7 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 
 import { DecodeError, decode, hashes, openStream } from "../decode/index.js";
-import { readVector, readVectors, same } from "../testing/vectors.mjs";
+import { endsOf, readVector, readVectors, same } from "../testing/vectors.mjs";
 /** @import { Scene } from "../decode/index.js" */
 
 const VECTORS = readVectors();
@@ -150,7 +150,7 @@ test("maxLayer is a number of 0 or more", () => {
 test("a stream raises its fault again at every call, and continues after rewind", () => {
   const bytes = readVector("valid/layers-0-1-2");
   const stream = openStream();
-  const ends = openEnds(bytes);
+  const ends = endsOf(bytes);
   assert.deepEqual(ends.map(({ layer }) => layer), [0, 1, 2]);
   assert.equal(ends[2].end, bytes.length);
   const damaged = bytes.slice();
@@ -168,7 +168,7 @@ test("a stream raises its fault again at every call, and continues after rewind"
 
 test("earlier scenes do not change as later layers arrive", () => {
   const bytes = readVector("valid/layers-0-1-2");
-  const [{ end }] = openEnds(bytes);
+  const [{ end }] = endsOf(bytes);
   const stream = openStream();
   const [first] = stream.feed(bytes.subarray(0, end));
   const kept = structuredClone(first);
@@ -176,17 +176,9 @@ test("earlier scenes do not change as later layers arrive", () => {
   assert.ok(same(first, kept));
 });
 
-/** @param {Uint8Array} bytes */
-function openEnds(bytes) {
-  const stream = openStream();
-  stream.feed(bytes);
-  assert.ok(stream.complete && stream.consumed === bytes.length);
-  return stream.layerEnds;
-}
-
 test("bytes behind the last requested layer are not read", () => {
   const bytes = readVector("valid/layers-0-1-2");
-  const end = openEnds(bytes)[0].end;
+  const end = endsOf(bytes)[0].end;
   const damaged = bytes.slice();
   damaged.fill(255, end);
   assert.ok(same(decode(damaged, { maxLayer: 0 }), decode(bytes, { maxLayer: 0 })));

@@ -4,17 +4,13 @@ import assert from "node:assert/strict";
 import { createServer } from "node:http";
 import { after, test } from "node:test";
 
-import { decode, openStream } from "../decode/index.js";
+import { decode } from "../decode/index.js";
 import { SceneSource } from "../decode/fetch.js";
-import { readVector, same } from "../testing/vectors.mjs";
+import { endsOf, readVector, same } from "../testing/vectors.mjs";
 
 const BYTES = readVector("valid/layers-0-1-2");
 const OTHER = readVector("valid/layers-0-1");
-const ENDS = (() => {
-  const stream = openStream();
-  stream.feed(BYTES);
-  return stream.layerEnds.map(({ end }) => end);
-})();
+const ENDS = endsOf(BYTES).map(({ end }) => end);
 
 /**
  * A server of one file. What it does for request i, counted from 0, is behave(i): `bytes` of the file, cut after `cut`
@@ -28,8 +24,9 @@ const ENDS = (() => {
 const servers = [];
 after(() => servers.forEach((server) => server.closeAllConnections()));
 
-/** @param {(i: number) => Act} behave */
-async function serving(behave) {
+/** A server, and a source of its file. @param {(i: number) => Act} [behave]
+ * @param {import("../decode/fetch.js").SourceOptions} [options] */
+async function serving(behave = () => ({}), options = {}) {
   /** @type {{range: string | undefined, ifRange: string | undefined}[]} */
   const asked = [];
   const server = createServer((request, response) => {
@@ -59,7 +56,8 @@ async function serving(behave) {
   await new Promise((resolve) => server.listen(0, "127.0.0.1", () => resolve(undefined)));
   server.unref();
   const { port } = /** @type {import("node:net").AddressInfo} */ (server.address());
-  return { url: `http://127.0.0.1:${port}/scene.pd4`, asked };
+  const url = `http://127.0.0.1:${port}/scene.pd4`;
+  return { asked, source: new SceneSource(url, { pause: 0.01, stall: 5, ...options }) };
 }
 
 /** @param {SceneSource} source @param {import("../decode/fetch.js").Budget} [budget] */
@@ -83,11 +81,8 @@ async function before(source, error) {
 /** @param {import("../decode/index.js").Scene[]} scenes */
 const layersOf = (scenes) => scenes.map(({ layers }) => layers);
 
-const OPTIONS = { pause: 0.01, stall: 5 };
-
 test("one request gives every layer", async () => {
-  const { url, asked } = await serving(() => ({}));
-  const source = new SceneSource(url, OPTIONS);
+  const { source, asked } = await serving();
   const scenes = await all(source);
   assert.deepEqual(layersOf(scenes), [[0], [0, 1], [0, 1, 2]]);
   assert.ok(same(scenes[2], decode(BYTES)));
@@ -97,8 +92,7 @@ test("one request gives every layer", async () => {
 
 test("a budget of layers or bytes stops, and a later call continues", async () => {
   for (const budget of [{ maxLayer: 0 }, { bytes: ENDS[0] }, { bytes: ENDS[1] - 1 }]) {
-    const { url, asked } = await serving(() => ({}));
-    const source = new SceneSource(url, OPTIONS);
+    const { source, asked } = await serving();
     assert.deepEqual(layersOf(await all(source, budget)), [[0]]);
     assert.equal(source.received, ENDS[0], "nothing behind the layer is decoded or counted");
     const rest = await all(source);
@@ -111,15 +105,14 @@ test("a budget of layers or bytes stops, and a later call continues", async () =
 });
 
 test("a budget too small for layer 0 yields nothing", async () => {
-  const { url } = await serving(() => ({}));
-  assert.deepEqual(await all(new SceneSource(url, OPTIONS), { bytes: ENDS[0] - 1 }), []);
-  assert.deepEqual(await all(new SceneSource(url, OPTIONS), { seconds: 0 }), []);
+  for (const budget of [{ bytes: ENDS[0] - 1 }, { seconds: 0 }]) {
+    assert.deepEqual(await all((await serving()).source, budget), []);
+  }
 });
 
 test("a download resumes after a cut anywhere, and requests no byte twice", async () => {
   for (const cut of [5, 30, 300, ENDS[0], ENDS[1] + 3]) {
-    const { url, asked } = await serving((i) => (i < 2 ? { cut } : {}));
-    const source = new SceneSource(url, OPTIONS);
+    const { source, asked } = await serving((i) => (i < 2 ? { cut } : {}));
     const scenes = await all(source);
     assert.ok(same(scenes[scenes.length - 1], decode(BYTES)));
     assert.equal(scenes.length, 3);
@@ -130,23 +123,20 @@ test("a download resumes after a cut anywhere, and requests no byte twice", asyn
 });
 
 test("a stalled connection counts as cut", async () => {
-  const { url, asked } = await serving((i) => (i === 0 ? { cut: 400, hang: true } : {}));
-  const source = new SceneSource(url, { ...OPTIONS, stall: 0.2 });
+  const { source, asked } = await serving((i) => (i === 0 ? { cut: 400, hang: true } : {}), { stall: 0.2 });
   assert.equal((await all(source)).length, 3);
   assert.deepEqual([asked.length, source.cuts], [2, 1]);
 });
 
 test("a server without ranges sends the same file again, whose known bytes are skipped", async () => {
-  const { url, asked } = await serving((i) => (i === 0 ? { cut: ENDS[0] + 5, ranges: false } : { ranges: false }));
-  const source = new SceneSource(url, OPTIONS);
+  const { source, asked } = await serving((i) => (i === 0 ? { cut: ENDS[0] + 5, ranges: false } : { ranges: false }));
   assert.deepEqual(layersOf(await all(source)), [[0], [0, 1], [0, 1, 2]]);
   assert.deepEqual([asked.length, source.changes], [2, 0]);
 });
 
 test("a changed file restarts with its layer 0", async () => {
   for (const ranges of [true, false]) {
-    const { url } = await serving((i) => (i === 0 ? { cut: ENDS[0] + 5 } : { bytes: OTHER, tag: '"b"', ranges }));
-    const source = new SceneSource(url, OPTIONS);
+    const { source } = await serving((i) => (i === 0 ? { cut: ENDS[0] + 5 } : { bytes: OTHER, tag: '"b"', ranges }));
     const scenes = await all(source);
     assert.deepEqual(layersOf(scenes), [[0], [0], [0, 1]]);
     assert.ok(same(scenes[2], decode(OTHER)));
@@ -155,58 +145,56 @@ test("a changed file restarts with its layer 0", async () => {
 });
 
 test("without a validator a cut file is fetched anew", async () => {
-  const { url, asked } = await serving((i) => (i === 0 ? { cut: 400, tag: null } : { tag: null }));
-  assert.equal((await all(new SceneSource(url, OPTIONS))).length, 3);
+  const { source, asked } = await serving((i) => (i === 0 ? { cut: 400, tag: null } : { tag: null }));
+  assert.equal((await all(source)).length, 3);
   assert.equal(asked[1].range, undefined);
 });
 
 test("a file that changes at every request is given up", async () => {
-  const { url } = await serving((i) => ({ cut: 400, tag: `"${i}"` }));
-  await assert.rejects(all(new SceneSource(url, OPTIONS)), { name: "FetchError", message: /changed/ });
+  const { source } = await serving((i) => ({ cut: 400, tag: `"${i}"` }));
+  await assert.rejects(all(source), { name: "FetchError", message: /changed/ });
 });
 
 test("a damaged layer is fetched once more, and is an error the second time", async () => {
   const damaged = BYTES.slice();
   damaged[ENDS[1] - 30] ^= 1;
-  const { url, asked } = await serving((i) => (i === 0 ? { bytes: damaged } : {}));
-  const scenes = await all(new SceneSource(url, OPTIONS));
+  const { source, asked } = await serving((i) => (i === 0 ? { bytes: damaged } : {}));
+  const scenes = await all(source);
   assert.deepEqual(layersOf(scenes), [[0], [0, 1], [0, 1, 2]]);
   assert.ok(same(scenes[2], decode(BYTES)));
   assert.equal(asked[1].range, `bytes=${ENDS[0]}-`);
   const always = await serving(() => ({ bytes: damaged }));
   const fault = { kind: "ChecksumMismatch", chunk: 1 };
-  assert.deepEqual(await before(new SceneSource(always.url, OPTIONS), fault), [[0]]);
+  assert.deepEqual(await before(always.source, fault), [[0]]);
   assert.equal(always.asked.length, 2);
 });
 
 test("a file of another type is refused at its first bytes", async () => {
   const bytes = new TextEncoder().encode("<!doctype html>" + "x".repeat(1 << 16));
-  const { url, asked } = await serving(() => ({ bytes }));
-  await assert.rejects(all(new SceneSource(url, OPTIONS)), { kind: "BadSignature" });
+  const { source, asked } = await serving(() => ({ bytes }));
+  await assert.rejects(all(source), { kind: "BadSignature" });
   assert.equal(asked.length, 1);
 });
 
 test("a file that ends within a layer is Truncated", async () => {
-  const short = BYTES.subarray(0, ENDS[1] - 7);
-  const { url } = await serving(() => ({ bytes: short }));
-  assert.deepEqual(await before(new SceneSource(url, OPTIONS), { kind: "Truncated" }), [[0]]);
+  const { source } = await serving(() => ({ bytes: BYTES.subarray(0, ENDS[1] - 7) }));
+  assert.deepEqual(await before(source, { kind: "Truncated" }), [[0]]);
 });
 
 test("temporary status codes are tried again, others are final, and a dead server is given up", async () => {
   const passing = await serving((i) => (i < 2 ? { status: 503 } : {}));
-  assert.equal((await all(new SceneSource(passing.url, OPTIONS))).length, 3);
+  assert.equal((await all(passing.source)).length, 3);
   const gone = await serving(() => ({ status: 404 }));
-  await assert.rejects(all(new SceneSource(gone.url, OPTIONS)), /404/);
+  await assert.rejects(all(gone.source), /404/);
   assert.equal(gone.asked.length, 1);
-  const dead = await serving(() => ({ status: 500 }));
-  await assert.rejects(all(new SceneSource(dead.url, { ...OPTIONS, attempts: 3 })), { name: "FetchError" });
+  const dead = await serving(() => ({ status: 500 }), { attempts: 3 });
+  await assert.rejects(all(dead.source), { name: "FetchError" });
   assert.equal(dead.asked.length, 3);
 });
 
 test("an abort raises the signal's reason, before and during the download", async () => {
-  const { url } = await serving(() => ({ cut: ENDS[0] + 5, hang: true }));
   const controller = new AbortController();
-  const source = new SceneSource(url, { ...OPTIONS, signal: controller.signal });
+  const { source } = await serving(() => ({ cut: ENDS[0] + 5, hang: true }), { signal: controller.signal });
   const reason = new Error("enough");
   const run = async () => {
     for await (const { layers } of source.scenes()) {
@@ -219,8 +207,7 @@ test("an abort raises the signal's reason, before and during the download", asyn
 });
 
 test("after the seconds of a budget, a later call continues", async () => {
-  const { url, asked } = await serving((i) => (i === 0 ? { cut: ENDS[0] + 5, hang: true } : {}));
-  const source = new SceneSource(url, OPTIONS);
+  const { source, asked } = await serving((i) => (i === 0 ? { cut: ENDS[0] + 5, hang: true } : {}));
   assert.deepEqual(layersOf(await all(source, { seconds: 0.5 })), [[0]]);
   assert.equal(source.received, ENDS[0] + 5);
   assert.equal((await all(source)).length, 2);
@@ -228,10 +215,10 @@ test("after the seconds of a budget, a later call continues", async () => {
 });
 
 test("progress is told as bytes arrive", async () => {
-  const { url } = await serving(() => ({}));
   /** @type {[number, number | null][]} */
   const told = [];
-  await all(new SceneSource(url, { ...OPTIONS, progress: (...figures) => void told.push(figures) }));
+  const { source } = await serving(undefined, { progress: (...figures) => void told.push(figures) });
+  await all(source);
   assert.deepEqual(told[told.length - 1], [BYTES.length, BYTES.length]);
   told.forEach(([received], i) => assert.ok(!i || received > told[i - 1][0]));
 });

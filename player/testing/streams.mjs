@@ -6,8 +6,9 @@
 
 import { readFileSync } from "node:fs";
 
-import { decode, openStream } from "../decode/index.js";
+import { decode } from "../decode/index.js";
 import { every, fed, fetched, least, working } from "./splits.js";
+import { endsOf } from "./vectors.mjs";
 /** @import { Scene } from "../decode/index.js" */
 
 const [, , file, way, size, url] = process.argv;
@@ -26,9 +27,7 @@ function held(scenes) {
 }
 
 async function splits() {
-  const probe = openStream();
-  probe.feed(bytes);
-  const ends = probe.layerEnds.map(({ end }) => end);
+  const ends = endsOf(bytes).map(({ end }) => end);
   const ways = {
     whole: () => fed(bytes, []),
     slices: () => fed(bytes, ends),

@@ -1,6 +1,9 @@
 // The conformance vectors, with the results of an ans-only decoder.
 
+import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
+
+import { openStream } from "../decode/index.js";
 
 const FOLDER = new URL("../../spec/vectors/", import.meta.url);
 
@@ -35,6 +38,14 @@ export function readVectors() {
 /** One vector's bytes. @param {string} name without the ending */
 export function readVector(name) {
   return new Uint8Array(readFileSync(new URL(`${name}.pd4`, FOLDER)));
+}
+
+/** Each slice's layer with its end in a whole file. @param {Uint8Array} bytes */
+export function endsOf(bytes) {
+  const stream = openStream();
+  stream.feed(bytes);
+  assert.ok(stream.complete && stream.consumed === bytes.length);
+  return stream.layerEnds;
 }
 
 /** An address of these bytes. @param {Uint8Array} bytes */
