@@ -68,7 +68,7 @@ def taken(page: Any, at: str, files: str, scene: Scene, camera: Camera, time: fl
     state |= {"viewmat": camera.viewmat.ravel().tolist(), "K": camera.K.ravel().tolist()}
     look = supersplat(scene, camera) | {"still": f"{files}still.ply"}
     for name in browser.VIEWERS:
-        page.goto(f"{at}test-browser/viewer.html?{name}")
+        page.goto(f"{at}test-browser/harness.html?{name}")
         page.wait_for_function("!!window.harness")
         browser.call(page, "harness.open", source, *size, look)
         browser.call(page, "harness.show" if name == "supersplat" else "harness.shoot", state)

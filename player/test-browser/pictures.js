@@ -1,5 +1,13 @@
 // What the harnesses share.
 
+/** A package that TypeScript need not find. @param {string} name */
+export const load = (name) => import(name);
+
+/** A camera from a message. @param {{viewmat: number[], K: number[], width: number, height: number}} of */
+export function cameraOf({ viewmat, K, width, height }) {
+  return { viewmat: new Float32Array(viewmat), K: new Float32Array(K), width, height };
+}
+
 /** What a canvas shows, as base64 of its RGBA bytes: in the task that draws it. @param {HTMLCanvasElement} canvas */
 export function pictureOf(canvas) {
   const picture = new OffscreenCanvas(canvas.width, canvas.height).getContext("2d");

@@ -3,17 +3,13 @@
 import * as pc from "playcanvas";
 
 import { Pd4 } from "../playcanvas.js";
-import { pictureOf } from "./pictures.js";
+import { cameraOf, pictureOf } from "./pictures.js";
 
 /** app, camera, script, canvas: while a scene is open. @type {any} */
 const harness = { open, shoot, close };
 Object.assign(window, { harness });
 
-/**
- * A scene in PlayCanvas on a canvas of some size.
- *
- * @param {string} url @param {number} width @param {number} height
- */
+/** A scene in PlayCanvas on a canvas of some size. @param {string} url @param {number} width @param {number} height */
 async function open(url, width, height) {
   close();
   const canvas = document.createElement("canvas");
@@ -50,11 +46,11 @@ async function open(url, width, height) {
  *
  * @param {{level: number, seconds: number, viewmat: number[], K: number[], width: number, height: number}} state
  */
-async function shoot({ level, seconds, viewmat, K, width, height }) {
+async function shoot({ level, seconds, ...view }) {
   const { app, camera, script, canvas } = harness;
   script.maxLayer = level;
   script.playback.time = seconds;
-  script.lookThrough(camera, { viewmat: new Float32Array(viewmat), K: new Float32Array(K), width, height });
+  script.lookThrough(camera, cameraOf(view));
   const frame = () => new Promise((resolve) => app.once("frameend", resolve));
   let sorted = false;
   const handle = app.scene.on("gsplat:sorted", () => (sorted = true));

@@ -1,21 +1,15 @@
 // What the test of the adapter to Spark calls: `window.harness`. three.js and Spark come from the page's import map.
 
 import { Pd4Splats, SPARK_SETTINGS } from "../spark.js";
-import { pictureOf } from "./pictures.js";
+import { cameraOf, load, pictureOf } from "./pictures.js";
 
-/** @param {string} name */
-const load = (name) => import(name); // without a type: TypeScript need not find the package
 const [THREE, spark] = await Promise.all(["three", "@sparkjsdev/spark"].map(load));
 
 /** @type {any} */
 let shown = null;
 Object.assign(window, { harness: { open, shoot, close } });
 
-/**
- * A scene in Spark on a canvas of some size.
- *
- * @param {string} url @param {number} width @param {number} height
- */
+/** A scene in Spark on a canvas of some size. @param {string} url @param {number} width @param {number} height */
 async function open(url, width, height) {
   close();
   const renderer = new THREE.WebGLRenderer({ antialias: false, preserveDrawingBuffer: true });
@@ -27,7 +21,7 @@ async function open(url, width, height) {
   scene.background = splats.background;
   const sparkRenderer = new spark.SparkRenderer({ renderer, autoUpdate: false, ...SPARK_SETTINGS });
   scene.add(sparkRenderer, splats.mesh);
-  shown = { renderer, scene, splats, sparkRenderer, camera: new THREE.PerspectiveCamera(), width, height };
+  shown = { renderer, scene, splats, sparkRenderer, camera: new THREE.PerspectiveCamera() };
   await new Promise((resolve) => splats.addEventListener("loaded", resolve));
 }
 
@@ -36,12 +30,11 @@ async function open(url, width, height) {
  *
  * @param {{level: number, seconds: number, viewmat: number[], K: number[], width: number, height: number}} state
  */
-async function shoot({ level, seconds, viewmat, K, width, height }) {
+async function shoot({ level, seconds, ...view }) {
   const { renderer, scene, splats, sparkRenderer, camera } = shown;
-  const view = { viewmat: new Float32Array(viewmat), K: new Float32Array(K), width, height };
   splats.level = level;
   splats.time = seconds;
-  splats.lookThrough(camera, width, height, view);
+  splats.lookThrough(camera, view.width, view.height, cameraOf(view));
   splats.update(camera);
   while (!splats.settled) await new Promise((resolve) => setTimeout(resolve, 5));
   scene.updateMatrixWorld();

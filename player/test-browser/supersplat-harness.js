@@ -3,9 +3,8 @@
 import { Entity, Mat4 } from "playcanvas";
 
 import { Pd4 } from "../playcanvas.js";
+import { load } from "./pictures.js";
 
-/** @param {string} name */
-const load = (name) => import(name); // without a type: TypeScript need not find the package
 const [{ createViewer }, { defaultSettings }] = await Promise.all(
   ["viewer", "settings"].map((name) => load(`@playcanvas/supersplat-viewer/${name}.js`)),
 );

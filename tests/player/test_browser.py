@@ -169,7 +169,7 @@ def _opened(context: Any) -> tuple[Any, list[str]]:
 
 
 def _load_harness(page: Any, server: Server) -> Any:
-    page.goto(server.url_of("player/test-browser/harness.html"))
+    page.goto(server.url_of("player/test-browser/harness.html") + "?player")
     page.wait_for_function("!!window.harness")
     return page
 
@@ -288,7 +288,7 @@ def viewer(page: Any, repository: Server, name: str) -> None:
         check_packages(name)
     except DataError as error:
         pytest.skip(str(error))
-    page.goto(f"{repository.url_of('player/test-browser/viewer.html')}?{name}")
+    page.goto(f"{repository.url_of('player/test-browser/harness.html')}?{name}")
     page.wait_for_function("!!window.harness")
 
 

@@ -6,7 +6,7 @@ import { evaluate } from "../render/evaluate.js";
 import { GpuEvaluator } from "../render/evaluator.js";
 import { Gpu } from "../render/gl.js";
 import { ANCHOR_BITS, listGaussians, NO_ENTRY } from "../render/sort.js";
-import { base64 } from "./pictures.js";
+import { base64, cameraOf } from "./pictures.js";
 
 /** Columns of a Gaussian's record. */
 const QUANTITIES = { mean: [0, 1, 2], opacity: [3], scale: [4, 5, 6], quaternion: [8, 9, 10, 11], color: [12, 13, 14] };
@@ -89,7 +89,7 @@ Object.assign(window, { harness });
 async function open(url, width, height, options = {}) {
   close();
   const canvas = document.createElement("canvas");
-  Object.assign(canvas.style, { width: `${width}px`, height: `${height}px`, display: "block" });
+  Object.assign(canvas.style, { width: `${width}px`, height: `${height}px` });
   document.body.append(canvas);
   const made = new Player(canvas, { degrade: false, pixelRatio: 1, ...options });
   harness.player = made;
@@ -114,7 +114,7 @@ async function shoot({ level, seconds, viewmat, K, width, height } = {}) {
   if (level !== undefined) player.level = level;
   if (seconds !== undefined) player.seek(seconds);
   if (viewmat && K && width && height) {
-    player.camera = { viewmat: new Float32Array(viewmat), K: new Float32Array(K), width, height };
+    player.camera = cameraOf({ viewmat, K, width, height });
   }
   await player.settled();
   return base64(player.snapshot().data);
