@@ -1,17 +1,8 @@
 // A script that plays a .pd4 in PlayCanvas (engine 2.23 or later) and in viewers that are made with it. The page's import
 // map, or its bundler, says where "playcanvas" is.
 
-import {
-  BoundingBox,
-  Color,
-  GSPLATDATA_LARGE,
-  GSplatContainer,
-  GSplatFormat,
-  Mat4,
-  PIXELFORMAT_RGBA32F,
-  Script,
-  Vec3,
-} from "playcanvas";
+import { BoundingBox, Color, Mat4, Script, Vec3 } from "playcanvas";
+import { GSPLATDATA_LARGE, GSplatContainer, GSplatFormat, PIXELFORMAT_RGBA32F } from "playcanvas";
 
 import { defaultCamera, fitted } from "./render/camera.js";
 import { Playback, poseOf } from "./render/playback.js";

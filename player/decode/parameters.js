@@ -4,18 +4,8 @@ import { limitExceeded, malformed } from "./errors.js";
 import { Fields, asInteger, asList, asRegistered, checkStep } from "./fields.js";
 import { channelCount } from "./header.js";
 import { headsOf } from "./heads.js";
-import {
-  INSTANTS,
-  MAX_CHANNELS,
-  MAX_FIELDS,
-  MAX_LINEAR_LAYERS,
-  MAX_PAYLOAD,
-  MAX_PLANE_CELLS,
-  MAX_ROWS,
-  MAX_SCALES,
-  MAX_SIDE,
-  MAX_WIDTH,
-} from "./limits.js";
+import { INSTANTS, MAX_CHANNELS, MAX_FIELDS, MAX_LINEAR_LAYERS, MAX_PAYLOAD } from "./limits.js";
+import { MAX_PLANE_CELLS, MAX_ROWS, MAX_SCALES, MAX_SIDE, MAX_WIDTH } from "./limits.js";
 import { unpack } from "./msgpack.js";
 import { PREDICTORS } from "./planes.js";
 import { PLANES } from "./scene.js";

@@ -28,10 +28,10 @@ class Chain {
     this._arena = arena;
     const last = network.length - 1;
     this._layers = network.map((layer, i) => arena.pack(layer, relu || i < last));
-    this._outs = this._layers.map((layer) => arena.take(BATCH * Arena.stride(layer)));
+    this._outs = this._layers.map((layer) => arena.take(BATCH * layer.stride));
     /** Where the rows of the result begin, and their distance. */
     this.out = this._outs[last];
-    this.stride = Arena.stride(this._layers[last]);
+    this.stride = this._layers[last].stride;
   }
 
   /** @param {number} rows at most BATCH @param {number} x where the first begins @param {number} stride */
@@ -39,7 +39,7 @@ class Chain {
     this._layers.forEach((layer, i) => {
       this._arena.linear(layer, rows, x, stride, this._outs[i]);
       x = this._outs[i];
-      stride = Arena.stride(layer);
+      stride = layer.stride;
     });
   }
 }

@@ -9,8 +9,9 @@ const PAGE_FLOATS = 1 << 14;
 
 /**
  * A layer in an arena. at: of its first float; per group of outputs their biases, then for each input their weights.
+ * stride: how far apart its rows of outputs are.
  *
- * @typedef {{at: number, inputs: number, groups: number, relu: boolean}} Packed
+ * @typedef {{at: number, inputs: number, groups: number, stride: number, relu: boolean}} Packed
  */
 
 /** Floats that both sides see; what was taken lasts until `reset`. */
@@ -61,12 +62,7 @@ export class Arena {
       this.floats[to] = bias[o];
       for (let i = 0; i < inputs; i++) this.floats[(to += GROUP)] = weight[o * inputs + i];
     }
-    return { at, inputs, groups, relu };
-  }
-
-  /** How far apart a layer's rows of outputs are. @param {Packed} layer */
-  static stride({ groups }) {
-    return groups * GROUP;
+    return { at, inputs, groups, stride: groups * GROUP, relu };
   }
 
   /**

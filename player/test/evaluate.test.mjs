@@ -37,11 +37,11 @@ for (const [inputs, outputs, rows, relu] of /** @type {[number, number, number, 
       arena.take(20_000); // more than a page of memory
       const packed = arena.pack(layer, relu);
       const x = arena.take(rows * stride);
-      const out = arena.take(rows * Arena.stride(packed) + 4);
+      const out = arena.take(rows * packed.stride + 4);
       arena.floats.set(numbers(rows * stride), x);
-      arena.floats.fill(7, out, out + rows * Arena.stride(packed) + 4);
+      arena.floats.fill(7, out, out + rows * packed.stride + 4);
       arena.linear(packed, rows, x, stride, out);
-      return { arena, values: arena.floats.slice(out, out + rows * Arena.stride(packed) + 4) };
+      return { arena, values: arena.floats.slice(out, out + rows * packed.stride + 4) };
     });
     assert.ok(fast.arena.fast && !plain.arena.fast);
     assert.ok(farthest(fast.values, plain.values) < 1e-6 * inputs);
