@@ -44,15 +44,15 @@ class Scaffold {
   constructor(gpu, network, features, firstBlock) {
     if (network.length !== 2) throw new TooLarge(`a network of ${network.length} layers, expected 2`);
     const [first, last] = network;
-    this.features = columns(first, 0, features);
+    this.features = inputsOf(first, features);
     this.firstBlock = firstBlock;
     this.blocks = blocksOf(first.outputs);
     /** Inputs that are the view direction: 3 or 0. */
     this.views = first.inputs - features;
-    const { weight } = columns(first, features, this.views);
     const data = new Float32Array(12 * this.blocks);
     for (let o = 0; o < first.outputs; o++) {
-      for (let k = 0; k < this.views; k++) data[((o >> 2) * 3 + k) * 4 + (o & 3)] = weight[3 * o + k];
+      const from = o * first.inputs + features;
+      for (let k = 0; k < this.views; k++) data[((o >> 2) * 3 + k) * 4 + (o & 3)] = first.weight[from + k];
     }
     /** The weights of the direction. */
     this.direction = gpu.uniforms(data);
@@ -73,12 +73,10 @@ class Scaffold {
   }
 }
 
-/** The layer for some of its inputs. @param {Network[number]} layer @param {number} start @param {number} count */
-function columns({ weight, bias, inputs, outputs }, start, count) {
+/** The layer for the first of its inputs. @param {Network[number]} layer @param {number} count */
+function inputsOf({ weight, bias, inputs, outputs }, count) {
   const out = new Float32Array(outputs * count);
-  for (let o = 0; o < outputs; o++) {
-    out.set(weight.subarray(o * inputs + start, o * inputs + start + count), o * count);
-  }
+  for (let o = 0; o < outputs; o++) out.set(weight.subarray(o * inputs, o * inputs + count), o * count);
   return { weight: out, bias, inputs: count, outputs };
 }
 
@@ -212,12 +210,13 @@ void main() {
     return rest;
   }
 
-  /** Last layers of shape and colour, one chunk per slot: (v 0..2, 0), v 3..6, (w, 0). */
+  /** Last layers of shape and colour, one chunk per slot: v 0..3, v 3..6, w 0..3. */
   _uploadShapes() {
     const gpu = this._gpu;
     const { last: covariance } = this._covariance;
     const { last: color } = this._color;
-    const shapeBytes = 2 * (16 + 64 * blocksOf(covariance.inputs));
+    const blockFloats = 4 + 16 * blocksOf(covariance.inputs);
+    const shapeBytes = 8 * blockFloats;
     const colorBytes = 16 + 64 * blocksOf(color.inputs);
     /** @param {number} bytes */
     const align = (bytes) => Math.ceil(bytes / gpu.uniformAlignment) * gpu.uniformAlignment;
@@ -227,9 +226,9 @@ void main() {
     const data = new Float32Array((stride * this._slots) / 4);
     for (let i = 0; i < this._slots; i++) {
       const at = (stride * i) / 4;
-      const shape = stack([rowsOf(covariance, 7 * i, 3), rowsOf(covariance, 7 * i + 3, 4)]);
-      pack(shape, 0, 2, data.subarray(at, at + shapeBytes / 4));
-      pack(rowsOf(color, 3 * i, 3), 0, 1, data.subarray(at + colorAt / 4, at + (colorAt + colorBytes) / 4));
+      pack(covariance, 7 * i, 1, data.subarray(at));
+      pack(covariance, 7 * i + 3, 1, data.subarray(at + blockFloats));
+      pack(color, 3 * i, 1, data.subarray(at + colorAt / 4));
     }
     return { buffer: gpu.uniforms(data), stride, shapeBytes, colorAt, colorBytes };
   }
@@ -383,7 +382,7 @@ ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i} * vec4(greaterThanEqual(y${
   _shapeSource() {
     const K = this._covariance.blocks;
     return `${targets(SPLAT_BLOCKS) + this._listedSource() + this._covariance.declare(1)}
-layout(std140) uniform U3 { vec4 b3[2]; mat4 w3[${2 * K}]; };
+layout(std140) uniform U3 { vec4 vb; mat4 vw[${K}]; vec4 qb; mat4 qw[${K}]; };
 uniform sampler2DArray opacities;
 uniform sampler2D codes;
 void main() {
@@ -401,8 +400,8 @@ void main() {
   if (!(opacity > 0.)) return;
   vec3 d = directionTo(p);
 ${this._covariance.compute(1, "x")}
-  vec4 v = b3[0], q = b3[1];
-${repeat(K, (k) => `v += w3[${k}] * x${k}; q += w3[${K + k}] * x${k};`)}
+  vec4 v = vb, q = qb;
+${repeat(K, (k) => `v += vw[${k}] * x${k}; q += qw[${k}] * x${k};`)}
   float gate = texelFetch(codes, p, 0).r;
   float n = length(q);
   out0 = vec4(mean, opacity * gate);
@@ -451,15 +450,5 @@ ${repeat(L, (k) => `w += w4[${k}] * c${k};`)}
     this._gpu.free(this._first.buffer, this._opacityLast.buffer, this._shapes.buffer);
     this._gpu.free(...[this._opacity, this._covariance, this._color].map(({ direction }) => direction));
   }
-}
-
-/** Some outputs of a layer. @param {Network[number]} layer @param {number} first @param {number} count */
-function rowsOf({ weight, bias, inputs }, first, count) {
-  return {
-    weight: weight.subarray(first * inputs, (first + count) * inputs),
-    bias: bias.subarray(first, first + count),
-    inputs,
-    outputs: count,
-  };
 }
 
