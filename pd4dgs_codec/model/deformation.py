@@ -21,6 +21,9 @@ from pd4dgs_codec.model.config import DeformationConfig
 from pd4dgs_codec.model.hexplane import HexPlane
 from pd4dgs_codec.model.networks import MLP, rounded
 
+#: Heads that change what Gaussians look like, as prefixes of the names of their parameters; the others move them.
+APPEARANCE = ("heads.feature", "heads.scaling")
+
 
 class DeformationField(nn.Module):
     """Computes residuals at points and a time. The heads start at zero, so a fresh field changes nothing.
@@ -80,6 +83,10 @@ class DeformationField(nn.Module):
     def weights(self) -> list[nn.Parameter]:
         """The parameters but the planes, quantised in the step of weights."""
         return [*self.trunk.parameters(), *self.heads.parameters()]
+
+    def motion_parameters(self) -> list[nn.Parameter]:
+        """The parameters but those of the heads that change what Gaussians look like."""
+        return [p for name, p in self.named_parameters() if not name.startswith(APPEARANCE)]
 
     def head_layer(self, head: str) -> nn.Linear | None:
         """Returns the linear layer whose output is the residual `head`, or None if the field lacks it."""

@@ -174,7 +174,7 @@ class Learner(TrainState):
                 parameter.grad = torch.zeros_like(parameter)
             parameter.grad.add_(gradient.to(parameter.device), alpha=share)
         if level and self.guiding:
-            self.optimiser.keep_gradients(self.model.deformations.values())
+            self.optimiser.keep_gradients({p for f in self.model.deformations.values() for p in f.motion_parameters()})
         record["loss"] = float(loss.detach()) + rest.loss
         record |= {name: float(value.detach()) for name, value in terms.items()} | rest.terms
         return picture

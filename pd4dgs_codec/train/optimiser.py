@@ -7,7 +7,7 @@ a second.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Set
 from typing import Any
 
 import torch
@@ -85,9 +85,8 @@ class Optimiser:
             if g is not None:
                 p.grad = g if p.grad is None else p.grad.add_(g)
 
-    def keep_gradients(self, modules: Iterable[nn.Module]) -> None:
-        """Removes the gradients of all parameters outside `modules`."""
-        kept = {p for module in modules for p in module.parameters()}
+    def keep_gradients(self, kept: Set[nn.Parameter]) -> None:
+        """Removes the gradients of all parameters but those."""
         for p in self.parameters:
             if p not in kept:
                 p.grad = None

@@ -175,8 +175,8 @@ class TrainState:
 
     @property
     def guiding(self) -> bool:
-        """Whether only the deformations learn from motion at this step."""
-        return self.guided and self.schedule.guidance(self.position) > 0
+        """Whether pictures of motion train nothing but motion at this step."""
+        return self.guided and self.schedule.attraction(self.position, guided=True) > 0
 
     def rounding(self, *, noisy: bool = True) -> Rounding:
         """How the steps at this position simulate quantisation; without noise if not `noisy`."""

@@ -29,8 +29,10 @@ from pd4dgs_codec.train import phases, workers
 from pd4dgs_codec.train.phases.levels import images, other_views
 from pd4dgs_codec.train.state import TrainState
 
-#: Weight of the loss term, times `Schedule.guidance`.
-WEIGHT = 0.4
+#: Weight of the loss term, times `Schedule.attraction`; the instants that a step matches, and the points of the key
+#: instant that it matches with each. True: if points guide the run (`TrainState.guided`).
+WEIGHT = {False: 0.4, True: 2.0}
+SAMPLES = {False: (1, 600), True: (8, 150)}
 #: Training views that are searched at most; more views are searched in groups of three, evenly spread.
 MOST_VIEWS = 240
 #: Pixels of a view that are searched, at random, and depths on the ray of each.
@@ -44,12 +46,13 @@ MOVED, CONSISTENT, AMBIGUOUS = 0.12, 0.16, 0.3
 ELSEWHERE = 1.0
 #: If fewer of the pixels have a point, the camera moves too little between views for their depths to be trusted.
 LEAST_FOUND = 1 / 6
-#: Points of the key instant are those of KEY_VIEWS views around it. A step matches SAMPLE of them.
-KEY_VIEWS, SAMPLE = 5, 600
+#: Points of the key instant are those of KEY_VIEWS views around it.
+KEY_VIEWS = 5
 #: A match has the least distance, to which a difference in colour adds COLOUR_WEIGHT times. It attracts if the colours
-#: differ by at most SAME_COLOUR and, if other bodies may be nearer than the right one (not `TrainState.guided`), the
-#: distance is at most REACH. Distances are in units of the deformation, colour differences are means over RGB.
-COLOUR_WEIGHT, SAME_COLOUR, REACH = 4.0, 0.1, 0.8
+#: differ by at most SAME_COLOUR and the distance is at most REACH: unless points guide the run, other bodies may be
+#: nearer than the right one. Distances are in units of the deformation, colour differences are means over RGB.
+COLOUR_WEIGHT, SAME_COLOUR = 4.0, 0.1
+REACH = {False: 0.8, True: math.inf}
 
 
 class Points(NamedTuple):
@@ -95,10 +98,10 @@ class Match(phases.Phase):
 
     def weight(self, state: TrainState) -> float:
         """The weight of `term` at this step."""
-        return WEIGHT * state.schedule.guidance(state.position)
+        return WEIGHT[state.guided] * state.schedule.attraction(state.position, guided=state.guided)
 
     def term(self, state: TrainState, level: int) -> Tensor | None:
-        """The `attraction` of points of the key instant that `level` moves to another instant; None if there are no
+        """The mean `attraction` of points of the key instant that `level` moves to other instants; None if there are no
         points, at level 0 and in trials. The points are dropped once the weight is 0."""
         key, generator = state.key, state.generator
         if self._instants and not self.weight(state):
@@ -108,9 +111,12 @@ class Match(phases.Phase):
         if self._here is None:
             nearest = sorted(self._instants, key=lambda points: abs(float(points.time[0]) - key))
             self._here = Points.joined(nearest[:KEY_VIEWS])
-        there = self._instants[int(torch.randint(len(self._instants), (), generator=generator))]
-        drawn = torch.randint(len(self._here.time), (SAMPLE,), generator=generator)
-        return attraction(state, level, self._here.at(drawn), there)
+        instants, sample = SAMPLES[state.guided]
+        pulls = []
+        for k in torch.randint(len(self._instants), (instants,), generator=generator).tolist():
+            drawn = torch.randint(len(self._here.time), (sample,), generator=generator)
+            pulls.append(attraction(state, level, self._here.at(drawn), self._instants[k]))
+        return torch.stack(pulls).mean()
 
     def _keep(self, found: Points) -> None:
         self._here = None
@@ -136,7 +142,7 @@ def attraction(state: TrainState, level: int, here: Points, there: Points) -> Te
         match = (torch.cdist(moved, place) + COLOUR_WEIGHT * contrast).argmin(1)
         alike = contrast.gather(1, match[:, None])[:, 0] <= SAME_COLOUR
     distance = (moved - place[match]).norm(dim=1)
-    near = distance.detach() <= (math.inf if state.guided else REACH)
+    near = distance.detach() <= REACH[state.guided]
     found: Tensor = (distance * (alike & near)).mean()
     return found
 
