@@ -16,8 +16,10 @@ RHO_DECAY = 0.95
 COARSE_SHARE = 1 / 10
 #: Share of a run with a key instant after which views of all times train motion, see `phases.opening`.
 OPENING_SHARE = 1 / 2
-#: Share of a run until which points attract what moves, and the same where they guide the run, see `phases.matching`.
-MATCHING_SHARE, GUIDED_SHARE = 0.35, 0.6
+#: Share of a run until which points attract what moves; True: if they guide the run, see `phases.matching`.
+MATCHING_SHARE = {False: 0.35, True: 0.5}
+#: Share of a run that points guide until which pictures of motion train motion alone.
+GUIDED_SHARE = 0.35
 #: Rounds in which anchors of little use are pruned; each anchor is a candidate in one round.
 PRUNING_ROUNDS = 4
 
@@ -61,8 +63,8 @@ class Schedule:
         return min(max((self.progress(iteration) - COARSE_SHARE) / (OPENING_SHARE - COARSE_SHARE), 0.0), 1.0)
 
     def attraction(self, iteration: int, *, guided: bool) -> float:
-        """Weight of the points that attract what moves, 1..0: falls from the start of a run to 0 at its end."""
-        return max(0.0, 1 - self.progress(iteration) / (GUIDED_SHARE if guided else MATCHING_SHARE))
+        """Weight of the points that attract what moves, 1..0: falls from the start of a run to 0 at MATCHING_SHARE."""
+        return max(0.0, 1 - self.progress(iteration) / MATCHING_SHARE[guided])
 
     def separation(self, iteration: int) -> float:
         """Progress of the masks' separation, 0..1, from the start of the mask terms to exact rounding."""

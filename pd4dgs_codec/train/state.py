@@ -20,7 +20,7 @@ from pd4dgs_codec.scene import MASK_THRESHOLD, instant
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.initialise import fresh_model
 from pd4dgs_codec.train.optimiser import PER_ANCHOR, Optimiser
-from pd4dgs_codec.train.schedule import Schedule, reduction
+from pd4dgs_codec.train.schedule import GUIDED_SHARE, Schedule, reduction
 from pd4dgs_codec.train.ssim import Part, pixel_weights, within_reach
 
 #: Bytes of images on the device, weights included, beyond which the least recently used are dropped.
@@ -176,7 +176,7 @@ class TrainState:
     @property
     def guiding(self) -> bool:
         """Whether pictures of motion train nothing but motion at this step."""
-        return self.guided and self.schedule.attraction(self.position, guided=True) > 0
+        return self.guided and self.schedule.progress(self.position) < GUIDED_SHARE
 
     def rounding(self, *, noisy: bool = True) -> Rounding:
         """How the steps at this position simulate quantisation; without noise if not `noisy`."""

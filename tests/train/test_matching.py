@@ -18,7 +18,7 @@ from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.loop import Trainer
 from pd4dgs_codec.train.phases import levels, matching, opening
 from pd4dgs_codec.train.phases.matching import Match, Points, attraction, moving_points
-from pd4dgs_codec.train.schedule import GUIDED_SHARE
+from pd4dgs_codec.train.schedule import MATCHING_SHARE
 
 WHOLE_TINY = PRESETS["tiny"]  # tests have a smaller one
 
@@ -128,7 +128,7 @@ def test_points_guide_higher_levels_until_the_end_of_the_term(dataset):
     while learner.iteration < 60:
         terms.append((learner.iteration, learner.step()))
     with_it = {at for at, record in terms if "match" in record}
-    assert with_it == {at for at, record in terms if record["level"] and at < GUIDED_SHARE * 60}
+    assert with_it == {at for at, record in terms if record["level"] and at < MATCHING_SHARE[True] * 60}
     assert with_it and not len(phase.points.time) and not learner.guiding
 
 
