@@ -7,9 +7,9 @@ coloring, 1997). The deformation moves the points of the key instant to another 
 similar colour attracts each (iterative closest points: Besl and McKay, A method for registration of 3-D shapes, 1992).
 Large surfaces slide along themselves in such matches, so the term ends early. `opening` finds steady motion better.
 
-If most of what the views show is elsewhere in level 0, pictures of levels 1 and 2 train the deformations alone while
-points guide them, and level 0 is trained near the key instant alone: bodies would otherwise fade before their motion is
-learnt. Where much stands still, it would learn too little from so few pictures.
+If most of what the views show is elsewhere in level 0, bodies would fade before their motion is learnt. Points then
+guide the run: matching is stronger and longer, pictures of levels 1 and 2 train motion alone at first, and level 0 is
+trained near the key instant alone. Where much stands still, it would learn too little from so few pictures.
 """
 
 from __future__ import annotations
