@@ -60,7 +60,7 @@ def measure(run: Run, scene: Scene) -> list[Row]:
     for seed in range(run.seeds):
         model, training = run.trained(scene, seed=seed)
         file = run.folder(scene) / ("scene.pd4" if seed == 0 else f"scene-{seed}.pd4")
-        told = {"scene": scene.name, "seed": seed, "minutes": training["seconds"] / 60, "steps": training["iterations"]}
+        told = {"scene": scene.name, "seed": seed, "minutes": training["seconds"] / 60}
         rows += [told | row for row in packed_levels(scene, model, file)]
         if seed == 0:
             rows[0]["curve"] = curve(model)
@@ -90,7 +90,7 @@ def monolith(run: Run, scene: Scene, longer: float = 1.0) -> Row:
     """The monolith after as many steps as our model: every tensor float32, all of it under LZMA, in one piece."""
     model, training = run.trained(scene, *MONOLITH, longer=longer)
     best = levels(scene, model)[-1] | {"bytes": monolithic_bytes(model), "level": "monolith"}
-    return {"scene": scene.name, "seed": 0, "minutes": training["seconds"] / 60, "steps": training["iterations"]} | best
+    return {"scene": scene.name, "seed": 0, "minutes": training["seconds"] / 60} | best
 
 
 def monolithic_bytes(path: Path) -> int:
@@ -161,7 +161,7 @@ def levels_table(rows: Sequence[Row], m: str) -> str:
     for (scene, level), found in groups.items():
         sizes = [row["bytes"] for row in found]
         moving = [row["moving_mpsnr"] for row in found if "moving_mpsnr" in row]
-        training = [number(found[0][key], digits) for key, digits in (("anchors", 0), ("steps", 0), ("minutes", 1))]
+        training = [number(found[0][key], digits) for key, digits in (("anchors", 0), ("minutes", 1))]
         cells.append(
             (scene, level, spread(sizes, 0), seconds_at(median(sizes)), spread([row[f"{m}psnr"] for row in found], 2))
             + ((spread(moving, 2),) if moves else ())
@@ -172,9 +172,9 @@ def levels_table(rows: Sequence[Row], m: str) -> str:
         family = [scene for scene in scenes if scene.split("-")[0] == name]
         for method, psnr, ssim, size in published if family else ():
             told = ("-", "-") if size is None else (number(1e6 * size, 0), seconds_at(1e6 * size))
-            cells.append((family[-1], method, *told, number(psnr), *["-"] * moves, number(ssim, 3), "-", "-", "-"))
+            cells.append((family[-1], method, *told, number(psnr), *["-"] * moves, number(ssim, 3), "-", "-"))
     cells.sort(key=lambda row: scenes.index(row[0]))
-    head = ["scene", "level", "bytes so far", "s at 2 Mbps", f"{m}PSNR dB", f"{m}SSIM", "anchors", "steps"]
+    head = ["scene", "level", "bytes so far", "s at 2 Mbps", f"{m}PSNR dB", f"{m}SSIM", "anchors"]
     if moves:
         head.insert(5, "moving dB")
     return table([*head, "training min"], cells)

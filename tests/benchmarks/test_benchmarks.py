@@ -184,7 +184,7 @@ def test_sections_whose_code_has_changed_are_named(tmp_path, monkeypatch):
 
 
 def test_several_seeds_are_shown_with_their_spread():
-    row = {"scene": "discs", "level": 0, "mssim": 0.9, "anchors": 7, "steps": 9, "minutes": 1.0}
+    row = {"scene": "discs", "level": 0, "mssim": 0.9, "anchors": 7, "minutes": 1.0}
     rows = [
         row | {"seed": i, "bytes": n, "mpsnr": db}
         for i, (n, db) in enumerate([(1000, 20.0), (1200, 21.0), (900, 23.0)])
@@ -198,7 +198,7 @@ def test_several_seeds_are_shown_with_their_spread():
 
 def test_official_scenes_stand_beside_what_is_published():
     """In a table of their own, by its protocol: unmasked metrics, the published rows below those of their scene."""
-    row = {"level": 1, "seed": 0, "bytes": 9e5, "mpsnr": 30.0, "mssim": 0.9, "anchors": 7, "steps": 9, "minutes": 1.0}
+    row = {"level": 1, "seed": 0, "bytes": 9e5, "mpsnr": 30.0, "mssim": 0.9, "anchors": 7, "minutes": 1.0}
     official = row | {"psnr": 40.0, "ssim": 0.99}
     rows = [official | {"scene": "mutant"}, official | {"scene": "basketball", "moving_mpsnr": 20.0}]
     _, what, ours, told, theirs = quality.text([row | {"scene": "shelf-hand"}, *rows]).split("\n\n")
