@@ -131,7 +131,7 @@ def python() -> Callable[..., str]:
 
     def call(code: str, *arguments: object, **variables: str) -> str:
         command = [sys.executable, "-c", code, *map(str, arguments)]
-        options: dict[str, Any] = {"capture_output": True, "text": True, "timeout": 900}
+        options: dict[str, Any] = {"capture_output": True, "text": True, "timeout": 300}
         done = subprocess.run(command, env=os.environ | variables, cwd=ROOT, **options)
         assert done.returncode == 0, done.stderr
         return done.stdout

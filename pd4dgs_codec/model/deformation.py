@@ -21,8 +21,8 @@ from pd4dgs_codec.model.config import DeformationConfig
 from pd4dgs_codec.model.hexplane import HexPlane
 from pd4dgs_codec.model.networks import MLP, rounded
 
-#: Heads that change what Gaussians look like, as prefixes of the names of their parameters; the others move them.
-APPEARANCE = ("heads.feature", "heads.scaling")
+#: Heads that change what Gaussians look like; the others move them.
+APPEARANCE = ("feature", "scaling")
 
 
 class DeformationField(nn.Module):
@@ -86,7 +86,8 @@ class DeformationField(nn.Module):
 
     def motion_parameters(self) -> list[nn.Parameter]:
         """The parameters but those of the heads that change what Gaussians look like."""
-        return [p for name, p in self.named_parameters() if not name.startswith(APPEARANCE)]
+        heads = [head for name, head in self._named_heads() if name not in APPEARANCE]
+        return [p for module in (self.planes, self.trunk, *heads) for p in module.parameters()]
 
     def head_layer(self, head: str) -> nn.Linear | None:
         """Returns the linear layer whose output is the residual `head`, or None if the field lacks it."""

@@ -16,9 +16,7 @@ RHO_DECAY = 0.95
 COARSE_SHARE = 1 / 10
 #: Share of a run with a key instant after which views of all times train motion, see `phases.opening`.
 OPENING_SHARE = 1 / 2
-#: Share of a run until which points attract what moves; True: if they guide the run, see `phases.matching`.
-MATCHING_SHARE = {False: 0.35, True: 0.5}
-#: Share of a run that points guide until which pictures of motion train motion alone.
+#: Share of a run that points guide until which pictures of motion train motion alone, see `phases.matching`.
 GUIDED_SHARE = 0.35
 #: Rounds in which anchors of little use are pruned; each anchor is a candidate in one round.
 PRUNING_ROUNDS = 4
@@ -61,10 +59,6 @@ class Schedule:
     def opening(self, iteration: int) -> float:
         """Progress of opening the time window, 0..1, from the end of the coarse phase to OPENING_SHARE."""
         return min(max((self.progress(iteration) - COARSE_SHARE) / (OPENING_SHARE - COARSE_SHARE), 0.0), 1.0)
-
-    def attraction(self, iteration: int, *, guided: bool) -> float:
-        """Weight of the points that attract what moves, 1..0: falls from the start of a run to 0 at MATCHING_SHARE."""
-        return max(0.0, 1 - self.progress(iteration) / MATCHING_SHARE[guided])
 
     def separation(self, iteration: int) -> float:
         """Progress of the masks' separation, 0..1, from the start of the mask terms to exact rounding."""

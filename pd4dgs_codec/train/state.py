@@ -35,7 +35,7 @@ class TrainingView:
     """A view of the dataset on the device.
 
     pixels: uint8 [H, W, 3]. weights: float32 [H, W], see `pixel_weights`. rows, columns: bool [H] and [W], whether
-    a row or column differs from the background.
+    a row or column differs from the background. visible: the number of pixels that do.
     """
 
     view: View
@@ -43,6 +43,7 @@ class TrainingView:
     weights: Tensor
     rows: Tensor
     columns: Tensor
+    visible: int
 
     @staticmethod
     def of(view: View, background: Sequence[float], device: torch.device) -> TrainingView:
@@ -52,7 +53,7 @@ class TrainingView:
         if view.mask is not None:
             mask = torch.as_tensor(view.mask, device=device).float()
         shown = (pixels != torch.tensor(background, device=device) * 255).any(2)
-        return TrainingView(view, pixels, pixel_weights(mask), shown.any(1), shown.any(0))
+        return TrainingView(view, pixels, pixel_weights(mask), shown.any(1), shown.any(0), int(shown.sum()))
 
     @property
     def nbytes(self) -> int:

@@ -18,7 +18,6 @@ from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.loop import Trainer
 from pd4dgs_codec.train.phases import levels, matching, opening
 from pd4dgs_codec.train.phases.matching import Match, Points, attraction, moving_points
-from pd4dgs_codec.train.schedule import MATCHING_SHARE
 
 WHOLE_TINY = PRESETS["tiny"]  # tests have a smaller one
 
@@ -111,12 +110,14 @@ def test_points_far_away_or_of_other_colours_do_not_attract(dataset):
     learner = trainer_of(dataset).learner
     unit = learner.model.deformations[1].unit
     here, colour = points([[0.0, 0.0, 0.0]], [[0.5, 0.5, 0.5]]), [[0.5, 0.5, 0.5]]
-    far = points([[(matching.REACH[False] + 0.01) * unit, 0.0, 0.0]], colour)
+    far = points([[(matching.STRENGTH[False].reach + 0.01) * unit, 0.0, 0.0]], colour)
     other = points([[0.3 * unit, 0.0, 0.0]], [[0.5 + 3.1 * matching.SAME_COLOUR, 0.5, 0.5]])
     for there in (far, other):
         assert float(attraction(learner, 1, here, there).detach()) == 0
     learner.guided = True
-    assert float(attraction(learner, 1, here, far).detach()) == pytest.approx(matching.REACH[False] + 0.01, abs=1e-5)
+    assert float(attraction(learner, 1, here, far).detach()) == pytest.approx(
+        matching.STRENGTH[False].reach + 0.01, abs=1e-5
+    )
 
 
 @pytest.mark.usefixtures("short_runs_match")
@@ -128,7 +129,7 @@ def test_points_guide_higher_levels_until_the_end_of_the_term(dataset):
     while learner.iteration < 60:
         terms.append((learner.iteration, learner.step()))
     with_it = {at for at, record in terms if "match" in record}
-    assert with_it == {at for at, record in terms if record["level"] and at < MATCHING_SHARE[True] * 60}
+    assert with_it == {at for at, record in terms if record["level"] and at < matching.STRENGTH[True].until * 60}
     assert with_it and not len(phase.points.time) and not learner.guiding
 
 

@@ -29,10 +29,20 @@ from pd4dgs_codec.train import phases, workers
 from pd4dgs_codec.train.phases.levels import images, other_views
 from pd4dgs_codec.train.state import TrainState
 
-#: Weight of the loss term, times `Schedule.attraction`; the instants that a step matches, and the points of the key
-#: instant that it matches with each. True: if points guide the run (`TrainState.guided`).
-WEIGHT = {False: 0.4, True: 2.0}
-SAMPLES = {False: (1, 600), True: (8, 150)}
+
+class Strength(NamedTuple):
+    """weight: of the loss term at the start of a run; it falls to 0 at the share `until` of the run. instants: that a
+    step matches, each with `sample` points of the key instant. reach: the largest distance of a match that attracts."""
+
+    weight: float
+    until: float
+    instants: int
+    sample: int
+    reach: float
+
+
+#: True: if points guide the run (`TrainState.guided`). Otherwise other bodies may be nearer than the right one.
+STRENGTH = {False: Strength(0.4, 0.35, 1, 600, 0.8), True: Strength(2.0, 0.5, 8, 150, math.inf)}
 #: Training views that are searched at most; more views are searched in groups of three, evenly spread.
 MOST_VIEWS = 240
 #: Pixels of a view that are searched, at random, and depths on the ray of each.
@@ -49,10 +59,8 @@ LEAST_FOUND = 1 / 6
 #: Points of the key instant are those of KEY_VIEWS views around it.
 KEY_VIEWS = 5
 #: A match has the least distance, to which a difference in colour adds COLOUR_WEIGHT times. It attracts if the colours
-#: differ by at most SAME_COLOUR and the distance is at most REACH: unless points guide the run, other bodies may be
-#: nearer than the right one. Distances are in units of the deformation, colour differences are means over RGB.
+#: differ by at most SAME_COLOUR. Distances are in units of the deformation, colour differences are means over RGB.
 COLOUR_WEIGHT, SAME_COLOUR = 4.0, 0.1
-REACH = {False: 0.8, True: math.inf}
 
 
 class Points(NamedTuple):
@@ -98,7 +106,8 @@ class Match(phases.Phase):
 
     def weight(self, state: TrainState) -> float:
         """The weight of `term` at this step."""
-        return WEIGHT[state.guided] * state.schedule.attraction(state.position, guided=state.guided)
+        strength = STRENGTH[state.guided]
+        return strength.weight * max(0.0, 1 - state.schedule.progress(state.position) / strength.until)
 
     def term(self, state: TrainState, level: int) -> Tensor | None:
         """The mean `attraction` of points of the key instant that `level` moves to other instants; None if there are no
@@ -111,10 +120,9 @@ class Match(phases.Phase):
         if self._here is None:
             nearest = sorted(self._instants, key=lambda points: abs(float(points.time[0]) - key))
             self._here = Points.joined(nearest[:KEY_VIEWS])
-        instants, sample = SAMPLES[state.guided]
-        pulls = []
-        for k in torch.randint(len(self._instants), (instants,), generator=generator).tolist():
-            drawn = torch.randint(len(self._here.time), (sample,), generator=generator)
+        strength, pulls = STRENGTH[state.guided], []
+        for k in torch.randint(len(self._instants), (strength.instants,), generator=generator).tolist():
+            drawn = torch.randint(len(self._here.time), (strength.sample,), generator=generator)
             pulls.append(attraction(state, level, self._here.at(drawn), self._instants[k]))
         return torch.stack(pulls).mean()
 
@@ -142,7 +150,7 @@ def attraction(state: TrainState, level: int, here: Points, there: Points) -> Te
         match = (torch.cdist(moved, place) + COLOUR_WEIGHT * contrast).argmin(1)
         alike = contrast.gather(1, match[:, None])[:, 0] <= SAME_COLOUR
     distance = (moved - place[match]).norm(dim=1)
-    near = distance.detach() <= REACH[state.guided]
+    near = distance.detach() <= STRENGTH[state.guided].reach
     found: Tensor = (distance * (alike & near)).mean()
     return found
 
@@ -152,8 +160,7 @@ def attraction(state: TrainState, level: int, here: Points, there: Points) -> Te
 
 class Evidence(NamedTuple):
     """A view for the search. moved: [H, W], the mean difference of its image from level 0. around: [H, W], the largest
-    of these within two pixels. colour: [H, W, 3]. All are means over 3 x 3 pixels. visible: the pixels that differ from
-    the background."""
+    of these within two pixels. colour: [H, W, 3]. All are means over 3 x 3 pixels. visible: see `TrainingView`."""
 
     view: View
     moved: Tensor
@@ -175,9 +182,8 @@ def moving_points(state: TrainState) -> tuple[Points, float]:
         shown = state.picture(index)
         different = (images(state, shown, (0,))[0] - shown.image).abs().mean(-1) * (shown.weights > 0)
         moved, *colour = avg_pool2d(torch.cat([different[None], shown.image.permute(2, 0, 1)]), 3, 1, 1).cpu()
-        background = shown.image.new_tensor(state.model.info.background)
-        pixels = int((shown.image != background).any(-1).sum())
-        return Evidence(shown.view, moved, max_pool2d(moved[None], 5, 1, 2)[0], torch.stack(colour, -1), pixels)
+        around = max_pool2d(moved[None], 5, 1, 2)[0]
+        return Evidence(shown.view, moved, around, torch.stack(colour, -1), shown.visible)
 
     low, high = torch.from_numpy(state.model.info.box.copy())
     found, searched, moving, shown, generator = [], 0, 0, 0, torch.Generator().manual_seed(0)
