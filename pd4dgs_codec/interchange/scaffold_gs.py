@@ -265,4 +265,6 @@ def _cells(anchor: np.ndarray, voxel: float, path: Path) -> np.ndarray:
     if off.max() > OFF_GRID:
         found = f"anchors lie up to {off.max():.3g} voxels off the grid of {voxel:g}"
         raise DataError(f"{path}: {found}, expected multiples of it; --voxel-size sets another")
+    if np.ptp(anchor, axis=0).any() and not np.ptp(cells, axis=0).any():
+        raise DataError(f"{path}: all anchors lie in one voxel of {voxel:g}, expected a smaller voxel size")
     return cells.astype(np.int32)
