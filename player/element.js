@@ -4,7 +4,8 @@
 //   <pd4-player src="scene.pd4" controls autoplay loop></pd4-player>
 //
 // Attributes: src; poster, a picture until there is one; controls; autoplay; loop; time, seconds to start at; level,
-// the highest to load and show; max-bytes and max-seconds, how much of the file to load, and how long beyond layer 0.
+// the highest to load and show; max-bytes and max-seconds, how much of the file to load, and how long beyond its first
+// slice. A change of autoplay, max-bytes or max-seconds acts on the next file.
 
 import { Orbit } from "./render/orbit.js";
 import { Player } from "./render/player.js";
@@ -107,7 +108,7 @@ const BODY = `
 const number = (text) => (text === null || text.trim() === "" || Number.isNaN(Number(text)) ? null : Number(text));
 
 export class Pd4Player extends HTMLElement {
-  static observedAttributes = ["src", "level", "time", "controls", "poster"];
+  static observedAttributes = ["src", "level", "time", "loop", "controls", "poster"];
 
   constructor() {
     super();
@@ -148,14 +149,7 @@ export class Pd4Player extends HTMLElement {
     const old = /** @type {HTMLCanvasElement} */ (this.shadowRoot?.querySelector("canvas"));
     const canvas = /** @type {HTMLCanvasElement} */ (old.cloneNode()); // a context that was given up does not return
     old.replaceWith(canvas);
-    const player = new Player(canvas, {
-      level: number(this.getAttribute("level")),
-      time: number(this.getAttribute("time")),
-      autoplay: this.hasAttribute("autoplay"),
-      loop: this.hasAttribute("loop"),
-      bytes: number(this.getAttribute("max-bytes")),
-      seconds: number(this.getAttribute("max-seconds")),
-    });
+    const player = new Player(canvas, this._asked());
     this._player = player;
     for (const name of EVENTS) {
       player.addEventListener(name, (event) => {
@@ -184,6 +178,7 @@ export class Pd4Player extends HTMLElement {
     if (name === "src") this._load();
     else if (name === "level") this._player.level = number(value);
     else if (name === "time") this.seek(number(value) ?? 0);
+    else if (name === "loop") this._player.loop = value !== null;
     else if (name === "controls") this._showControls();
     else this._showPoster();
   }
@@ -198,7 +193,9 @@ export class Pd4Player extends HTMLElement {
   /** Loads a scene in place of the one on show. @param {string | URL | Blob} source */
   async load(source) {
     this._error.hidden = true;
-    await this._player?.load(source);
+    if (!this._player) return;
+    Object.assign(this._player._options, this._asked());
+    await this._player.load(source);
   }
 
   get src() {
@@ -260,6 +257,18 @@ export class Pd4Player extends HTMLElement {
   }
 
   // --- inside
+
+  /** What the attributes ask of a player. */
+  _asked() {
+    return {
+      level: number(this.getAttribute("level")),
+      time: number(this.getAttribute("time")),
+      autoplay: this.hasAttribute("autoplay"),
+      loop: this.hasAttribute("loop"),
+      bytes: number(this.getAttribute("max-bytes")),
+      seconds: number(this.getAttribute("max-seconds")),
+    };
+  }
 
   _load() {
     const { src } = this;

@@ -15,8 +15,9 @@ export class FetchError extends Error {
 }
 
 /**
- * Limits of a download: highest layer, bytes from the first of the file, seconds from the call. The first slice is
- * fetched if it ends within `bytes`, a later one only if it would also arrive in time at the connection's rate so far.
+ * Limits of a download: highest layer, bytes from the first of the file, seconds from the first slice's arrival or a
+ * later call. The first slice is fetched if it ends within `bytes`, a later one only if it would also arrive in time at
+ * the connection's rate so far.
  *
  * @typedef {{maxLayer?: number, bytes?: number, seconds?: number}} Budget
  */
@@ -107,7 +108,8 @@ export class SceneSource {
    * @returns {AsyncGenerator<Scene, void, void>}
    */
   async *scenes({ maxLayer = Infinity, bytes, seconds = Infinity } = {}) {
-    const until = now() + seconds;
+    const begun = () => this.decoder.consumed >= (this.decoder.layerEnds[0]?.end ?? Infinity);
+    let until = begun() ? now() + seconds : Infinity;
     let failures = 0;
     try {
       for (;;) {
@@ -140,7 +142,9 @@ export class SceneSource {
         }
         if (!block.length) continue;
         failures = 0;
-        for (const scene of this._feed(block)) yield scene; // yield* takes longer than a small piece
+        const scenes = this._feed(block);
+        if (until === Infinity && begun()) until = now() + seconds;
+        for (const scene of scenes) yield scene; // yield* takes longer than a small piece
       }
     } finally {
       this.close();

@@ -160,11 +160,12 @@ export class Orbit {
     const player = this._player;
     const { camera, info } = player;
     if (!camera || !info) return;
+    if (camera !== this._made) this._pivot = null; // of another scene or a script's camera
     const pivot = (this._pivot ??= this._findPivot());
     const down = downOf(camera);
     const up = unit(info.up, plus([0, 0, 0], down, -1));
     const next = change(centreOf(camera), forwardOf(camera), down, pivot, up);
-    if (next && next.flat().every(Number.isFinite)) player.camera = lookAlong(...next, camera);
+    if (next && next.flat().every(Number.isFinite)) player.camera = this._made = lookAlong(...next, camera);
   }
 
   /** What the camera looks at: on its axis, at the median depth of the anchors in the picture's middle. */

@@ -21,7 +21,7 @@ import { WORKERS } from "./workers.js";
  * @property {boolean} [autoplay]
  * @property {boolean} [loop]
  * @property {number | null} [bytes] how much of the file to load at most
- * @property {number | null} [seconds] how long to load beyond the first layer
+ * @property {number | null} [seconds] how long to load beyond the first slice
  * @property {"gpu" | "cpu" | null} [evaluator] default: the faster one of the machine
  * @property {boolean} [degrade] whether a slow machine gets fewer pixels and lower levels, default true
  * @property {number | null} [pixelRatio] device pixels per CSS pixel, default the window's, at most 2
@@ -124,8 +124,8 @@ export class Player extends Clip {
     this._resize = new ResizeObserver(() => this._changed());
     this._resize.observe(canvas);
     this._visible = true;
-    this._seen = new IntersectionObserver(([entry]) => {
-      this._visible = entry.isIntersecting;
+    this._seen = new IntersectionObserver((entries) => {
+      this._visible = entries[entries.length - 1].isIntersecting; // the newest
       this._wake();
     });
     this._seen.observe(canvas);
@@ -165,7 +165,9 @@ export class Player extends Clip {
     this._loadedLevel = this._level ?? Infinity;
     this._status.loading = true;
     await this._load({ maxLayer: this._loadedLevel, bytes: bytes ?? undefined, seconds: seconds ?? undefined });
-    if (loader === this._loader) this._status.loading = false;
+    if (loader !== this._loader) return;
+    this._status.loading = false;
+    if ((this._level ?? Infinity) > this._loadedLevel) await this._loadOn(); // raised meanwhile
   }
 
   /** Stops loading; layers that have arrived stay. */

@@ -104,10 +104,15 @@ test("a budget of layers or bytes stops, and a later call continues", async () =
   }
 });
 
-test("a budget too small for layer 0 yields nothing", async () => {
-  for (const budget of [{ bytes: ENDS[0] - 1 }, { seconds: 0 }]) {
-    assert.deepEqual(await all((await serving()).source, budget), []);
-  }
+test("bytes that end before the first slice yield nothing", async () => {
+  assert.deepEqual(await all((await serving()).source, { bytes: ENDS[0] - 1 }), []);
+});
+
+test("seconds count from the first slice, in a later call from its beginning", async () => {
+  const { source } = await serving();
+  assert.deepEqual(layersOf(await all(source, { seconds: 0 })), [[0]]);
+  assert.deepEqual(await all(source, { seconds: 0 }), []);
+  assert.equal((await all(source)).length, 2);
 });
 
 test("a download resumes after a cut anywhere, and requests no byte twice", async () => {

@@ -453,6 +453,14 @@ def test_budgets_are_kept_and_may_be_raised(harness, server, lively):
     harness.wait_for_function("harness.player.status.level === 2")
 
 
+def test_a_level_may_be_raised_while_a_lower_one_loads(harness, folder, lively):
+    with Server(folder, link=Link(8 * len(lively) / 2)) as slow, slow.running():
+        harness.evaluate("(url) => void harness.open(url, 96, 72, { level: 0 })", slow.url_of("scene.pd4"))
+        harness.wait_for_function("harness.player.status.bytes > 0")
+        harness.evaluate("harness.player.level = null")
+        harness.wait_for_function("harness.player.status.level === 2")
+
+
 def element(page: Any, server: Server, attributes: str, code: Server | None = None) -> Any:
     """A page of `server` with one element, whose code is on another server perhaps."""
     script = (code or server).url_of("player/element.js")
@@ -630,6 +638,19 @@ def test_controls(page, server):
         assert views[-1] != views[-2], key
     page.keyboard.press("Home")
     assert page.evaluate(state) == home
+
+    far = np.array(home).reshape(4, 4) + np.array([[0, 0, 0, 50.0]] + 3 * [[0, 0, 0, 0]])
+    look = "(v) => void (player.camera = { ...player.camera, viewmat: new Float32Array(v) })"
+    page.evaluate(f"void (window.player = {ELEMENT})")
+    page.evaluate(look, far.ravel().tolist())
+    page.keyboard.press("ArrowLeft")
+    near = np.array(page.evaluate(state)).reshape(4, 4)
+    eyes = [-view[:3, :3].T @ view[:3, 3] for view in (far, near)]
+    assert 0 < np.linalg.norm(eyes[1] - eyes[0]) < 2  # not about what the camera before looked at
+    page.keyboard.press("Home")
+
+    page.evaluate(f"{ELEMENT}.seek(NaN)")
+    assert page.evaluate(f"{ELEMENT}.time") == 3
     page.keyboard.press(",")
     assert page.evaluate(f"{ELEMENT}.time") == pytest.approx(3 - 1 / 30)
     changes = "seen.filter(([name]) => name === 'statechange').length"
@@ -755,6 +776,12 @@ def test_attributes_and_removal(page, server):
     page.wait_for_function("document.querySelector('pd4-player').time < 2")  # it plays, and begins anew
     names = [name for name, _ in page.evaluate("seen")]
     assert names.count("firstpicture") == 1 and names.count("upgrade") <= 1 and "progress" in names
+    page.evaluate(f"{ELEMENT}.removeAttribute('loop')")
+    page.wait_for_function(f"{ELEMENT}.paused")  # at the end
+    assert page.evaluate(f"{ELEMENT}.time") == 3
+    page.evaluate(f"{ELEMENT}.removeAttribute('autoplay')")
+    page.evaluate(f"{ELEMENT}.setAttribute('time', '2.5'), {ELEMENT}.load({ELEMENT}.src)")  # as they are now
+    page.wait_for_function(f"{ELEMENT}.player.status.level === 1 && {ELEMENT}.time === 2.5 && {ELEMENT}.paused")
     page.evaluate(f"window.player = {ELEMENT}; player.remove()")
     assert page.evaluate("player.player") is None
     page.evaluate("document.body.append(player)")
