@@ -19,7 +19,7 @@ from pd4dgs_codec import __version__
 from pd4dgs_codec.batch import store
 from pd4dgs_codec.data.dataset import SYNTHETIC, dataset_folders
 from pd4dgs_codec.errors import DataError, Pd4Error, one_line
-from pd4dgs_codec.io import remove_temporaries, temporary_folder
+from pd4dgs_codec.io import URI, remove_temporaries, temporary_folder
 from pd4dgs_codec.signals import ignore_more, interruptible
 
 LOG_BYTES = 1 << 16  #: limit of a command's log, whose end is kept
@@ -127,8 +127,12 @@ def _absolute(place: Any) -> str:
 
 
 def default_output(source: str, op: Op) -> str:
-    """The last part of the source with the operation's suffix: kitchen.pt -> kitchen.pd4."""
-    name = posixpath.basename(source.partition("?")[0].rstrip("/")).rpartition(":")[2]
+    """The last part of the source with the operation's suffix: kitchen.pt -> kitchen.pd4, synthetic:fast?seed=1 ->
+    fast.pt."""
+    name = source.removeprefix(SYNTHETIC)
+    if name != source or URI.match(source):
+        name = name.partition("?")[0]
+    name = posixpath.basename(name.rstrip("/"))
     return (posixpath.splitext(name)[0] or name) + op.suffix
 
 

@@ -5,6 +5,7 @@ Slurm enforces the time limit itself.
 """
 
 import contextlib
+import math
 import multiprocessing
 import os
 import shutil
@@ -277,9 +278,9 @@ class Slurm(Engine):
         parameters: dict[str, Any] = {"cpus_per_task": settings.threads, "name": "pd4dgs-batch", **settings.slurm}
         cluster = parameters.pop("cluster", "slurm")
         if settings.timeout:
-            parameters["timeout_min"] = max(1, round(settings.timeout / 60))
+            parameters["timeout_min"] = math.ceil(settings.timeout / 60)
         if settings.gpus:
-            parameters["gpus_per_node"] = int(settings.gpus)
+            parameters["gpus_per_node"] = math.ceil(settings.gpus)
         if settings.workers and cluster == "slurm":
             parameters["slurm_array_parallelism"] = settings.workers
         try:

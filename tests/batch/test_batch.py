@@ -8,7 +8,7 @@ import pytest
 
 from pd4dgs_codec import __version__
 from pd4dgs_codec.batch import store
-from pd4dgs_codec.batch.job import OPS, Job, Line, Manifest, arguments, run_job, scan
+from pd4dgs_codec.batch.job import OPS, Job, Line, Manifest, arguments, default_output, run_job, scan
 from pd4dgs_codec.errors import DataError
 
 
@@ -225,6 +225,14 @@ def test_scan_finds_sources_of_one_kind(tmp_path):
     assert [line["output"] for line in scan(str(tmp_path), "train")] == ["set.pt"]
     with pytest.raises(DataError, match="found no sources"):
         list(scan(str(tmp_path), "prepare"))
+
+
+def test_outputs_are_named_after_their_sources():
+    names = {
+        "a/kitchen.pt": "kitchen.pd4", "clip 12:30:05.pt": "clip 12:30:05.pd4", "what?.pt": "what?.pd4",
+        "s3://bucket/a.pt?version=3": "a.pd4", "synthetic:fast?seed=1": "fast.pd4", "set/": "set.pd4",
+    }  # fmt: skip
+    assert {source: default_output(source, OPS["encode"]) for source in names} == names
 
 
 def test_uris_of_fsspec_are_sources_and_outputs(library):

@@ -8,10 +8,11 @@ import threading
 import time
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
-from pd4dgs_codec.batch.run import _follow_parent
+from pd4dgs_codec.batch.run import Settings, Slurm, _follow_parent
 from pd4dgs_codec.batch.store import Root
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.io import temporary_folder
@@ -162,6 +163,15 @@ def test_slurm_jobs_by_the_local_executor_of_submitit(library):
     assert summary["done"] == 2
     assert library.outcomes["b.pd4"][0].message.endswith("never")
     assert library.outcomes["c.pd4"][1] == 2
+
+
+def test_slurm_gets_whole_minutes_and_gpus_that_suffice(monkeypatch):
+    told: dict[str, Any] = {}
+    executor = SimpleNamespace(update_parameters=lambda **parameters: told.update(parameters))
+    stub = SimpleNamespace(AutoExecutor=lambda **_: executor)
+    monkeypatch.setitem(sys.modules, "submitit", stub)
+    Slurm(lambda job: None, Settings(1, timeout=150, gpus=0.5))
+    assert (told["timeout_min"], told["gpus_per_node"]) == (3, 1)
 
 
 def test_parameters_that_submitit_does_not_know_are_named(library):
