@@ -78,11 +78,13 @@ def load(source: str | Path, *, downscale: int = 1, holdout: int = 8, background
     source: a folder that one of READERS recognises, or `synthetic:NAME[?key=value&...]` (see `synthetic`).
     downscale: images are averaged over downscale x downscale blocks (the remainder is cropped), intrinsics follow.
     holdout: without split files, frames with i % holdout == holdout // 2 are the test frames; 0 = none.
-    background: RGB 0..1 on which pictures with alpha are laid, None for white; other pictures stay as they are.
+    background: RGB 0..1 of the scene's background, on which pictures with alpha are laid. None for white behind such
+    pictures, otherwise the dataset's own or the colour of the pictures' border. Opaque pictures stay as they are.
     Views whose masks hold no valid pixel are left out, see `Dataset.left_out`.
     Raises DataError, one line, for anything missing or broken.
     """
-    return _without_blind_views(_read(source, downscale, holdout, background), source)
+    dataset = _without_blind_views(_read(source, downscale, holdout, background), source)
+    return dataset if background is None else replace(dataset, background=background)
 
 
 def color(text: str) -> Color:

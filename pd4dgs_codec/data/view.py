@@ -319,9 +319,9 @@ def posed_dataset(
 ) -> Dataset:
     """The dataset of these frames.
 
-    points: float32 [M, 3], or None. depth: near and far, box: float32 [2, 3], if known. background: RGB 0..1 behind
-    pictures with alpha, None for white; if the first one has no alpha, the colour of the images' border is the scene's
-    background. composite: False drops alpha (photographs); `background` is the scene's, None for the border's colour.
+    points: float32 [M, 3], or None. depth: near and far, box: float32 [2, 3], if known. background: RGB 0..1 of the
+    scene, and behind pictures with alpha; None for white if a training picture has alpha, else for the colour of their
+    border. composite: False drops alpha (photographs).
     """
     frames, under = [*train, *test], (background or WHITE) if composite else None
     files = {frame.image for frame in frames}
@@ -329,8 +329,8 @@ def posed_dataset(
         raise DataError(f"{folder}: {len(frames)} frames of {len(files)} pictures, expected at most {USES} per picture")
     check_pixels(sum(frame.lens.width * frame.lens.height for frame in frames), files, str(folder))
     behind = background
-    if composite:
-        behind = under if image_info(train[0].image)[2] else None
+    if composite and background is None and any(image_info(frame.image)[2] for frame in train):
+        behind = WHITE
     times, start, stop = normalised_times([f.time for f in frames], str(folder))
     views = [read_view(f, t, downscale, under) for f, t in zip(frames, times, strict=True)]
     return Dataset(

@@ -202,9 +202,13 @@ def test_uniform_border_is_the_background(blender, color):
         image = np.full((8, 12, 3), color, np.uint8)
         image[3:5, 3:9] = 77
         save(folder / f"r_{i:03d}.png", image)
-    for asked in (None, (0.5, 0.5, 0.5)):  # there is no alpha to see it through
+    for asked in (None, (0.5, 0.5, 0.5)):  # the pictures stay as they are
         d = load(folder, background=asked)
-        assert d.background == pytest.approx([c / 255 for c in color]) and d.train[0].image[0, 0].tolist() == [*color]
+        assert d.background == (asked or pytest.approx([c / 255 for c in color]))
+        assert d.train[0].image[0, 0].tolist() == [*color]
+    save(folder / "r_001.png", np.full((8, 12, 4), 9, np.uint8))
+    assert load(folder, holdout=0).background == (1, 1, 1)  # for the one that has alpha
+    assert load("synthetic:static?frames=8", downscale=4, background=(1.0, 0.0, 0.0)).background == (1, 0, 0)
 
 
 def test_busy_border_means_black(blender):
