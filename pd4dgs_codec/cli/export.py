@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +17,7 @@ from pd4dgs_codec.io import check_path, whole_files
 if TYPE_CHECKING:
     import numpy as np
 
+    from pd4dgs_codec.data.view import View
     from pd4dgs_codec.draw.player import Player
     from pd4dgs_codec.interchange.export import Export, Eyes
     from pd4dgs_codec.interchange.splats import Splats
@@ -47,6 +48,7 @@ SEQUENCES = ("ply-seq", "4dgs")
 KINDS = ("ply", "ply-seq", "spz", "glb", "4dgs")
 LIBRARIES = {"spz": "gaussforge", "4dgs": "fourdgs"}
 FPS, STEPS, MAX_FRAMES = 30.0, 300, 100_000
+SCALE = options.checked(float, lambda x: 1e-6 <= x <= 1e6, "a number from 1e-6 to 1e6")
 
 
 def parser() -> options.Parser:
@@ -58,14 +60,14 @@ def parser() -> options.Parser:
     what = "time of ply, spz and glb, as 0..1 of the file's time range (default: 0)"
     p.add_argument("--time", type=options.share, metavar="T", help=what)
     what = f"frame rate of ply-seq and 4dgs (default: {FPS:g})"
-    p.add_argument("--fps", type=options.positive_float, metavar="F", help=what)
+    p.add_argument("--fps", type=options.fps, metavar="F", help=what)
     p.add_argument("--level", type=int, choices=(0, 1, 2), help="level to export (default: the highest)")
     what = "degree of the spherical harmonics (default: 3)"
     p.add_argument("--sh", type=int, choices=(0, 1, 2, 3), default=3, help=what)
     what = f"refinement steps; later frames take a quarter (default: {STEPS} or 0, see below)"
     p.add_argument("--refine", type=options.count, metavar="N", help=what)
     what = "factor on all lengths; enlarge small scenes for the fixed-point positions of SPZ (default: 1)"
-    p.add_argument("--scale", type=options.positive_float, default=1.0, metavar="X", help=what)
+    p.add_argument("--scale", type=SCALE, default=1.0, metavar="X", help=what)
     p.add_argument("--data", metavar="SOURCE", help="use the training cameras of this dataset as viewpoints")
     what = "measure PSNR before and after export on the held-out views of this dataset"
     p.add_argument("--compare", metavar="SOURCE", help=what)
@@ -76,13 +78,14 @@ def parser() -> options.Parser:
 
 def _export(args: argparse.Namespace, console: Console) -> int:
     _check_usage(args)
+    common.check_other_file(args.input, args.output)
     if args.to == "ply-seq":
         _check_folder(args.output, args.overwrite)
     else:
         common.check_output(args.output, args.overwrite)
     from pd4dgs_codec.draw.player import Player
     from pd4dgs_codec.format.decoder import decode
-    from pd4dgs_codec.interchange.export import Export
+    from pd4dgs_codec.interchange.export import Export, cost
     from pd4dgs_codec.interchange.splats import EXTRA
 
     if args.to in LIBRARIES:
@@ -90,14 +93,16 @@ def _export(args: argparse.Namespace, console: Console) -> int:
     player = Player(decode(common.read_bytes(args.input), max_layer=args.level))
     if args.refine is None:
         args.refine = 0 if player.shapes_are_blind else STEPS
+    views = _compared(args, player)
     export = Export(player, _eyes(args, player), args.sh, args.refine)
     start = time.perf_counter()
     result = {"input": args.input, "output": args.output, "to": args.to, "level": player.level, "sh": args.sh}
     result["refine"] = args.refine
     result |= _write_sequence(args, export) if args.to in SEQUENCES else _write_still(args, export)
     result["seconds"] = time.perf_counter() - start
-    if args.compare:
-        result["cost"] = _cost(args, export)
+    if views:
+        with progress_bar(len(views), "views", "comparing") as step:
+            result["cost"] = cost(export, views, step)
     console.result(result, _text(result))
     return OK
 
@@ -130,6 +135,16 @@ def _eyes(args: argparse.Namespace, player: Player) -> Eyes:
     if args.data is None:
         return eyes_of_scene(player)
     return eyes_of_cameras([view.camera for view in common.read_dataset(args.data, args, player.info).train])
+
+
+def _compared(args: argparse.Namespace, player: Player) -> Sequence[View]:
+    """The held-out views of --compare, empty without it. Raises DataError if it has none."""
+    if args.compare is None:
+        return ()
+    views = common.read_dataset(args.compare, args, player.info).test
+    if not views:
+        raise DataError(f"{args.compare}: has no held-out views; expected another --holdout")
+    return views
 
 
 def _write_still(args: argparse.Namespace, export: Export) -> dict[str, Any]:
@@ -209,16 +224,6 @@ def _write_folder(args: argparse.Namespace, count: int, frames: Iterator[Splats]
     for other in set(folder.glob("*.ply")) - {Path(name) for name in names}:
         other.unlink()
     return {"frames": count, "gaussians": most, "bytes": total}
-
-
-def _cost(args: argparse.Namespace, export: Export) -> dict[str, Any]:
-    from pd4dgs_codec.interchange.export import cost
-
-    views = common.read_dataset(args.compare, args, export.player.info).test
-    if not views:
-        raise DataError(f"{args.compare}: has no held-out views; expected another --holdout")
-    with progress_bar(len(views), "views", "comparing") as step:
-        return cost(export, views, step)
 
 
 def _text(result: dict[str, Any]) -> str:

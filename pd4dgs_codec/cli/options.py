@@ -152,7 +152,7 @@ seed = checked(int, lambda value: 0 <= value <= 2**63 - 2, "an integer from 0 to
 positive_float = checked(float, lambda value: 0 < value < math.inf, "a number > 0")
 non_negative_float = checked(float, lambda value: 0 <= value < math.inf, "a number >= 0")
 share = checked(float, lambda value: 0 <= value <= 1, "a number from 0 to 1")
-#: Frames per second that GIF and ffmpeg can represent.
+#: Frames per second that ffmpeg can represent.
 fps = checked(float, lambda value: 0.01 <= value <= 1000, "a number from 0.01 to 1000")
 named = checked(str, lambda text: text not in ("", "-"), "the name of a file or folder")
 line = checked(str, str.isprintable, "one line of printable text")

@@ -38,7 +38,6 @@ examples:
   pd4dgs-package out -o out
   pd4dgs-package scene.pd4 -o out/scene --no-video --json"""
 
-STILL_FRAMES = 60  #: frames in the video of a static scene
 MAX_FRAMES = 3000
 FRAGMENT_SECONDS = 2
 
@@ -121,12 +120,13 @@ def _render(scene: Scene, fps: float) -> Video:
     from pd4dgs_codec.quality.image import to_uint8
     from pd4dgs_codec.quality.levels import level_of
     from pd4dgs_codec.web.manifests import Video
+    from pd4dgs_codec.web.package import STILL_SECONDS
 
     check_mp4()
     if scene.info.camera is None:
         raise RenderError("the file has no camera")
     low, high = scene.info.time_range
-    count = max(2, round((high - low) * fps)) if high > low else STILL_FRAMES
+    count = max(2, round((high - low if high > low else STILL_SECONDS) * fps))
     if count > MAX_FRAMES:
         raise RenderError(f"found {count:,} frames, expected at most {MAX_FRAMES:,}; lower --fps")
     frames, level, poster = own_frames(scene.info, count), level_of(scene), BytesIO()

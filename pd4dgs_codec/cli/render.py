@@ -33,6 +33,7 @@ examples:
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 VIDEOS = (".gif", ".mp4")
+MAX_GIF_FPS = 50  #: browsers slow down pictures that are shown for a shorter time
 
 
 def parser() -> options.Parser:
@@ -109,9 +110,11 @@ def _check_usage(args: argparse.Namespace) -> str:
         raise UsageError("found --orbit and --data, expected one of them")
     options.conditional(args, args.data, "needs --data SOURCE", split="test", holdout=options.READING["holdout"])
     options.conditional(args, kind in VIDEOS, "needs a .gif or .mp4 as -o", fps=20.0)
+    if kind == ".gif" and args.fps > MAX_GIF_FPS:
+        raise UsageError(f"found --fps {args.fps:g}, expected at most {MAX_GIF_FPS:g} for a .gif")
     if kind not in VIDEOS and "%" in args.output:
         name = Path(args.output).name
-        if not re.fullmatch(r"[^%]*%0?\d*d[^%]*", name) or "%" in str(Path(args.output).parent):
+        if not re.fullmatch(r"[^%]*%(0?[1-9])?d[^%]*", name) or "%" in str(Path(args.output).parent):
             raise UsageError(f"found -o {args.output}, expected one frame number such as %04d in the file name")
     return kind
 

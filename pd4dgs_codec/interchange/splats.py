@@ -416,7 +416,7 @@ def _linear(colors: np.ndarray) -> np.ndarray:
 def spz_bytes(splats: Splats) -> bytes:
     """Returns an SPZ file of version 3. Raises DataError for positions beyond its fixed-point range."""
     reach = float(np.abs(splats.means).max(initial=0))
-    if reach >= SPZ_REACH:
+    if reach >= SPZ_REACH - SPZ_STEP / 2:  # which rounding would wrap
         found = f"a Gaussian lies {reach:.4g} units from 0"
         raise DataError(f"{found}, expected less than {SPZ_REACH:g} in SPZ: use --scale below 1")
     with quiet():

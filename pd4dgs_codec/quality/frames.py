@@ -164,8 +164,10 @@ def write_gif(frames: Iterator[np.ndarray], path: Path, fps: float) -> None:
     images = [Image.fromarray(frame) for frame in frames]
     palette = images[0].quantize(256, method=Image.Quantize.MEDIANCUT)
     indexed = [image.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for image in images]
+    starts = [10 * round(100 * i / fps) for i in range(len(images) + 1)]  # GIF counts hundredths of a second
+    durations = [stop - start for start, stop in itertools.pairwise(starts)]
     indexed[0].save(
-        path, format="GIF", save_all=True, append_images=indexed[1:], duration=round(1000 / fps), loop=0, optimize=False
+        path, format="GIF", save_all=True, append_images=indexed[1:], duration=durations, loop=0, optimize=False
     )
 
 

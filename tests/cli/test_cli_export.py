@@ -1,8 +1,12 @@
 """`pd4dgs-export`: what it writes, and one line for what it cannot."""
 
+from dataclasses import replace
+
 import pytest
 from tiny import sighted
 
+from pd4dgs_codec.cli.export import frame_times
+from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.interchange.splats import properties
 
@@ -54,6 +58,11 @@ def test_the_whole_time_as_a_folder_of_plys(cli, scene_pd4, tmp_path):
     assert again.code == 1 and "contains PLY files already" in again.err
     assert cli(*command, "--fps", 1, "-f").code == 0
     assert sorted(path.name for path in out.iterdir()) == ["00000.ply", "00001.ply", "00002.ply"]
+
+
+def test_the_number_of_frames_is_limited(scene):
+    with pytest.raises(DataError, match="10000 seconds at 30 frames per second are 300001 frames, expected at most"):
+        frame_times(replace(scene.info, time_range=(0.0, 1e4)), 30.0)
 
 
 def test_the_cost_is_printed(cli, scene_pd4, shared_dataset, tmp_path):

@@ -127,6 +127,9 @@ def test_spz_refuses_positions_out_of_range():
     pytest.importorskip("gaussforge")
     with pytest.raises(DataError, match="a Gaussian lies .* units from 0, expected less than 2048"):
         spz_bytes(make_splats().scaled(1e4))
+    splats = make_splats()
+    with pytest.raises(DataError, match="a Gaussian lies"):  # which rounding would bring to the other end
+        spz_bytes(splats.scaled(2047.9999 / float(np.abs(splats.means).max())))
 
 
 def test_fourdgs_reads_moving_gaussians():

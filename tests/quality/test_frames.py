@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from PIL import Image
+from PIL import Image, ImageSequence
 
 from pd4dgs_codec.errors import RenderError
 from pd4dgs_codec.quality import frames
@@ -101,3 +101,6 @@ def test_gif_keeps_order_count_and_speed(tmp_path):
         gif.seek(i)
         found = np.asarray(gif.convert("RGB"))[4, 4].astype(int)
         assert np.abs(found - colour).max() <= 8
+    frames.write_gif(iter([mixed, *(np.tile(i, (1, 3, 1)) for i in images)]), tmp_path / "b.gif", 30.0)
+    shown = ImageSequence.Iterator(Image.open(tmp_path / "b.gif"))
+    assert [frame.info["duration"] for frame in shown] == [30, 40, 30, 30]

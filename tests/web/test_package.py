@@ -252,3 +252,9 @@ def test_a_rendered_video_is_packaged(cli, folder, tmp_path, monkeypatch):
     assert sum(piece.samples for piece in pieces) == round((high - low) * 10) and len(pieces) == 2
     index = json.loads((tmp_path / "out" / "index.json").read_text())
     assert index["video"] == {"file": "fallback.mp4", "width": 64, "height": 48, "fps": 10.0}
+    still = replace(make_scene(7, layers=(0,)).info, camera=small, time_range=(1.0, 1.0))
+    (folder / "still.pd4").write_bytes(encode(replace(make_scene(7, layers=(0,)), info=still), effort=1))
+    assert cli("package", folder / "still.pd4", "-o", tmp_path / "still", "--fps", 10).code == 0
+    _, pieces = manifests.fragments((tmp_path / "still" / "fallback.mp4").read_bytes())
+    duration = ElementTree.fromstring((tmp_path / "still" / MPD).read_text()).attrib["mediaPresentationDuration"]
+    assert sum(piece.samples for piece in pieces) == 10 and duration == "PT1S"
