@@ -109,11 +109,12 @@ export class SceneSource {
    */
   async *scenes({ maxLayer = Infinity, bytes, seconds = Infinity } = {}) {
     const begun = () => this.decoder.consumed >= (this.decoder.layerEnds[0]?.end ?? Infinity);
-    let until = begun() ? now() + seconds : Infinity;
+    let until = now() + seconds;
     let failures = 0;
     try {
       for (;;) {
         this._signal?.throwIfAborted();
+        if (!begun()) until = Infinity; // also of a file that has changed
         const end = this._end(maxLayer, bytes, until);
         if (end === null || now() >= until) return;
         let block;
@@ -143,7 +144,11 @@ export class SceneSource {
         if (!block.length) continue;
         failures = 0;
         const scenes = this._feed(block);
-        if (until === Infinity && begun()) until = now() + seconds;
+        if (seconds < Infinity && until === Infinity && begun()) {
+          until = now() + seconds;
+          clearTimeout(this._timer); // the next wait may lapse earlier than the one it was set for
+          this._timer = undefined;
+        }
         for (const scene of scenes) yield scene; // yield* takes longer than a small piece
       }
     } finally {
@@ -169,7 +174,7 @@ export class SceneSource {
     const { at, received } = this._requested;
     const rate = (this.received - received) / (now() - at);
     const late = until < Infinity && rate > 0 && next.end - this.received > rate * (until - now());
-    return late && next !== ends[0] ? null : next.end;
+    return late ? null : next.end;
   }
 
   /** The scenes that a block completes. After damage the download goes back to the last valid chunk, once.

@@ -64,9 +64,9 @@ export class Clip extends EventTarget {
     this.seek(seconds);
   }
 
-  /** Goes to a time; NaN changes nothing. @param {number} seconds of the scene's time */
+  /** Goes to a time; what is no number changes nothing. @param {number} seconds of the scene's time */
   seek(seconds) {
-    if (Number.isNaN(seconds)) return;
+    if (isNaN(seconds)) return;
     const [start, end] = this.timeRange;
     this._time = this._scene ? Math.min(Math.max(seconds, start), Math.max(start, end)) : seconds;
     this._changed();

@@ -2,6 +2,7 @@
 
 import { centreOf, cross, downOf, dot, forwardOf, lookAlong, magnification } from "./camera.js";
 import { middleOf, plus, turn, unit } from "./camera.js";
+/** @import { Camera } from "../decode/scene.js" */
 /** @import { Vector } from "./camera.js" */
 /** @import { Player } from "./player.js" */
 
@@ -23,6 +24,8 @@ export class Orbit {
     this._surface = surface;
     /** What the camera turns about. @type {Vector | null} */
     this._pivot = null;
+    /** The camera that it made last. @type {Camera | null} */
+    this._made = null;
     /** Pointers that are down, by their ids. @type {Map<number, {x: number, y: number}>} */
     this._pointers = new Map();
     this._panning = false;
@@ -41,7 +44,6 @@ export class Orbit {
 
   /** Back to the scene's own camera. */
   reset() {
-    this._pivot = null;
     this._player.camera = null;
   }
 

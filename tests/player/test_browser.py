@@ -457,7 +457,7 @@ def test_a_level_may_be_raised_while_a_lower_one_loads(harness, folder, lively):
     with Server(folder, link=Link(8 * len(lively) / 2)) as slow, slow.running():
         harness.evaluate("(url) => void harness.open(url, 96, 72, { level: 0 })", slow.url_of("scene.pd4"))
         harness.wait_for_function("harness.player.status.bytes > 0")
-        harness.evaluate("harness.player.level = null")
+        assert harness.evaluate("(harness.player.level = null, harness.player.status.loading)")
         harness.wait_for_function("harness.player.status.level === 2")
 
 
