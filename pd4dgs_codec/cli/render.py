@@ -114,7 +114,7 @@ def _check_usage(args: argparse.Namespace) -> str:
         raise UsageError(f"found --fps {args.fps:g}, expected at most {MAX_GIF_FPS:g} for a .gif")
     if kind not in VIDEOS and "%" in args.output:
         name = Path(args.output).name
-        if not re.fullmatch(r"[^%]*%(0?[1-9])?d[^%]*", name) or "%" in str(Path(args.output).parent):
+        if not re.fullmatch(r"[^%]*%(0?[1-9]\d?)?d[^%]*", name) or "%" in str(Path(args.output).parent):
             raise UsageError(f"found -o {args.output}, expected one frame number such as %04d in the file name")
     return kind
 

@@ -78,8 +78,8 @@ def load(source: str | Path, *, downscale: int = 1, holdout: int = 8, background
     source: a folder that one of READERS recognises, or `synthetic:NAME[?key=value&...]` (see `synthetic`).
     downscale: images are averaged over downscale x downscale blocks (the remainder is cropped), intrinsics follow.
     holdout: without split files, frames with i % holdout == holdout // 2 are the test frames; 0 = none.
-    background: RGB 0..1 of the scene's background, on which pictures with alpha are laid. None for white behind such
-    pictures, otherwise the dataset's own or the colour of the pictures' border. Opaque pictures stay as they are.
+    background: RGB 0..1 of the scene's background, on which pictures with alpha are laid; opaque ones stay as they are.
+    None: white if a training picture has alpha, else the dataset's own or the colour of the pictures' border.
     Views whose masks hold no valid pixel are left out, see `Dataset.left_out`.
     Raises DataError, one line, for anything missing or broken.
     """

@@ -328,16 +328,14 @@ def posed_dataset(
     if len(frames) > USES * len(files):
         raise DataError(f"{folder}: {len(frames)} frames of {len(files)} pictures, expected at most {USES} per picture")
     check_pixels(sum(frame.lens.width * frame.lens.height for frame in frames), files, str(folder))
-    behind = background
-    if composite and background is None and any(image_info(frame.image)[2] for frame in train):
-        behind = WHITE
+    white = composite and background is None and any(image_info(frame.image)[2] for frame in train)
     times, start, stop = normalised_times([f.time for f in frames], str(folder))
     views = [read_view(f, t, downscale, under) for f, t in zip(frames, times, strict=True)]
     return Dataset(
         name=folder.resolve().name,
         train=tuple(views[: len(train)]),
         test=tuple(views[len(train) :]),
-        background=behind or border_color(views[: len(train)]),
+        background=background or (WHITE if white else border_color(views[: len(train)])),
         time_range=seconds_range(start, stop),
         **geometry(frames, points, depth, box),
     )

@@ -92,19 +92,18 @@ def load_source(source: str, *, downscale: int = 1, holdout: int = 8, background
     if not place:
         raise DataError(f"{source}: names no teacher; expected {PREFIX}FOLDER, {PREFIX}FILE or {PREFIX}module:function")
     options = Options(**values)
+    if background is not None:
+        options = replace(options, background=background)
     teacher = read_model(place, options.fps)
     if not options.cameras:
-        behind = background or options.background or teacher.background
-        return _around(source, Path(place), teacher, options, downscale, holdout, behind)
-    data = load(options.cameras, downscale=downscale, holdout=holdout, background=background)
+        return _around(source, Path(place), teacher, options, downscale, holdout)
+    data = load(options.cameras, downscale=downscale, holdout=holdout, background=options.background)
     poses = [(view.camera, view.time) for view in data.train]  # the held-out pictures stay
     train = _pictures(teacher, poses, data.background, data.near)
     return replace(data, name=source, train=tuple(train), points=_points(teacher, _solid(source, teacher, MIDDLE)))
 
 
-def _around(
-    source: str, place: Path, teacher: Teacher, options: Options, downscale: int, holdout: int, background: Triple
-) -> Dataset:
+def _around(source: str, place: Path, teacher: Teacher, options: Options, downscale: int, holdout: int) -> Dataset:
     """Returns the teacher's pictures by `_cameras` as a dataset, every holdout-th picture held out."""
     solid = _solid(source, teacher, MIDDLE)
     cameras, up = _cameras(place, teacher.splats(teacher.nearest(MIDDLE)).means[solid], options, downscale)
@@ -115,6 +114,7 @@ def _around(
     everywhere = np.concatenate([teacher.splats(t).means[_solid(source, teacher, t)] for t in some])
     box = points_box(everywhere)
     near, far = depth_range([c.viewmat.astype(np.float64) for c in cameras], box, everywhere)
+    background = options.background or teacher.background
     views = _pictures(teacher, poses, background, near)
     train, test = held_out(views, holdout)
     return Dataset(

@@ -140,7 +140,7 @@ class TrainConfig:
     view_dependent: str = option("color", help="networks that take the view direction", choices=VIEW_DEPENDENT)
     downscale: int = option(1)
     holdout: int = option(8)
-    #: RGB behind pictures with alpha; None: white
+    #: RGB of the scene's background and behind pictures with alpha; None: see `dataset.load`
     background: tuple[float, float, float] | None = option(None, least=0, most=1, count=3)
     #: None: the preset's default, or as many as `max_seconds` allows
     iterations: int | None = option(

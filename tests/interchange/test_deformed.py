@@ -86,6 +86,8 @@ def test_the_last_iteration_and_the_background_of_the_run(tmp_path):
         data = load_source(f"teacher:{place}", holdout=0)
         assert data.background == (1.0, 1.0, 1.0) and len(data.train) == 2
     assert load_source(f"teacher:{run}?background=black", holdout=0).background == (0.0, 0.0, 0.0)
+    asked = load_source(f"teacher:{run}?background=black", holdout=0, background=(1.0, 0.0, 0.0))
+    assert asked.background == (1.0, 0.0, 0.0)
     with pytest.raises(DataError, match="iteration_9/deform.pth: not a zip archive"):
         read_model(str(run / "point_cloud" / "iteration_9"), 30)
 
