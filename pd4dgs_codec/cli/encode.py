@@ -153,7 +153,10 @@ def _load(args: argparse.Namespace) -> tuple[Scene, Metadata | None]:
 
 
 def _metadata(args: argparse.Namespace, had: Metadata | None) -> Metadata | None:
-    """Returns the metadata `had` of the file, with the fields replaced that were given as options."""
+    """Returns the metadata `had` of the file without what was measured on it, and with the fields replaced that were
+    given as options."""
+    if had:
+        had = replace(had, quality={}, slices=())
     given = {name: vars(args)[name] for name in ("title", "source", "licence") if vars(args)[name] is not None}
     if not given:
         return had

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -20,6 +20,8 @@ from pd4dgs_codec.model.sensitivity import Viewpoint, omission_error, smaller, u
 from pd4dgs_codec.quality.image import mean_scores, mpsnr
 from pd4dgs_codec.scene import Scene
 
+#: dB of a picture at most in means: one that equals its image would decide them alone.
+MOST_DB = 100.0
 #: A layer's bytes are divided into so many parts; the next layer may begin after any of them.
 PARTS = 16
 
@@ -42,18 +44,21 @@ def level_psnr(
     step: Callable[[], None] = lambda: None,
     rounding: Rounding = EXACT,
 ) -> float:
-    """Returns the mean mPSNR of a level over `views`, dB, infinite for equal pictures. step is called after each."""
+    """Returns the mean mPSNR of a level over `views`, dB, of each at most MOST_DB. step is called after each."""
 
     def draw(view: View) -> np.ndarray:
         return render_image(model, level, view.time, view.camera, rounding)
 
-    return mean_scores(draw, views, {"mpsnr": mpsnr}, step)["mpsnr"]
+    capped = {"mpsnr": lambda *pictures: min(mpsnr(*pictures), MOST_DB)}
+    return mean_scores(draw, views, capped, step)["mpsnr"]
 
 
-def true_psnr(scene: Scene, views: Sequence[View], step: Callable[[], None] = lambda: None) -> dict[int, float]:
-    """Returns `level_psnr` by level of a decoded scene."""
+def true_psnr(
+    scene: Scene, levels: Iterable[int], views: Sequence[View], step: Callable[[], None] = lambda: None
+) -> dict[int, float]:
+    """Returns `level_psnr` of a decoded scene at each of `levels`, which may lie above its highest layer."""
     model = from_scene(scene)
-    return {level: level_psnr(model, level, views, step) for level in scene.layers}
+    return {level: level_psnr(model, level, views, step) for level in levels}
 
 
 # -- errors of a quantised scene ---------------------------------------------------------------------------------------

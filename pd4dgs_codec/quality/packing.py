@@ -165,7 +165,8 @@ class _Pictures:
                         met, fitter.growth[row.layer] = False, fitter.growth[row.layer] * size / row.bytes
             packed = plan(fitted, replace(options, omit="nothing")).symbols.scene()
             errors = loss.mse(packed)
-            before, after = (true_psnr(s, self.held_out, step) if self.held_out else {} for s in (scene, packed))
+            held_out = self.held_out
+            before, after = (true_psnr(s, errors, held_out, step) if held_out else {} for s in (scene, packed))
         levels = []
         for level, mse in errors.items():
             lost = {"lost_db": before[level] - after[level]} if before else {}

@@ -151,7 +151,8 @@ def _walk(
             break
         else:
             low = position
-        ratio = got / size(at(position))
+        if estimate := size(at(position)):  # 0 if the layer has no effect at this setting
+            ratio = got / estimate
     return None if met is None else at(met)
 
 

@@ -11,6 +11,7 @@ from strategies import make_scene
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.info import info
+from pd4dgs_codec.format.metadata import Metadata
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.model import to_scene
 
@@ -137,6 +138,11 @@ def test_metadata_is_written_shown_and_kept(cli, scene_pd4, tmp_path):
     assert cli("encode", told, "-o", again, "--title", "Hall", *fast).code == 0
     assert cli("info", told, "--json").json["metadata"] == {"title": "Kitchen", "licence": "CC BY 4.0"}
     assert {"title: Hall", "licence: CC BY 4.0"} <= set(cli("info", again).out.decode().splitlines())
+    measured = Metadata(title="Kitchen", quality={0: 30.0}, slices=(20.0, 25.0, 30.0))
+    told.write_bytes(encode(decode(scene_pd4.read_bytes()), effort=1, metadata=measured))
+    assert cli("info", told, "--json").json["metadata"].keys() == {"title", "quality", "slices"}
+    assert cli("encode", told, "-o", again, "-f", *fast).code == 0
+    assert cli("info", again, "--json").json["metadata"] == {"title": "Kitchen"}, "measured on the other file"
 
 
 def test_info_names_what_is_left_out(cli, model_pt, tmp_path):

@@ -14,7 +14,7 @@ from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.quality import packing, target
 from pd4dgs_codec.quality.frames import own_frames
 from pd4dgs_codec.quality.image import to_uint8
-from pd4dgs_codec.quality.measure import RenderedLoss, leave_out_low_gain
+from pd4dgs_codec.quality.measure import RenderedLoss, leave_out_low_gain, true_psnr
 
 #: Fitting the priors of mode ans takes ten times as long.
 FAST = ("--mode", "lzma", "--effort", 1, "--json", "-f")
@@ -76,6 +76,13 @@ def test_a_layer_that_explains_the_pictures_is_kept(scene):
         views.append(View(camera.viewmat, camera.K, camera.width, camera.height, time, to_uint8(picture), None, "", 0))
     kept, (gone,) = leave_out_low_gain(scene, views, min_gain=0.5, options=EncodeOptions(mode="lzma", effort=1))
     assert gone.what == "local_deformation" and kept.global_deformation is not None
+
+
+def test_a_picture_that_equals_its_image_does_not_decide_a_mean(scene, monkeypatch):
+    views = [View(*[None] * 2, 4, 3, t, np.full((3, 4, 3), 255, np.uint8), None, "", 0) for t in (0.0, 1.0)]
+    draw = lambda model, level, time, *_: np.full((3, 4, 3), 1 - 0.1 * time, np.float32)  # noqa: E731
+    monkeypatch.setattr("pd4dgs_codec.quality.measure.render_image", draw)
+    assert true_psnr(scene, (0, 2), views) == {level: pytest.approx(60, abs=0.1) for level in (0, 2)}  # 100, 20 dB
 
 
 def test_the_estimated_omission_error_is_close_to_the_measured_one(scene, monkeypatch):

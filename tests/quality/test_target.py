@@ -33,6 +33,16 @@ def rate_distortion(counts, weights):
     return size, loss
 
 
+def test_a_layer_that_loses_all_effect_ends_the_search():
+    """Its estimated size is then 0."""
+
+    def final_size(setting):
+        return 200 if setting["a"] == 0 else 60 if setting["a"] < 2 else 40
+
+    found = least_loss({"a": (0.0, 1.0, 2.0)}, lambda s: 100 * (s["a"] < 0.5), lambda s: s["a"], final_size, 50)
+    assert found == {"a": 2.0}
+
+
 def test_the_search_comes_close_to_the_best_of_all_settings():
     counts, weights = {"a": 40_000, "b": 40_000, "c": 8_000}, {"a": 1.0, "b": 16.0, "c": 0.1}
     size, loss = rate_distortion(counts, weights)
