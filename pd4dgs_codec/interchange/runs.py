@@ -51,8 +51,9 @@ Layer = tuple[np.ndarray, np.ndarray]  #: weight float32 [outputs, inputs], bias
 
 
 def iteration(folder: Path, number: int | None = None) -> Path | None:
-    """Finds the folder with point_cloud.ply: `folder` itself, or iteration `number` below it (None: the last)."""
-    if (folder / PLY).is_file():
+    """Finds the folder with point_cloud.ply: `folder` itself, or iteration `number` below it (None: the last);
+    None if it has no such iteration."""
+    if (folder / PLY).is_file() and (number is None or folder.name == f"iteration_{number}"):
         return folder
     base = folder / "point_cloud" if (folder / "point_cloud").is_dir() else folder
     found = {

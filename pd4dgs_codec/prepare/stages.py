@@ -105,6 +105,8 @@ def check_folder(output: Path, overwrite: bool) -> None:
     check_path(output)
     if output.name in ("", ".."):
         raise DataError(f"{output}: has no name of its own, expected the name of an output folder")
+    if output.is_symlink():
+        raise DataError(f"{output}: found a link, expected a folder or nothing")
     if output.exists() and not (overwrite and (output / REPORT).is_file() and (output / "sparse").is_dir()):
         how = "expected an output of pd4dgs-prepare" if overwrite else "--overwrite replaces an earlier output"
         raise DataError(f"{output}: exists already; {how}")

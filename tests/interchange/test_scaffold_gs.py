@@ -243,6 +243,8 @@ def test_broken_folders(tmp_path, cli):
     assert "has no point_cloud.ply" in _fails(tmp_path, cli)
     place = Checkpoint().write(tmp_path / "run")
     assert "has no iteration_7" in _fails(tmp_path, cli, "--iteration", 7)
+    with pytest.raises(DataError, match="has no iteration_7"):
+        read_scaffold_gs(place, Choices(iteration=7))
     (place / "cov_mlp.pt").unlink()
     assert "cov_mlp.pt: cannot be read" in _fails(tmp_path, cli)
     (place / "cov_mlp.pt").write_bytes(b"no archive")

@@ -12,6 +12,7 @@ from rooms import FOCAL, picture, pose, texture, walk
 
 from pd4dgs_codec.cli.prepare import main
 from pd4dgs_codec.data.dataset import load
+from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.prepare import poses, stages
 
 pytest.importorskip("pycolmap")
@@ -144,6 +145,12 @@ def test_foreign_folder_is_not_replaced(room, tmp_path, capsys):
     (tmp_path / "new.partial").mkdir()
     assert main([str(room[0]), "-o", str(tmp_path / "new")]) == 1
     assert "expected nothing here or the partial output of an earlier run" in capsys.readouterr().err
+
+
+def test_a_link_is_not_replaced(tmp_path):
+    (tmp_path / "link").symlink_to(tmp_path)
+    with pytest.raises(DataError, match="link: found a link"):
+        stages.check_folder(tmp_path / "link", True)
 
 
 def test_a_folder_without_a_name_of_its_own_is_refused(room, tmp_path, monkeypatch, capsys):
