@@ -10,9 +10,11 @@ from torch import Tensor
 
 from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.draw.simd import Tasks, parallel
+from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.model.config import ModelConfig
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model, fresh_networks
+from pd4dgs_codec.morton import MAX_VOXEL
 from pd4dgs_codec.scene import INSTANTS, SceneInfo, Steps, Widths
 
 #: Voxels along the longest side of the scene's box.
@@ -79,10 +81,15 @@ def fresh_mask_logits(n: int, level: int) -> Tensor:
 
 
 def scene_info(dataset: Dataset) -> SceneInfo:
-    """The `SceneInfo` of a dataset; a voxel is 1/GRID of the box's longest side."""
+    """The `SceneInfo` of a dataset; a voxel is 1/GRID of the box's longest side. Raises DataError for a box without
+    extent, or one so far from the origin that the format cannot number its voxels."""
     box = np.asarray(dataset.box, np.float32)
+    side, farthest = float((box[1] - box[0]).max()), float(np.abs(box).max())
+    if not side > 0 or farthest + side > MAX_VOXEL / GRID * side:
+        found = f"the scene's box is {box.tolist()}"
+        raise DataError(f"{dataset.name}: {found}, expected an extent, and at most {MAX_VOXEL // GRID} times it from 0")
     return SceneInfo(
-        voxel_size=_binary32(float((box[1] - box[0]).max()) / GRID),
+        voxel_size=_binary32(side / GRID),
         box=box,
         time_range=tuple(_binary32(v) for v in dataset.time_range),  # type: ignore[arg-type]
         background=tuple(_binary32(v) for v in dataset.background),  # type: ignore[arg-type]

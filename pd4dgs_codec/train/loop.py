@@ -51,7 +51,7 @@ class Progress(Protocol):
 
 
 class Stopped(Exception):
-    """A signal stopped a trial. The trial is undone; a resumed run repeats it."""
+    """A signal or the time limit stopped a trial. The trial is undone; a resumed run repeats it."""
 
 
 class Trainer:
@@ -130,17 +130,20 @@ class Trainer:
         saved = now = time.monotonic()
 
         def before_practice(done: int, steps: int) -> None:
-            if any(workers.largest(stop.is_set())):
+            late = limit is not None and self.seconds + time.monotonic() - now >= limit
+            if any(workers.largest(stop.is_set() or late)):
                 raise Stopped
             if progress:
                 progress.on_trial(done, steps)
 
         self.learner.before_practice = before_practice
+        limit = None if self.timed else self.config.max_seconds  # a timed run plans its trials itself
         while not self.finished:
             position = self.learner.position
             try:
                 record = self.learner.step()
             except Stopped:
+                self.seconds += max(workers.largest(time.monotonic() - now))
                 break
             now, begun = time.monotonic(), now
             late = self._spend(*workers.largest(now - begun))  # one clock for all workers
@@ -168,7 +171,7 @@ class Trainer:
         if self.total is None:
             self._costs.append(seconds)
             slow = self.iteration >= FEWEST_TIMED_STEPS and self.seconds >= COARSE_SHARE * limit
-            if self.iteration >= TIMED_STEPS or slow:
+            if len(self._costs) >= TIMED_STEPS or slow:
                 self.learner.schedule = Schedule(max(1, round(limit / (LATER_COST * median(self._costs)))))
             return self.seconds >= limit
         share, left = self.learner.share or 0.0, limit - self._evaluation - usual - begun

@@ -154,6 +154,16 @@ def test_time_limit_ends_cleanly_and_must_grow_on_resume(cli, train, tmp_path, s
     assert refused.code == 1 and "higher --max-seconds" in refused.err
 
 
+def test_a_time_limit_on_resumption_leaves_the_schedule_of_the_preset(cli, train, tmp_path, monkeypatch):
+    step, path = Learner.step, tmp_path / "m.pt"
+    monkeypatch.setattr(Learner, "step", lambda self: signal.raise_signal(signal.SIGINT) or step(self))
+    assert train(path, iterations=None).code == 0  # one step of the preset's number
+    resumed = ("--resume", path, "--max-seconds", 1000, "--json", "--log", tmp_path / "log")
+    report = train(path, *resumed, iterations=None).json
+    assert report["iterations"] == 2 and report["total"] == TINY.iterations > 2
+    assert "position" not in read_log(tmp_path / "log")[0], "of a timed run"
+
+
 def test_missing_held_out_frames_are_noted(train, tmp_path):
     result = train(tmp_path / "m.pt", "--holdout", 0, iterations=2)
     assert result.code == 0 and "none held out" in result.err and "training-view PSNR" in result.err

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from pd4dgs_codec.train.initialise import initial_cells, nearest_distances
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.train.initialise import initial_cells, nearest_distances, scene_info
 
 
 @pytest.mark.parametrize("n", [2, 3, 50, 2000])
@@ -30,3 +31,11 @@ def test_as_many_cells_as_asked_start_at_fewer_as_many_or_more_points(dataset, c
     assert len(cells) == count
     own = {tuple(cell) for cell in np.round(points / 1e-4).astype(int).tolist()}
     assert sum(tuple(cell) in own for cell in cells.tolist()) >= min(count, 40) - 1  # one may round otherwise
+
+
+def test_a_box_that_the_format_cannot_number_is_refused(dataset):
+    size = dataset.box[1] - dataset.box[0]
+    assert scene_info(dataclasses.replace(dataset, box=dataset.box + 1000 * size.max())).voxel_size > 0
+    for box in (dataset.box + 1024 * size.max(), np.zeros((2, 3), np.float32)):
+        with pytest.raises(DataError, match="expected an extent, and at most 1024 times it from 0"):
+            scene_info(dataclasses.replace(dataset, box=box))

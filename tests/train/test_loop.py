@@ -176,6 +176,20 @@ def test_a_run_cut_at_its_limit_leaves_a_checkpoint(dataset, tmp_path, monkeypat
     assert checkpoint.load(tmp_path / "m.pt")[1]["iteration"] == done
 
 
+def test_a_time_limit_ends_a_trial(dataset, tmp_path, monkeypatch, clock):
+    trainer = trainer_of(dataset, 30, max_seconds=5.5)
+
+    def practise():
+        for done in range(100):
+            trainer.learner.before_practice(done, 100)
+            clock.now += 1
+
+    monkeypatch.setattr(trainer.learner, "step", practise)
+    trainer.run(tmp_path / "m.pt")
+    assert (trainer.iteration, trainer.seconds) == (0, 6) and not (trainer.finished or trainer.interrupted)
+    assert checkpoint.load(tmp_path / "m.pt")[1]["seconds"] == 6
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_the_first_signal_ends_the_run_after_a_whole_step(dataset, tmp_path, number):
     config = TrainConfig(preset="tiny", iterations=8)

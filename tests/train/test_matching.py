@@ -155,6 +155,15 @@ def test_attributes_learn_from_motion_where_much_stands_still(dataset, monkeypat
 
 
 @pytest.mark.usefixtures("short_runs_match")
+def test_points_are_drawn_without_the_numbers_of_the_other_thread(dataset):
+    learner = trainer_of(dataset, 60, steps=7).learner
+    before, noise = learner.generator.get_state(), learner.noise.generator.get_state()
+    assert learner.match.term(learner, 1) is not None
+    assert torch.equal(learner.generator.get_state(), before)
+    assert not torch.equal(learner.noise.generator.get_state(), noise)
+
+
+@pytest.mark.usefixtures("short_runs_match")
 def test_steady_motion_needs_no_points(dataset, monkeypatch):
     monkeypatch.setattr(opening, "_predicted", lambda state: opening.MIN_GAIN)
     assert not len(trainer_of(dataset, 60, steps=8).learner.match.points.time)

@@ -336,6 +336,24 @@ def test_level_2_needs_a_share_of_all_motion_and_counts_for_level_1(
     assert practised == [(1, max(75, steps // 10)), (0, max(150, steps // 10))][: len(record["level_gains"])]
 
 
+def test_a_resumed_selection_knows_the_gain_of_the_level_above(dataset, monkeypatch):
+    told = []
+    monkeypatch.setattr(levels.SelectLevels, "_gain", lambda *at: told.append(at[-1]) or (1.0, 0.5))
+    learner = trainer_of(replace(dataset, train=dataset.train * 12)).learner
+    levels.drop_level(learner.model, learner.optimiser, 2)
+    learner.levels.left_out.append({"level": 2, "gain": 0.4, "views": 4})
+    learner.levels.apply(learner, {})
+    assert told == [0.4] and learner.model.level == 1
+
+
+@pytest.mark.parametrize("share, due", [(0.45, True), (0.7, False)])
+def test_nothing_grows_behind_phases_that_number_the_anchors(dataset, share, due):
+    """A timed run whose machine stops may go from before N/2 to behind 2N/3 in one step."""
+    learner = trainer_of(dataset, 600).learner
+    learner.share, learner._before = share, 240
+    assert learner.grow.due(learner) == due
+
+
 @pytest.mark.parametrize("share, steps, due", [(0.67, 660, False), (0.67, 680, True), (None, 400, True)])
 def test_a_timed_run_on_a_busy_machine_keeps_its_levels(dataset, share, steps, due):
     """It has not learnt motion, whatever N it began with."""

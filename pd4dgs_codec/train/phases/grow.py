@@ -30,8 +30,9 @@ class Grow(Phase):
     """Collects statistics from every picture of the first half of a run, and grows and prunes anchors at intervals."""
 
     def due(self, state: TrainState) -> bool:
-        """At the positions of `Schedule.grow`."""
-        return any(map(state.reached, state.schedule.grow))
+        """At the positions of `Schedule.grow`, but not if one long step of a timed run ends behind all phases that know
+        the anchors by number."""
+        return state.position < state.schedule.rounding and any(map(state.reached, state.schedule.grow))
 
     @torch.no_grad()
     def observe(self, state: TrainState, pictures: Sequence[Picture]) -> None:

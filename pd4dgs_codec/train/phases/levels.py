@@ -59,14 +59,13 @@ class SelectLevels(phases.Phase):
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
         """Removes levels from the highest down, until one stays."""
         record["level_gains"] = gains = []
-        above = 0.0
         while state.model.level:
             level, views = state.model.level, [state.views[index] for index in sorted(held_back_views(state))]
+            above = max([0.0, *(row["gain"] for row in self.left_out)])  # also before the run was resumed
             gain, needed = self._gain(state, level, views, above)
             gains.append(gain)
             if gain >= needed:
                 break
-            above = max(gain, 0.0)
             drop_level(state.model, state.optimiser, level)
             self.left_out.append({"level": level, "gain": gain, "views": len(views)})
         record["left_out"] = self.left_out

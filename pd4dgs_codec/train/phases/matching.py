@@ -112,7 +112,7 @@ class Match(phases.Phase):
     def term(self, state: TrainState, level: int) -> Tensor | None:
         """The mean `attraction` of points of the key instant that `level` moves to other instants; None if there are no
         points, at level 0 and in trials. The points are dropped once the weight is 0."""
-        key, generator = state.key, state.generator
+        key, generator = state.key, state.noise.generator  # another thread draws from `state.generator` meanwhile
         if self._instants and not self.weight(state):
             self._keep(Points.joined([]))
         if key is None or level == 0 or state.practising or not self._instants:
