@@ -120,13 +120,12 @@ def _render(scene: Scene, fps: float) -> Video:
     from pd4dgs_codec.quality.image import to_uint8
     from pd4dgs_codec.quality.levels import level_of
     from pd4dgs_codec.web.manifests import Video
-    from pd4dgs_codec.web.package import STILL_SECONDS
+    from pd4dgs_codec.web.package import presentation_seconds
 
     check_mp4()
     if scene.info.camera is None:
         raise RenderError("the file has no camera")
-    low, high = scene.info.time_range
-    count = max(2, round((high - low if high > low else STILL_SECONDS) * fps))
+    count = max(2, round(presentation_seconds(*scene.info.time_range) * fps))
     if count > MAX_FRAMES:
         raise RenderError(f"found {count:,} frames, expected at most {MAX_FRAMES:,}; lower --fps")
     frames, level, poster = own_frames(scene.info, count), level_of(scene), BytesIO()

@@ -29,6 +29,11 @@ RATES = {"2M": 2e6, "10M": 1e7, "50M": 5e7}
 STILL_SECONDS = 1.0  #: presentation time of a static scene
 
 
+def presentation_seconds(low: float, high: float) -> float:
+    """How long manifests and video show a scene of this time range, seconds."""
+    return high - low if high > low else STILL_SECONDS
+
+
 def package(
     data: bytes, render: Callable[[Scene], Video | None] | None = None, *, immutable: bool = False
 ) -> dict[str, bytes]:
@@ -40,8 +45,7 @@ def package(
     """
     scene = decode(data)
     about = info(data)
-    low, high = about["time_range"]
-    seconds = high - low if high > low else STILL_SECONDS
+    seconds = presentation_seconds(*about["time_range"])
     if seconds > MAX_SECONDS:
         raise DeliveryError(f"found a scene of {seconds:g} s, expected at most {MAX_SECONDS:,} s for DASH")
     segments, slices = _segments(data, about, seconds)
