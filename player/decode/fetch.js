@@ -93,6 +93,10 @@ export class SceneSource {
   close() {
     this._controller?.abort();
     this._controller = this._body = null;
+    this._stopTimer();
+  }
+
+  _stopTimer() {
     clearTimeout(this._timer);
     this._timer = undefined;
   }
@@ -146,8 +150,7 @@ export class SceneSource {
         const scenes = this._feed(block);
         if (seconds < Infinity && until === Infinity && begun()) {
           until = now() + seconds;
-          clearTimeout(this._timer); // the next wait may lapse earlier than the one it was set for
-          this._timer = undefined;
+          this._stopTimer(); // the next wait may lapse earlier than the one it was set for
         }
         for (const scene of scenes) yield scene; // yield* takes longer than a small piece
       }
