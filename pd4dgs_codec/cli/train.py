@@ -13,7 +13,6 @@ from pd4dgs_codec.cli import common, options
 from pd4dgs_codec.cli.common import OK, Console, TrainingProgress, UsageError, check_output, command, number, say, table
 from pd4dgs_codec.errors import RenderError, TrainError
 from pd4dgs_codec.io import remove_leftovers
-from pd4dgs_codec.model.config import PRESETS
 from pd4dgs_codec.train.config import ABLATIONS, FIXED, OPTIONS, TrainConfig, at_quality
 
 if TYPE_CHECKING:
@@ -186,10 +185,8 @@ def _stored_config(args: argparse.Namespace) -> TrainConfig:
             raise TrainError(f"{args.resume}: found --without {part}, expected the settings of the checkpoint")
     if _same_source(args.source) != _same_source(config.source):
         _expect_same(args.resume, "SOURCE", config.source, args.source)
-    steps = config.iterations
-    if config.max_seconds is None:  # the limit stops the run early, but its schedule stays
-        steps = steps or PRESETS[config.preset].iterations
-    return replace(config, iterations=steps, max_seconds=args.max_seconds or config.max_seconds)
+    # the number of steps stays, since a time limit that comes later does not make a timed run
+    return replace(config, iterations=config.total, max_seconds=args.max_seconds or config.max_seconds)
 
 
 def _expect_same(path: str, what: str, stored: Any, asked: Any) -> None:

@@ -222,6 +222,13 @@ class TrainConfig:
         """The widths of a fresh model's anchors."""
         return Widths(self.feature_width, self.slots, viewing=tuple(self.view_dependent.split("+")))
 
+    @property
+    def total(self) -> int | None:
+        """N of the schedule; None in a timed run, which estimates it."""
+        if self.iterations is None and self.max_seconds is None:
+            return PRESETS[self.preset].iterations
+        return self.iterations
+
     def model_steps(self, steps: Steps) -> Steps:
         """The preset's `steps` with the steps named in COARSENED multiplied by `step_scale`."""
         return replace(steps, **{name: getattr(steps, name) * self.step_scale for name in COARSENED})

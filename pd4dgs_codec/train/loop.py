@@ -17,7 +17,7 @@ from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import DataError, TrainError, one_line
 from pd4dgs_codec.io import finite
 from pd4dgs_codec.model import checkpoint
-from pd4dgs_codec.model.config import PRESETS, ModelConfig
+from pd4dgs_codec.model.config import ModelConfig
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.signals import stop_request
 from pd4dgs_codec.threads import one_torch_thread
@@ -68,10 +68,9 @@ class Trainer:
 
     def __init__(self, config: TrainConfig, dataset: Dataset, device: str = "cpu", size: ModelConfig | None = None):
         """size: the model's size; by default the preset's."""
-        self.timed = config.max_seconds is not None and config.iterations is None
-        total = config.iterations or (None if self.timed else PRESETS[config.preset].iterations)
+        self.timed = config.total is None
         self.config, self.dataset = config, dataset
-        self.learner = Learner(config, dataset, Schedule(total), torch.device(device), size)
+        self.learner = Learner(config, dataset, Schedule(config.total), torch.device(device), size)
         self.learner.share = 0.0 if self.timed else None
         self._costs: list[float] = []  #: seconds of each step from which a timed run estimates N
         self._step = self._evaluation = 0.0  #: seconds of the last step and of the last evaluation
@@ -128,6 +127,7 @@ class Trainer:
     ) -> None:
         """Performs steps until the run ends or a record cannot be logged."""
         saved = now = time.monotonic()
+        limit = None if self.timed else self.config.max_seconds  # the schedule of a timed run includes its trials
 
         def before_practice(done: int, steps: int) -> None:
             late = limit is not None and self.seconds + time.monotonic() - now >= limit
@@ -137,7 +137,6 @@ class Trainer:
                 progress.on_trial(done, steps)
 
         self.learner.before_practice = before_practice
-        limit = None if self.timed else self.config.max_seconds  # a timed run plans its trials itself
         while not self.finished:
             position = self.learner.position
             try:
