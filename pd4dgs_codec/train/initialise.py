@@ -86,8 +86,8 @@ def scene_info(dataset: Dataset) -> SceneInfo:
     box = np.asarray(dataset.box, np.float32)
     side, farthest = float((box[1] - box[0]).max()), float(np.abs(box).max())
     if not side > 0 or farthest + side > MAX_VOXEL / GRID * side:
-        found = f"the scene's box is {box.tolist()}"
-        raise DataError(f"{dataset.name}: {found}, expected an extent, and at most {MAX_VOXEL // GRID} times it from 0")
+        expected = f"one with a side and at most {MAX_VOXEL // GRID} sides from 0"
+        raise DataError(f"{dataset.name}: the scene's box is {box.tolist()}, expected {expected}")
     return SceneInfo(
         voxel_size=_binary32(side / GRID),
         box=box,

@@ -37,5 +37,5 @@ def test_a_box_that_the_format_cannot_number_is_refused(dataset):
     size = dataset.box[1] - dataset.box[0]
     assert scene_info(dataclasses.replace(dataset, box=dataset.box + 1000 * size.max())).voxel_size > 0
     for box in (dataset.box + 1024 * size.max(), np.zeros((2, 3), np.float32)):
-        with pytest.raises(DataError, match="expected an extent, and at most 1024 times it from 0"):
+        with pytest.raises(DataError, match="expected one with a side and at most 1024 sides from 0"):
             scene_info(dataclasses.replace(dataset, box=box))
