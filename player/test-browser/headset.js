@@ -37,6 +37,7 @@
       setTimeout(() => {
         if (this.ended) return;
         draw(performance.now(), { getViewerPose });
+        headset.wait(); // else a slow machine gets pictures sooner than it draws them
         headset.frames++;
       }, 10);
     }
@@ -74,6 +75,12 @@
     session: null,
     /** @type {Layer | null} */
     layer: null,
+    /** Waits until the GPU has drawn. */
+    wait() {
+      const { gl, framebuffer } = /** @type {Layer} */ (this.layer);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+      gl.readPixels(0, 0, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
+    },
     read() {
       const { gl, framebuffer, framebufferWidth: w, framebufferHeight: h } = /** @type {Layer} */ (this.layer);
       const pixels = new Uint8Array(4 * w * h);
