@@ -26,9 +26,9 @@ FEW_INSTANTS = ((0.3, 3), (0.5, 5), (0.7, 9), (1.0, 17))
 TRIAL_SHARE, MIN_TRIAL = 1 / 15, 75
 #: Motion predicts if it gains MIN_GAIN dB over the static level 0 in whole pictures, so that missed motion counts, and
 #: half as much half way through the trial, ...
-MIN_GAIN = 4.2
+MIN_GAIN = 4.5
 #: ... over at most VIEWS views whose distance from the key instant is BEYOND, from and to, times the window.
-VIEWS, BEYOND = 12, (1.5, 2.0)
+VIEWS, BEYOND = 24, (1.5, 2.0)
 
 
 class OpenTime(phases.Phase):
