@@ -69,7 +69,7 @@ def open_video(path: Path, *, grey: bool = False, output: Sequence[str] = ()) ->
     from imageio_ffmpeg import read_frames  # of the extra `train`
 
     logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)  # else it warns of rotated and scaled videos
-    reader = read_frames(str(path), output_params=list(output))
+    reader = read_frames(file_url(path), output_params=list(output))
     try:
         with closing(reader):
             meta: dict[str, Any] = next(reader, {})
@@ -88,7 +88,7 @@ def open_video(path: Path, *, grey: bool = False, output: Sequence[str] = ()) ->
 def _pictures(path: Path, shape: tuple[int, ...], output: Sequence[str], promised: float) -> Iterator[np.ndarray]:
     """Decodes the pictures. promised: about how many frames the header promises; 0 if unknown."""
     pixels, size, count = "gray" if len(shape) == 2 else "rgb24", math.prod(shape), 0
-    arguments = ["-i", str(path), "-pix_fmt", pixels, *output, "-f", "rawvideo", "-"]
+    arguments = ["-i", file_url(path), "-pix_fmt", pixels, *output, "-f", "rawvideo", "-"]
     with ffmpeg(arguments, stdout=subprocess.PIPE) as run:
         assert run.process.stdout is not None
         while len(data := run.process.stdout.read(size)) == size:
@@ -100,6 +100,11 @@ def _pictures(path: Path, shape: tuple[int, ...], output: Sequence[str], promise
         raise DataError(f"{path}: is damaged: found {found}; expected a whole video")
     if said:
         warnings.warn(DamageWarning(f"{path}: is damaged: found {found}"), stacklevel=2)
+
+
+def file_url(path: Path) -> str:
+    """The file as a URL for ffmpeg, which takes the letters before a colon in a plain name for a protocol."""
+    return f"file:{path}"
 
 
 @dataclass(frozen=True)

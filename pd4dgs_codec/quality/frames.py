@@ -187,9 +187,9 @@ def write_mp4(frames: Iterator[np.ndarray], path: Path, fps: float, *, fragment:
     rate = str(Fraction(fps).limit_denominator())
     source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", rate]
     coding = ["-an", "-c:v", "libx264", "-crf", str(CRF), "-pix_fmt", "yuv420p", "-y"]
-    from pd4dgs_codec.data.videos import ffmpeg  # with the readers of datasets, which pictures do not need
+    from pd4dgs_codec.data.videos import ffmpeg, file_url  # with the readers of datasets, which pictures do not need
 
-    with ffmpeg([*source, "-i", "-", *coding, *options, "-f", "mp4", str(path)], stdin=subprocess.PIPE) as run:
+    with ffmpeg([*source, "-i", "-", *coding, *options, "-f", "mp4", file_url(path)], stdin=subprocess.PIPE) as run:
         assert run.process.stdin is not None
         with contextlib.suppress(BrokenPipeError), run.process.stdin as pipe:  # ffmpeg ended, and reports why
             for frame in itertools.chain([first], frames):

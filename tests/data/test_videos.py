@@ -119,6 +119,16 @@ def film(recorded, tmp_path):
     return Path(shutil.copy(recorded, tmp_path))
 
 
+@pytest.mark.parametrize("name", ["walk: day 1.mp4", "pipe:0", "-y é%d.mp4"])
+def test_any_name_of_a_video_is_written_and_read(name, tmp_path, monkeypatch):
+    from pd4dgs_codec.quality.frames import write_mp4
+
+    monkeypatch.chdir(tmp_path)
+    write_mp4(iter(np.zeros((3, 16, 16, 3), np.uint8)), Path(name), 30)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert sum(1 for _ in cached.open_video(Path(name)).pictures) == 3
+
+
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.97])
 def test_a_video_that_is_cut_is_refused(film, share):
     whole = film.read_bytes()
