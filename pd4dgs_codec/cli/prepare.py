@@ -7,8 +7,10 @@ from typing import Any
 from pd4dgs_codec.cli import options
 from pd4dgs_codec.cli.common import OK, Console, command, progress_bar, say
 from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.prepare import FEWEST_FRAMES
 
 CAMERAS = ("SIMPLE_RADIAL", "SIMPLE_PINHOLE", "PINHOLE", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
+FRAMES = options.checked(int, lambda n: n == 0 or n >= FEWEST_FRAMES, f"0 or an integer >= {FEWEST_FRAMES}")
 DETAILS = """\
 INPUT is a video, or a folder of frames whose names end with their numbers.
 Frames are chosen evenly over time, without blurred and repeated ones. pycolmap estimates the camera poses (pip install
@@ -29,7 +31,7 @@ def parser() -> options.Parser:
     add = p.add_argument
     add("input", type=options.named, metavar="INPUT", help="video or folder of frames")
     add("-o", "--output", required=True, type=options.named, metavar="FOLDER", help="output folder")
-    add("--frames", type=options.count, default=120, metavar="N", help="use at most N frames (default: 120; 0: all)")
+    add("--frames", type=FRAMES, default=120, metavar="N", help="use at most N frames (default: 120; 0: all)")
     what = "frame rate of a folder of frames (default: 30)"
     add("--fps", type=options.fps, metavar="F", help=what)
     add("--downscale", type=options.positive_int, default=1, metavar="K", help="downscale images by K (default: 1)")

@@ -8,6 +8,7 @@ before.
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import stat
@@ -23,7 +24,7 @@ from pd4dgs_codec.data.files import check_downscale, image_info, last_numbers, r
 from pd4dgs_codec.data.videos import open_video
 from pd4dgs_codec.errors import DataError, one_line
 from pd4dgs_codec.io import check_path, finite, write_bytes
-from pd4dgs_codec.prepare import poses
+from pd4dgs_codec.prepare import FEWEST_FRAMES, poses
 from pd4dgs_codec.prepare.poses import Advance, Features
 from pd4dgs_codec.signals import held
 from pd4dgs_codec.threads import available
@@ -35,10 +36,10 @@ Progress = Callable[[int | None, str, str], AbstractContextManager[Advance]]
 LOOK_WIDTH = 640
 #: A frame is blurred if its sharpness is below BLURRED times the median of AROUND frames on either side.
 BLURRED, AROUND = 0.4, 15
-#: A frame repeats the one before if their mean difference is below this, 8-bit levels. Video coding causes less.
+#: A frame repeats an earlier one if their mean difference is below this, 8-bit levels. Video coding causes less.
 SAME = 0.3
-#: Most frames of a recording, an hour at 60 per second; and the fewest for a pose estimate.
-MOST_FRAMES, FEWEST_FRAMES = 216_000, 8
+#: Most frames of a recording, an hour at 60 per second.
+MOST_FRAMES = 216_000
 PICTURES = {".png", ".jpg", ".jpeg"}
 STATE, REPORT = "prepare.json", "report.json"
 #: Thresholds of advice: share of frames, pixels of a picture 1000 wide, points a picture, degrees, share of features.
@@ -76,7 +77,7 @@ def prepare(
     check_folder(output, overwrite)
     recording = open_recording(source, options.fps)
     work = output.with_name(f"{output.name}.partial")
-    _begin(work, source, options)
+    _begin(work, recording, options)
     try:
         looks, choice, times = _frames(work, recording, options, progress)
         cores = options.threads if options.threads > 0 else available()
@@ -116,10 +117,11 @@ def check_folder(output: Path, overwrite: bool) -> None:
         raise DataError(f"{output}: no permission to write here")
 
 
-def _begin(work: Path, source: Path, options: Options) -> None:
+def _begin(work: Path, recording: Recording, options: Options) -> None:
     """Keeps the work of an earlier run with the same recording and options, else begins anew."""
-    stat = source.stat()
-    asked = {"source": str(source.resolve()), "size": stat.st_size, "changed": stat.st_mtime_ns}
+    stats = [path.stat() for path in (recording.path, *recording.files)]  # a folder's own time is that of its names
+    asked = {"source": str(recording.path.resolve()), "size": sum(each.st_size for each in stats)}
+    asked |= {"changed": max(each.st_mtime_ns for each in stats)}
     asked |= {name: value for name, value in asdict(options).items() if name != "threads"}
     state = work / STATE
     if work.exists():
@@ -175,9 +177,10 @@ def _poses(work: Path, times: dict[str, float], options: Options, progress: Prog
     with progress(None, "frames", "poses") as advance:
         model = poses.reconstruct(database, images, work / "models", options.threads, advance)
     posed = 0 if model is None else model.num_reg_images()
-    if model is None or posed < max(FEWEST_FRAMES, poses.LEAST_SHARE * len(names)):
+    least = max(FEWEST_FRAMES, math.ceil(poses.LEAST_SHARE * len(names)))
+    if model is None or posed < least:
         raise DataError(
-            f"found camera poses for {posed} of {len(names)} frames, expected at least half; "
+            f"found camera poses for {posed} of {len(names)} frames, expected at least {least}; "
             "record static, textured objects with a camera that moves slowly and sideways"
         )
     features = poses.moving_features(database, model)
@@ -216,7 +219,7 @@ class Look:
     """Measurements of a frame.
 
     index: in the recording. time: seconds. sharpness: variance of the Laplacian, squared 8-bit levels. change: mean
-    difference from the frame before, 8-bit levels, infinite for the first.
+    difference from the last frame that does not repeat another, 8-bit levels, infinite for the first.
     """
 
     index: int
@@ -240,7 +243,7 @@ class VideoFile:
 
     def __init__(self, path: Path):
         video = open_video(path)
-        self.path, self.size, self.fps = path, video.size, video.fps
+        self.path, self.files, self.size, self.fps = path, [path], video.size, video.fps
 
     def looks(self) -> Iterator[np.ndarray]:
         """Yields every frame, small and grey, uint8 [h, w]."""
@@ -310,14 +313,15 @@ def open_recording(path: Path, fps: float) -> Recording:
 def look(recording: Recording, advance: Advance) -> list[Look]:
     """Measures every frame. Raises DataError for too few or too many."""
     looks: list[Look] = []
-    before: np.ndarray | None = None
+    before: np.ndarray | None = None  # small steps, as in slow motion, add up to a change
     for index, small in enumerate(recording.looks()):
         if index >= MOST_FRAMES:
             raise DataError(f"{recording.path}: more than {MOST_FRAMES:,} frames, expected a shorter recording")
         picture = small.astype(np.float32)
         change = float("inf") if before is None else float(np.abs(picture - before).mean())
         looks.append(Look(index, recording.time(index), sharpness(picture), change))
-        before = picture
+        if change >= SAME:
+            before = picture
         advance()
     if len(looks) < FEWEST_FRAMES:
         raise DataError(f"{recording.path}: {len(looks)} frames, expected at least {FEWEST_FRAMES}")

@@ -70,6 +70,7 @@ CASES = [
     (2, "batch m.jsonl -o out --op encode --on ray --slurm cluster=local", "--slurm needs --on slurm"),
     (2, "prepare kept.gif -o out --fps 5", "--fps needs a folder of frames"),
     (2, "prepare empty -o out --fps 1e-300", "a number from 0.01 to 1000"),
+    (2, "prepare empty -o out --frames 5", "0 or an integer >= 8"),
     (2, "train synthetic:local -o m.pt --rollout top --key-instant 0", "--key-instant needs --rollout key"),
     *((2, f"encode m.pt -o s.pd4 --source '{text}'", "one line of printable text") for text in ("a\nb", "\udcff")),
     *((2, f"render s.pd4 -o a.gif --fps {fps}", "a number from 0.01 to 1000") for fps in (1e-4, 1e308)),

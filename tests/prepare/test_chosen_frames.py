@@ -10,7 +10,8 @@ from rooms import HEIGHT, WIDTH, walk
 from videos import write_video
 
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.prepare.stages import FEWEST_FRAMES, Look, choose, look, open_recording, sharpness, write_frames
+from pd4dgs_codec.prepare import FEWEST_FRAMES
+from pd4dgs_codec.prepare.stages import Look, choose, look, open_recording, sharpness, write_frames
 
 pytest.importorskip("imageio_ffmpeg")
 FPS = 10
@@ -105,6 +106,15 @@ def test_frames_are_spread_over_the_time_and_are_the_sharpest_of_their_stretch()
 def test_a_still_camera_before_a_still_scene_leaves_one_frame():
     choice = choose([Look(i, i / 10, 100.0, 0.0 if i else float("inf")) for i in range(20)], 10)
     assert choice.chosen == (0,) and len(choice.repeated) == 19
+
+
+def test_slow_motion_is_no_repetition(tmp_path):
+    """Ten pixels in forty frames, over a texture that changes by less than SAME from one frame to the next."""
+    x = np.arange(64) - np.arange(40)[:, None] / 4
+    rows = np.rint(128 + 8 * np.sin(2 * np.pi * x / 64)).astype(np.uint8)
+    write_folder(tmp_path / "slow", np.broadcast_to(rows[:, None, :, None], (40, 48, 64, 3)))
+    looks = look(open_recording(tmp_path / "slow", 240), nothing)
+    assert len(choose(looks, 0).chosen) >= FEWEST_FRAMES
 
 
 def test_sharpness_is_the_variance_of_the_laplacian():

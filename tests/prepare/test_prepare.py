@@ -89,6 +89,18 @@ def test_an_interruption_says_how_to_go_on(room, tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().err.splitlines()[-1].endswith(line)
 
 
+def test_pictures_that_changed_since_an_interruption_are_read_anew(tmp_path, monkeypatch):
+    frames = write(tmp_path / "frames", walk(COUNT)[0])
+    with monkeypatch.context() as patch:
+        patch.setattr(poses, "extract", Mock(side_effect=KeyboardInterrupt))
+        for _ in range(2):
+            assert main([str(frames), "-o", str(tmp_path / "out")]) == 1
+            written = np.asarray(Image.open(tmp_path / "out.partial" / "images" / "frame_000003.png"))
+            np.testing.assert_array_equal(written, np.asarray(Image.open(frames / "003.png")))
+            for file in frames.iterdir():
+                Image.fromarray(255 - np.asarray(Image.open(file))).save(file)  # the folder stays as it was
+
+
 @pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
 def test_signals_are_ours_once_pycolmap_is_loaded(number):
     """Its C++ would print a stack."""
@@ -130,7 +142,7 @@ def test_unregistrable_recording_is_refused_and_leaves_nothing(tmp_path, capsys)
     frames = write(tmp_path / "noise", [rng.integers(0, 255, (96, 128, 3), np.uint8) for _ in range(10)])
     assert main([str(frames), "-o", str(tmp_path / "out"), "-j", "2"]) == 1
     lines = capsys.readouterr().err.strip().splitlines()
-    assert "found camera poses for 0 of 10 frames" in lines[-1]
+    assert "found camera poses for 0 of 10 frames, expected at least 8" in lines[-1]
     assert sorted(path.name for path in tmp_path.iterdir()) == ["noise"]
 
 
