@@ -78,6 +78,8 @@ def _lens(file: dict[str, Any], frame: dict[str, Any], size: Callable[[], tuple[
     else:
         width, height = (whole_number(get(k), f"{where}: {k}", low=1) for k in ("w", "h"))
     model = get("camera_model")
+    if model is None and get("is_fisheye"):  # of instant-ngp
+        model = FISHEYE_MODEL
     if model is not None and not isinstance(model, str):
         raise DataError(f"{where}: camera_model is {one_line(repr(model), 60)}, expected a name")
     fisheye = model == FISHEYE_MODEL
@@ -124,8 +126,18 @@ def _frames(folder: Path, path: Path) -> tuple[list[UnreadView], dict[str, Any]]
         if frame.get("time") is not None:
             time = number(frame["time"], f"{where}: time", largest=LARGEST_TIME)
         lens = _lens(file, frame, partial(size, image), where)
-        frames.append(UnreadView(image.stem, 0, time, viewmat, lens, image))
+        frames.append(UnreadView(image.stem, 0, time, viewmat, lens, image, _mask(folder, frame, where)))
     return frames, file
+
+
+def _mask(folder: Path, frame: dict[str, Any], where: str) -> Path | None:
+    """The file of nerfstudio's mask of a frame, black where pixels are not valid, or None."""
+    named = frame.get("mask_path")
+    if named is None:
+        return None
+    if not isinstance(named, str):
+        raise DataError(f"{where}: mask_path is {one_line(repr(named), 60)}, expected the name of a picture")
+    return find_image(folder, named)
 
 
 def _stored_depth(folder: Path, file: dict[str, Any]) -> tuple[float, float] | None:

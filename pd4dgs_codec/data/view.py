@@ -16,6 +16,7 @@ from pd4dgs_codec.data.files import (
     check_pixels,
     image_info,
     read_image,
+    read_mask,
     shrink_image,
     shrink_mask,
 )
@@ -45,8 +46,8 @@ class View:
     K: float32 [3, 3], pixels of `image`, pixel centres at +0.5.
     time: 0..1 over the dataset's time range (train and test together).
     image: uint8 [height, width, 3], sRGB as stored.
-    mask: bool [height, width], True = valid; None = all valid. Holds the undistortion border and, on test views,
-        the covisibility mask.
+    mask: bool [height, width], True = valid; None = all valid. Holds the undistortion border, the dataset's own mask
+        and, on test views, the covisibility mask.
     """
 
     viewmat: np.ndarray
@@ -163,7 +164,8 @@ def downscaled_matrix(K: np.ndarray, downscale: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class UnreadView:
-    """A frame of a dataset before its pixels are read. viewmat: float64 [4, 4] world to camera; time: as stored."""
+    """A frame of a dataset before its pixels are read. viewmat: float64 [4, 4] world to camera; time: as stored; mask:
+    a picture of the size of `image` that is black where pixels are not valid."""
 
     name: str
     camera_id: int
@@ -171,6 +173,7 @@ class UnreadView:
     viewmat: np.ndarray
     lens: Lens
     image: Path
+    mask: Path | None = None
 
 
 def check_rotation(rotation: np.ndarray, where: str) -> None:
@@ -272,12 +275,15 @@ def shrunk_view(view: View, k: int) -> View:
 def read_view(frame: UnreadView, time: float, downscale: int, under: Color | None) -> View:
     """The frame with its pixels, undistorted and downscaled. time: normalised. under: as in `read_image`."""
     lens, size = frame.lens, (frame.lens.width, frame.lens.height)
-    mask = None
     if lens.is_pinhole:
         image = read_image(frame.image, size, downscale=downscale, under=under)
+        mask = None if frame.mask is None else read_mask(frame.mask, size, downscale=downscale)
     else:
         check_downscale(size, downscale, str(frame.image))
         image, seen = rectify(read_image(frame.image, size, under=under), lens)
+        if frame.mask is not None:
+            valid = np.where(read_mask(frame.mask, size), 255, 0)[..., None].astype(np.uint8)
+            seen = seen & (rectify(valid, lens)[0][..., 0] == 255)  # all pixels between which a place lies
         image, mask = shrink_image(image, downscale), shrink_mask(seen, downscale)
     height, width = image.shape[:2]
     viewmat = frame.viewmat.astype(np.float32)
@@ -365,7 +371,7 @@ def border_color(views: Sequence[View]) -> tuple[float, float, float]:
     return float(r), float(g), float(b)
 
 
-def mean_up(frames: Sequence[UnreadView]) -> tuple[float, float, float]:
+def mean_up(frames: Sequence[UnreadView | Camera]) -> tuple[float, float, float]:
     """Unit mean of the cameras' up directions (minus OpenCV's y axis)."""
     up = -np.mean([f.viewmat[1, :3] for f in frames], axis=0)
     norm = np.linalg.norm(up)

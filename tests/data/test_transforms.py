@@ -104,6 +104,8 @@ FAULTS = {
         ("points.ply", ply("ascii").replace(b"2\n", b"99999999999\n", 1), "0 vertex lines"),
         ("transforms.json", {"camera_model": ["PINHOLE"]}, "camera_model is ['PINHOLE'], expected a name"),
         ("transforms.json", {"camera_model": {}}, "camera_model is {}, expected a name"),
+        ("transforms.json", frame(mask_path=3), "mask_path is 3, expected the name of a picture"),
+        ("transforms.json", frame(mask_path="m/0.png"), "m/0.png: image is missing"),
         ("transforms.json", {"ply_file_path": "../points.ply"}, "'../points.ply' is not the name of a file in"),
         ("transforms.json", {"ply_file_path": "/etc/passwd"}, "'/etc/passwd' is not the name of a file in"),
         ("transforms.json", {"ply_file_path": "p\0.ply"}, "is not the name of a file in"),
@@ -284,6 +286,7 @@ LENSES = {
     "pinhole": {},
     "distorted": {"camera_model": "OPENCV", "k1": 0.12, "k2": -0.03, "p1": 0.004, "p2": -0.003},
     "fisheye": {"camera_model": "OPENCV_FISHEYE", "k1": 0.05, "k2": -0.01, "k3": 0.002, "k4": -0.001},
+    "fisheye of instant-ngp": {"is_fisheye": True, "k1": 0.05, "k2": -0.01, "k3": 0, "k4": 0},
 }
 
 
@@ -307,7 +310,7 @@ def test_pictures_are_resampled_by_the_formulas_of_opencv(tmp_path, name):
     x, y = (u - cx) / fx, (v - cy) / fy
     k, r = [lens.get(f"k{i}", 0.0) for i in range(1, 5)], np.hypot(x, y)
     p1, p2 = (lens.get(f"p{i}", 0.0) for i in (1, 2))
-    if name == "fisheye":
+    if "fisheye" in name:
         angle = np.arctan(r)
         scale = angle * (1 + sum(k[i] * angle ** (2 * i + 2) for i in range(4))) / r
         xd, yd = scale * x, scale * y
@@ -318,6 +321,25 @@ def test_pictures_are_resampled_by_the_formulas_of_opencv(tmp_path, name):
     seen = np.ones(u.shape, bool) if view.mask is None else view.mask
     assert (view.mask is None) == (name == "pinhole") and seen.mean() > 0.8
     assert np.abs(view.image - _levels(fx * xd + cx, fy * yd + cy))[seen].max() < 2
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_masks_of_frames_are_read_and_resampled(tmp_path, name):
+    """Black beside a slanted line; the second frame has no mask."""
+    u, v = np.meshgrid(np.arange(80) + 0.5, np.arange(60) + 0.5)
+    levels, black = _levels(u, v).astype(np.uint8), u + v / 2 < 30
+    levels[black] = 0  # so that a resampled pixel is as dark as its share of invalid ones
+    save(tmp_path / "0.png", levels)
+    save(tmp_path / "masks" / "0.png", np.where(black, 0, 255).astype(np.uint8))
+    frame = {"file_path": "0.png", "transform_matrix": pose()}
+    frames = [frame | {"mask_path": "masks/0.png"}, frame]
+    save(tmp_path / "transforms.json", {"fl_x": 75, **LENSES[name], "frames": frames})
+    for downscale in (1, 3):
+        view, bare = load(tmp_path, holdout=0, downscale=downscale).train
+        seen = np.ones(view.image.shape[:2], bool) if bare.mask is None else bare.mask
+        dark = view.image.min(axis=2) < 60
+        assert 0.1 < dark.mean() < 0.3 and not view.mask[dark].any()
+        assert view.mask[seen].mean() > 0.7 and not view.mask[~seen].any()
 
 
 @pytest.mark.slow
