@@ -30,7 +30,7 @@ import numpy as np
 
 from pd4dgs_codec.archives import read_tensors
 from pd4dgs_codec.data.files import LARGEST, WHITE, Color, array, number, read_file, whole_number
-from pd4dgs_codec.data.view import check_rotation, rotation_matrix, world_to_camera
+from pd4dgs_codec.data.view import check_rotation, mean_up, rotation_matrix, world_to_camera
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.splats import (
     Splats,
@@ -168,7 +168,7 @@ def read_cameras(path: Path) -> tuple[list[Camera], tuple[float, float, float]]:
         raise DataError(f"{path}: cannot be read as JSON: {error}") from None
     if not (isinstance(rows, list) and rows and all(isinstance(row, dict) for row in rows)):
         raise DataError(f"{path}: expected a list of cameras with position, rotation, fx, fy, width and height")
-    cameras, downs = [], []
+    cameras = []
     for i, row in enumerate(rows):
         where = f"{path}: camera {i}:"
         turn = array(row.get("rotation"), (3, 3), f"{where} rotation")
@@ -178,9 +178,7 @@ def read_cameras(path: Path) -> tuple[list[Camera], tuple[float, float, float]]:
         width, height = (whole_number(row.get(key), f"{where} {key}", 1, 65535) for key in ("width", "height"))
         K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], np.float32)
         cameras.append(Camera(world_to_camera(turn.T, place).astype(np.float32), K, width, height))
-        downs.append(turn[:, 1])
-    x, y, z = (float(np.float32(v)) for v in -unit(np.mean(downs, axis=0)))
-    return cameras, (x, y, z)
+    return cameras, mean_up(cameras)
 
 
 # -- Gaussians that a network moves ------------------------------------------------------------------------------------

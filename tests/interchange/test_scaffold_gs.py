@@ -173,6 +173,9 @@ def test_run_files_give_voxel_background_and_camera(tmp_path):
     np.testing.assert_allclose(viewmat @ [1, 2, 3, 1], [0, 0, 0, 1], atol=1e-6)
     np.testing.assert_allclose(viewmat[:3, :3], np.transpose(turn))
     assert (info.camera.width, info.camera.height, info.camera.K[1, 1]) == (64, 48, 51)
+    upside_down = row | {"rotation": [[1, 0, 0], [0, 0, -1], [0, 1, 0]]}
+    (tmp_path / "cameras.json").write_text(json.dumps([row, upside_down]))
+    assert np.linalg.norm(read_scaffold_gs(tmp_path, Choices()).info.up) == pytest.approx(1)
     for content, message in (
         ("[]", "expected a list of cameras with position"),
         ("[3]", "expected a list of cameras"),
