@@ -163,6 +163,13 @@ def inside(folder: Path, name: str) -> Path:
     raise DataError(f"{folder}: {one_line(repr(name), 120)} is not the name of a file in this folder")
 
 
+def files_of(folder: Path, suffixes: Iterable[str]) -> list[Path]:
+    """The files of a folder with one of these suffixes, in lower or upper case, by name; without hidden ones, such as
+    the `._NAME` that macOS adds to each NAME."""
+    wanted = set(suffixes)
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in wanted and not p.name.startswith("."))
+
+
 def last_numbers(paths: Iterable[Path]) -> list[int] | None:
     """The last number in each file name without suffix; None if any name has none."""
     found = [re.findall(r"\d{1,15}", path.stem) for path in paths]
@@ -396,7 +403,7 @@ def read_vertices(path: Path, raw: bytes | None = None) -> np.ndarray:
 
 def read_only_ply(folder: Path) -> np.ndarray | None:
     """`read_ply` of the only PLY file in a folder; None if there is none or more than one."""
-    found = list(folder.glob("*.ply"))
+    found = files_of(folder, [".ply"])
     return read_ply(found[0]) if len(found) == 1 else None
 
 

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.data.dataset import color, load
-from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, last_numbers, read_file, split_options
+from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, files_of, last_numbers, read_file, split_options
 from pd4dgs_codec.data.view import Dataset, View, depth_range, held_out, normalised_times, points_box, seconds_range
 from pd4dgs_codec.errors import DataError, one_line, required
 from pd4dgs_codec.interchange.runs import read_cameras, read_deformed
@@ -228,10 +228,9 @@ def read_model(place: str, fps: float) -> Teacher:
 
 def _folder(folder: Path, fps: float) -> Teacher:
     """Reads a folder of one file per frame, in the order of the last number in the names."""
-    paths = max(([p for p in folder.iterdir() if p.suffix.lower() == suffix] for suffix in FRAME_SUFFIXES), key=len)
+    paths = max((files_of(folder, [suffix]) for suffix in FRAME_SUFFIXES), key=len)
     if not paths:
         raise DataError(f"{folder}: holds no file that ends in {' or '.join(FRAME_SUFFIXES)}, expected one per frame")
-    paths.sort()
     paths = [path for _, path in sorted(zip(last_numbers(paths) or range(len(paths)), paths, strict=True))]
     times = tuple(i / max(len(paths) - 1, 1) for i in range(len(paths)))
 

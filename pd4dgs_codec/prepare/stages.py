@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.data.files import check_downscale, image_info, last_numbers, read_image, shrink_image
+from pd4dgs_codec.data.files import check_downscale, files_of, image_info, last_numbers, read_image, shrink_image
 from pd4dgs_codec.data.videos import open_video
 from pd4dgs_codec.errors import DataError, one_line
 from pd4dgs_codec.io import check_path, finite, write_bytes
@@ -273,7 +273,7 @@ class FrameFolder:
     """A folder of pictures of one size, in the order of the last number in their names, at `fps` numbers per second."""
 
     def __init__(self, path: Path, fps: float):
-        files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in PICTURES]
+        files = files_of(path, PICTURES)
         if not files:
             raise DataError(f"{path}: found no picture, expected frames as {', '.join(sorted(PICTURES))}")
         numbered = dict(zip(last_numbers(files) or range(len(files)), files, strict=True))

@@ -238,6 +238,13 @@ def test_named_points_go_before_the_only_one(blender):
     assert load(folder).points.tolist() == [[2.0, 0.0, 0.0]]
 
 
+def test_hidden_files_are_no_points(blender):
+    folder = blender(ply_file_path=None)
+    save(folder / "a.ply", ply("ascii", b"1 0 0\n", vertices=1))
+    save(folder / "._a.ply", b"of macOS")
+    assert load(folder).points.tolist() == [[1.0, 0.0, 0.0]]
+
+
 def test_box_and_depth_without_points(blender):
     d = load(blender())
     np.testing.assert_allclose(d.box, [[-1.3] * 3, [1.3] * 3], atol=1e-5)

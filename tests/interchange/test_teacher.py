@@ -87,7 +87,9 @@ def test_splat_files_of_other_programs(name, count):
 
 
 def test_frames_are_in_the_order_of_their_numbers(tmp_path):
-    teacher = read_model(str(_sequence(tmp_path / "seq")), 10)
+    folder = _sequence(tmp_path / "seq")
+    (folder / "._hidden.ply").write_bytes(b"of macOS")
+    teacher = read_model(str(folder), 10)
     assert teacher.times == (0.0, 0.5, 1.0) and teacher.seconds == pytest.approx(0.2)
     base = make_splats(200, 1).means[:, 0].mean()
     shifts = [teacher.splats(t).means[:, 0].mean() - base for t in teacher.times]

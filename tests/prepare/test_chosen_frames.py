@@ -43,6 +43,7 @@ def write_folder(path, pictures) -> None:
     path.mkdir()
     for i, picture in enumerate(pictures):
         Image.fromarray(picture).save(path / f"shot{i + 1}.png")  # 10 comes after 9
+    (path / "._shot1.png").write_bytes(b"of macOS")
 
 
 @pytest.mark.parametrize("kind", ["video", "folder"])
