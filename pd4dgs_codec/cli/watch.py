@@ -146,6 +146,8 @@ class WatchedProgress(TrainingProgress):
             self.time.value = ((now - self._began) / self._span) % 1.0
         level, t = min(int(self.level.value), trainer.model.level), float(np.clip(self.time.value, 0, 1))
         eye = client.camera
+        if not (eye.image_width and eye.image_height):  # a window without a picture, of which viser has no aspect
+            return
         what = (tuple(eye.wxyz), tuple(eye.position), eye.fov, eye.aspect, level, t)
         shown = self._shown.setdefault(key, _Shown())
         moved = what != shown.what

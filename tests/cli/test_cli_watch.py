@@ -42,7 +42,7 @@ def watched(trainer):
 class Browser:
     """Looks from the data set's first camera."""
 
-    def __init__(self, progress: WatchedProgress, view):
+    def __init__(self, progress: WatchedProgress, view, height: int = HEIGHT):
         import msgspec
         from viser import _messages
 
@@ -51,7 +51,7 @@ class Browser:
         eye = np.linalg.inv(view.viewmat.astype(np.float64))
         self.pose = tuple(quaternions(eye[None, :3, :3])[0].tolist()), tuple(eye[:3, 3].tolist())
         look_at = tuple(map(float, eye[:3, 3] + eye[:3, 2]))
-        self.send(_messages.ViewerCameraMessage(*self.pose, FOV, 0.01, 100.0, HEIGHT, WIDTH, look_at, (0.0, 0.0, 1.0)))
+        self.send(_messages.ViewerCameraMessage(*self.pose, FOV, 0.01, 100.0, height, WIDTH, look_at, (0.0, 0.0, 1.0)))
         wait_for(lambda: progress.server.get_clients())
 
     def send(self, message) -> None:
@@ -127,6 +127,11 @@ def test_nothing_is_drawn_while_nobody_looks(watched, trainer, monkeypatch):
     monkeypatch.setattr(watched, "_tell", never)
     for _ in range(3):
         _step(trainer, watched)
+
+
+def test_a_window_without_height_does_not_end_the_run(watched, trainer, dataset):
+    Browser(watched, dataset.train[0], height=0)
+    _step(trainer, watched)
 
 
 def test_curves_grow_with_the_run(watched, trainer, dataset):
