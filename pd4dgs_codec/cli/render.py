@@ -106,6 +106,7 @@ def _check_usage(args: argparse.Namespace) -> str:
     kind = Path(args.output).suffix.lower()
     if args.output == STDIO or kind not in (*PICTURES, *VIDEOS):
         raise UsageError(f"found -o {args.output}, expected images such as out/%04d.png, or a .gif or .mp4")
+    common.check_other_file(args.input, args.output)
     if args.data and args.orbit:
         raise UsageError("found --orbit and --data, expected one of them")
     options.conditional(args, args.data, "needs --data SOURCE", split="test", holdout=options.READING["holdout"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import struct
 import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -158,7 +159,8 @@ def write_pictures(frames: Iterator[np.ndarray], paths: list[Path]) -> None:
 
 
 def write_gif(frames: Iterator[np.ndarray], path: Path, fps: float) -> None:
-    """Writes a looping GIF; all frames share the palette of the first, so that still parts do not flicker."""
+    """Writes a looping GIF; all frames share the palette of the first, so that still parts do not flicker. Raises
+    DataError if a picture would stay for longer than a GIF can say."""
     from PIL import Image
 
     images = [Image.fromarray(frame) for frame in frames]
@@ -166,9 +168,12 @@ def write_gif(frames: Iterator[np.ndarray], path: Path, fps: float) -> None:
     indexed = [image.quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for image in images]
     starts = [10 * round(100 * i / fps) for i in range(len(images) + 1)]  # GIF counts hundredths of a second
     durations = [stop - start for start, stop in itertools.pairwise(starts)]
-    indexed[0].save(
-        path, format="GIF", save_all=True, append_images=indexed[1:], duration=durations, loop=0, optimize=False
-    )
+    options = {"duration": durations, "loop": 0, "optimize": False}
+    try:
+        indexed[0].save(path, format="GIF", save_all=True, append_images=indexed[1:], **options)
+    except (OverflowError, struct.error):  # of Pillow by version; it joins equal pictures
+        what = f"a still picture lasts too long for a .gif at {fps:g} frames per second; expected more"
+        raise DataError(what) from None
 
 
 def write_mp4(frames: Iterator[np.ndarray], path: Path, fps: float, *, fragment: int | None = None) -> None:

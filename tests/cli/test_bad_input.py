@@ -100,6 +100,7 @@ CASES = [
     (2, "render s.pd4 -o %04d-%04d.png", "%04d"),
     (2, "render s.pd4 -o a.gif --data set --orbit 3", "--orbit"),
     (2, "render SCENE -o b.png --frames 2", "--frames 1"),
+    (2, "render kept.gif -o kept.gif -f", "-o names the input kept.gif"),
     (2, "eval s.pd4", "SOURCE"),
     (2, "eval s.pd4 set --downscale half", "an integer >= 1"),
     (2, "export SCENE -o out --to obj", "invalid choice: 'obj'"),

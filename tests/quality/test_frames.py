@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-from pd4dgs_codec.errors import RenderError
+from pd4dgs_codec.errors import DataError, RenderError
 from pd4dgs_codec.quality import frames
 from pd4dgs_codec.scene import Camera, SceneInfo
 
@@ -104,3 +104,9 @@ def test_gif_keeps_order_count_and_speed(tmp_path):
     frames.write_gif(iter([mixed, *(np.tile(i, (1, 3, 1)) for i in images)]), tmp_path / "b.gif", 30.0)
     shown = ImageSequence.Iterator(Image.open(tmp_path / "b.gif"))
     assert [frame.info["duration"] for frame in shown] == [30, 40, 30, 30]
+
+
+def test_a_still_gif_too_long_for_its_format_is_refused_in_one_line(tmp_path):
+    still = [np.zeros((2, 2, 3), np.uint8)] * 8  # of 100 s each; a picture lasts at most 655.35 s
+    with pytest.raises(DataError, match="too long for a .gif at 0.01 frames per second"):
+        frames.write_gif(iter(still), tmp_path / "a.gif", 0.01)
