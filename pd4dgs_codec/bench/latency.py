@@ -2,7 +2,7 @@
 
     python -m pd4dgs_codec.bench.latency URL
 
-is the cold viewer: a process that renders each level as it arrives and prints a line per image.
+is the cold viewer: a process that renders each level as it arrives and prints a line per image, its level first.
 """
 
 from __future__ import annotations
@@ -66,9 +66,9 @@ def arrivals(url: str, ends: Sequence[int]) -> list[float]:
     return seconds
 
 
-def pictures(url: str, ready: Callable[[], object] = lambda: None) -> Iterator[tuple[float, float]]:
-    """Renders each level at time 0 with the file's own camera as soon as it is decoded. Yields (seconds since the
-    request, seconds since the last byte of its layer). ready: called before each rendering.
+def pictures(url: str, ready: Callable[[], object] = lambda: None) -> Iterator[tuple[int, float, float]]:
+    """Renders each slice at time 0 with the file's own camera as soon as it is decoded. Yields (level, seconds since
+    the request, seconds since the last byte of the slice). ready: called before each rendering.
 
     Raises what SceneClient.scenes raises, and DataError for a file without a camera.
     """
@@ -83,23 +83,25 @@ def pictures(url: str, ready: Callable[[], object] = lambda: None) -> Iterator[t
 
             level_of(scene).picture(scene.info.camera, 0.0)
             now = time.monotonic()
-            yield now - start, now - last_byte
+            yield scene.level, now - start, now - last_byte
 
 
-def cold_start(url: str, **environment: str) -> list[float]:
-    """Returns seconds from the start of a viewer's process to each of its images. Raises DeliveryError if it fails."""
+def cold_start(url: str, **environment: str) -> list[tuple[int, float]]:
+    """Returns (level, seconds from the start of a viewer's process) of each of its images. Raises DeliveryError if it
+    fails."""
     start = time.perf_counter()
     with python("-m", "pd4dgs_codec.bench.latency", url, **environment) as lines:
-        seconds = [time.perf_counter() - start for _ in lines]
-    if not seconds:
+        images = [(int(line.partition(":")[0]), time.perf_counter() - start) for line in lines]
+    if not images:
         raise DeliveryError(f"{url}: the viewer's process rendered nothing")
-    return seconds
+    return images
 
 
 def times(data: bytes, rate: float, runs: int, step: Callable[[], None] = lambda: None) -> list[dict[str, Any]]:
     """Returns a row per level of a file: rate (bits per second), level, bytes S of the prefix, and seconds, medians of
     `runs`. expected: 8S/rate. network: from the request to the last byte. picture: from the request to the image in a
     warm process, of which after_last_byte come after the last byte. cold: from the start of a new process to the image.
+    The image of a sliced level is that with all its slices.
 
     `step` is called 3 times per run.
     """
@@ -110,9 +112,9 @@ def times(data: bytes, rate: float, runs: int, step: Callable[[], None] = lambda
         for _ in range(runs):
             network.append(arrivals(url, [end for _, end in layers]))
             step()
-            warm.append(list(pictures(url)))
+            warm.append({level: seconds for level, *seconds in pictures(url)})  # the last image of a level is whole
             step()
-            cold.append(cold_start(url))
+            cold.append(dict(cold_start(url)))
             step()
     return [
         {
@@ -121,9 +123,9 @@ def times(data: bytes, rate: float, runs: int, step: Callable[[], None] = lambda
             "bytes": end,
             "expected": 8 * end / rate,
             "network": median(run[i] for run in network),
-            "picture": median(run[i][0] for run in warm),
-            "after_last_byte": median(run[i][1] for run in warm),
-            "cold": median(run[i] for run in cold),
+            "picture": median(run[layer][0] for run in warm),
+            "after_last_byte": median(run[layer][1] for run in warm),
+            "cold": median(run[layer] for run in cold),
         }
         for i, (layer, end) in enumerate(layers)
     ]
@@ -132,7 +134,7 @@ def times(data: bytes, rate: float, runs: int, step: Callable[[], None] = lambda
 def first_start(data: bytes, rate: float) -> float:
     """Returns seconds to the first image of a process without compiled kernels, as after installation."""
     with tempfile.TemporaryDirectory(prefix="pd4dgs-") as cache, served(data, rate) as url:
-        return cold_start(url, NUMBA_CACHE_DIR=cache)[0]
+        return cold_start(url, NUMBA_CACHE_DIR=cache)[0][1]
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
@@ -161,8 +163,8 @@ def main(url: str) -> None:
     threads.load_numba()
     warming = threading.Thread(target=_warm_up)
     warming.start()
-    for seconds, _ in pictures(url, ready=warming.join):
-        print(f"image after {seconds:.3f} s", flush=True)
+    for level, seconds, _ in pictures(url, ready=warming.join):
+        print(f"{level}: image after {seconds:.3f} s", flush=True)
 
 
 if __name__ == "__main__":

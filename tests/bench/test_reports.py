@@ -170,6 +170,17 @@ def test_latency_of_a_file(scene_pd4, data, capsys, monkeypatch):
         assert 0 < row["after_last_byte"] <= row["picture"] and 0 < row["network"] and 0 < row["cold"]
 
 
+def test_the_image_of_a_sliced_level_is_that_with_all_its_slices(scene):
+    data = encode(scene, effort=1, slices=1000)
+    first, *_, last = info(data)["layers"]
+    assert len(first["slices"]) > 3  # the third image is of level 0
+    rate = 8 * len(data) / 1.5
+    rows = latency.times(data, rate, 1)
+    assert [row["level"] for row in rows] == [0, 1, 2] and rows[2]["bytes"] == last["end"]
+    for row in rows:
+        assert min(row["network"], row["picture"], row["cold"]) > 0.9 * row["expected"]
+
+
 def test_a_file_without_a_camera_cannot_be_rendered(scene, tmp_path):
     blind = encode(replace(scene, info=replace(scene.info, camera=None)), layers=0, effort=1)
     (tmp_path / "scene.pd4").write_bytes(blind)
