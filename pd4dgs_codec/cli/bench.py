@@ -8,7 +8,6 @@ import json
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pd4dgs_codec.cli import common, options
@@ -362,7 +361,7 @@ def parser(name: str | None = None) -> options.Parser:
         report.add_options(p)
         if report.plot:
             what = "plot error against cost on log axes, with the Pareto front"
-            p.add_argument("-o", "--plot", metavar="FILE.png", help=what)
+            p.add_argument("-o", "--plot", type=options.ending(".png"), metavar="FILE.png", help=what)
         p.add_common(json_file=True)
         return p
     lines = [f"  {name:<11} {report.summary}" for name, report in REPORTS.items()]
@@ -392,8 +391,6 @@ def _report(execute: Callable[[argparse.Namespace], Outcome], args: argparse.Nam
 
     console.json = args.json == STDIO
     plot = getattr(args, "plot", None)
-    if plot is not None and Path(plot).suffix.lower() != ".png":
-        raise UsageError(f"found --plot {plot}, expected a name that ends in .png")
     for path in (plot, args.json):
         if path is not None:
             common.check_output(path, args.overwrite)

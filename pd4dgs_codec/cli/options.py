@@ -73,8 +73,8 @@ class Parser(argparse.ArgumentParser):
         add("-h", "--help", action="help", help="show this help and exit")
         add("--version", action=_Version, nargs=0, help="show the version and exit")
         if json_file:
-            what = "write the result to FILE as one JSON object (default: to stdout, in place of the text)"
-            add("--json", nargs="?", const="-", metavar="FILE", help=what)
+            what = "write the result as one JSON object to this file (default: to stdout, in place of the text)"
+            add("--json", nargs="?", const="-", type=ending(".json", "-"), metavar="FILE.json", help=what)
         else:
             add("--json", action="store_true", help="print the result as one JSON object on stdout")
         add("-v", "--verbose", action="store_true", help="print more messages")
@@ -158,6 +158,11 @@ named = checked(str, lambda text: text not in ("", "-"), "the name of a file or 
 line = checked(str, str.isprintable, "one line of printable text")
 host = checked(str, bool, "a host name or an IP address")
 finite_float = checked(float, math.isfinite, "a number")
+
+
+def ending(suffix: str, *others: str) -> Callable[[str], str]:
+    """Makes the type of outputs that end in `suffix`, so that none is an input by mistake. others: names without it."""
+    return checked(str, lambda text: text in others or text.lower().endswith(suffix), f"a name that ends in {suffix}")
 
 
 def listed(kind: Callable[[str], T]) -> Callable[[str], tuple[T, ...]]:

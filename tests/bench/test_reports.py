@@ -208,6 +208,8 @@ def test_help_has_examples(report, capsys):
         ("codec none.pt --efforts 1,12", 2, "from 1 to 9"),
         ("codec none.pt --modes ans,zip", 2, "ans, lzma"),
         ("codec none.pt --plot p.gif", 2, "ends in .png"),
+        ("codec --json none.pt", 2, "ends in .json"),
+        ("latency --json none.pd4 other.pd4 -f", 2, "ends in .json"),
         ("render none.pd4 --only kernel", 2, "kernels"),
         ("render none.pd4 --holdout 0", 2, "--holdout needs --data"),
         ("train", 2, "--from"),
