@@ -18,7 +18,10 @@ from pd4dgs_codec.scene import Camera, Deformation, Network, Scene, SceneInfo, S
 TINY = ModelConfig(*[DeformationConfig(((4, 4),), 4, 8)] * 2, hidden=8, initial_anchors=300, max_anchors=600)
 WIDTH, HEIGHT = 32, 24
 #: Held-out quality that `checkpoint_of` tells of.
-CURVE = [{"seconds": 2.0, "psnr": [10.0, 20.0]}, {"seconds": 4.0, "psnr": [12.0, 40.0]}]
+CURVE = [
+    {"iteration": 1, "seconds": 2.0, "psnr": [10.0, 20.0]},
+    {"iteration": 2, "seconds": 4.0, "psnr": [12.0, 40.0]},
+]
 
 
 def camera_ahead(distance: float = 3.0, focal: float = 30.0, width: int = WIDTH, height: int = HEIGHT) -> Camera:

@@ -1,23 +1,27 @@
 """Measures error against run time of codec, rasterisers and trainer. Errors are RMSE of images in 0..1, not rounded to
 8 bits. A point or run is a dict, as in the report's JSON."""
 
+from __future__ import annotations
+
 import json
 import math
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from pd4dgs_codec.bench.report import Panel, clock, markdown, optional, spread, summary
-from pd4dgs_codec.errors import DataError, RenderError
+from pd4dgs_codec.errors import DataError, RenderError, one_line
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.info import hashes, info
 from pd4dgs_codec.quality.frames import Frame
 from pd4dgs_codec.quality.levels import Level, load_levels
-from pd4dgs_codec.scene import Scene
+
+if TYPE_CHECKING:
+    from pd4dgs_codec.model.model import Model
 
 Point = dict[str, Any]
 Step = Callable[[], None]
@@ -38,16 +42,20 @@ def _psnr(error: float | None) -> str:
 
 
 def codec_points(
-    model: str, scene: Scene, frames: Sequence[Frame], settings: Iterable[Setting], repeats: int, step: Step
+    model: Model, frames: Sequence[Frame], settings: Iterable[Setting], repeats: int, step: Step
 ) -> list[Point]:
-    """Measures a point per setting for the checkpoint `model`, whose scene is `scene`. error: of the highest level's
-    images from the checkpoint's images. `step` is called after each point. Encoding is timed without verification,
-    which takes one more decoding. Raises Pd4Error."""
+    """Measures a point per setting for a checkpoint's model. error: of the highest level's images from the model's.
+    `step` is called after each point. Encoding is timed without verification, which takes one more decoding. Raises
+    Pd4Error."""
+    from pd4dgs_codec.model.model import to_scene
+    from pd4dgs_codec.quality.measure import pictures
 
-    def images(level: Level) -> list[np.ndarray]:
+    def images(data: bytes) -> list[np.ndarray]:
+        (level,) = load_levels(data, last_only=True)
         return [level.picture(frame.camera, frame.time) for frame in frames]
 
-    expected = images(load_levels(model, last_only=True)[-1])
+    scene = to_scene(model)
+    expected = pictures(model, model.level, [(frame.camera, frame.time) for frame in frames])
     encode(scene, effort=1, verify=False)  # loads the libraries, before any timing
     errors: dict[str, float] = {}
     points = []
@@ -56,7 +64,7 @@ def codec_points(
         data, seconds = clock(partial(encode, scene, **options), repeats)
         key = json.dumps(hashes(data))  # all modes code the same values and give the same images
         if key not in errors:
-            errors[key] = rmse(images(load_levels(data, last_only=True)[-1]), expected)
+            errors[key] = rmse(images(data), expected)
         given = {"step_scale": scale, "effort": effort, "error": errors[key], "encode": summary(seconds)}
         points.append(file_point(data, repeats) | given)
         step()
@@ -202,18 +210,30 @@ def run_of(name: str, curve: Sequence[Point], anchors: int) -> Point:
     return {"name": name, "curve": points, "anchors": anchors}
 
 
-def recorded_run(path: str) -> Point:
-    """Reads the run that a checkpoint records. Raises DataError if it was never evaluated."""
+def recorded_runs(paths: Sequence[str]) -> list[Point]:
+    """Reads the runs that checkpoints record. A run has the name of its file, or its path where names are equal. Raises
+    DataError for a run that was never evaluated, or whose record is broken."""
     from pd4dgs_codec.model import checkpoint
+    from pd4dgs_codec.train.loop import read_curve
 
-    model, training = checkpoint.load(path)
-    preset = json.loads(training.get("config", "{}")).get("preset", "")
-    curve = json.loads(training.get("curve", "[]"))
-    if not curve:
-        raise DataError(
-            f"{path}: found no curve of quality, expected the checkpoint of a run with at least one evaluation"
-        )
-    return run_of(f"{Path(path).name} ({preset})" if preset else Path(path).name, curve, len(model.anchor_q))
+    paths = list(dict.fromkeys(paths))
+    names = [Path(path).name for path in paths]
+    runs = list[Point]()
+    for path, name in zip(paths, names, strict=True):
+        model, training = checkpoint.load(path)
+        shown = path if names.count(name) > 1 else name
+        try:
+            preset = json.loads(training.get("config", "{}")).get("preset", "")
+            curve = read_curve(training.get("curve", "[]"))
+            runs.append(run_of(f"{shown} ({preset})" if preset else shown, curve, len(model.anchor_q)))
+        except Exception as error:  # a broken record can raise any exception
+            reason = one_line(f"{type(error).__name__}: {error}")
+            raise DataError(f"{path}: its curve of quality cannot be read: {reason}") from None
+        if not curve:
+            raise DataError(
+                f"{path}: found no curve of quality, expected the checkpoint of a run with at least one evaluation"
+            )
+    return runs
 
 
 def train_table(runs: Sequence[Point]) -> str:

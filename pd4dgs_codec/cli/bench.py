@@ -115,11 +115,13 @@ def _codec(args: argparse.Namespace) -> Outcome:
     if is_pd4(data):
         points, panels = [runtime.file_point(data, repeats)], []
     else:
-        scene = common.checkpoint_scene(args.input, data)
-        frames = _frames(args, scene.info)
+        from pd4dgs_codec.model import checkpoint
+
+        model, _ = checkpoint.loads(data, common.shown_name(args.input))
+        frames = _frames(args, model.info)
         settings = list(itertools.product(scales, modes, efforts))
         with progress_bar(len(settings), "files", "codec") as step:
-            points = runtime.codec_points(args.input, scene, frames, settings, repeats, step)
+            points = runtime.codec_points(model, frames, settings, repeats, step)
         panels = runtime.codec_panels(points)
     text = f"{runtime.codec_table(points)}\n\n{report.machine_line(machine)}"
     return Outcome({"input": args.input, "machine": machine, "points": points}, text, panels, "RMSE of images")
@@ -208,10 +210,10 @@ def _train(args: argparse.Namespace) -> Outcome:
     from pd4dgs_codec.bench import report, runtime
 
     machine = None if args.runs else report.machine()  # the machine of existing runs is unknown
-    runs = [runtime.recorded_run(path) for path in args.runs] if args.runs else _trained(args)
+    runs = runtime.recorded_runs(args.runs) if args.runs else _trained(args)
     text = "\n\n".join([runtime.train_table(runs), *([report.machine_line(machine)] if machine else [])])
     result = {"source": args.source, "machine": machine, "runs": runs}
-    return Outcome(result, text, runtime.train_panels(runs), "held-out RMSE of the highest level")
+    return Outcome(result, text, runtime.train_panels(runs), "RMSE of the highest level")
 
 
 def _trained(args: argparse.Namespace) -> list[Point]:
@@ -226,6 +228,8 @@ def _trained(args: argparse.Namespace) -> list[Point]:
         config = TrainConfig(preset=preset, source=args.source, max_seconds=limit, **_given(args, *TRAIN_FIELDS))
         trainer = Trainer(config, load_source(args.source, downscale=config.downscale, holdout=config.holdout))
         say(f"training {preset} on {len(trainer.dataset.train)} views")
+        if not trainer.dataset.test:
+            say(common.NONE_HELD_OUT)
         with temporary_folder() as folder:
             trainer.run(folder / "model.pt", progress=common.TrainingProgress())
         if trainer.interrupted:

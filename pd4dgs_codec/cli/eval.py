@@ -4,7 +4,18 @@ import argparse
 from typing import Any
 
 from pd4dgs_codec.cli import options
-from pd4dgs_codec.cli.common import OK, Console, command, named_input, number, progress_bar, read_dataset, say, table
+from pd4dgs_codec.cli.common import (
+    NONE_HELD_OUT,
+    OK,
+    Console,
+    command,
+    named_input,
+    number,
+    progress_bar,
+    read_dataset,
+    say,
+    table,
+)
 
 DETAILS = f"""\
 Decodes each level of a .pd4 file from its own prefix and compares its renderings with the held-out views.
@@ -48,7 +59,7 @@ def _evaluate(args: argparse.Namespace, console: Console) -> int:
     dataset = read_dataset(args.source, args, levels[-1].model.info)
     console.detail(f"{args.source}: {len(dataset.train)} training views, {len(dataset.test)} held out")
     if not dataset.test:
-        say("no held-out views: measuring on the training views")
+        say(NONE_HELD_OUT)
     distances = (*(PERCEPTUAL if args.perceptual else ()), *([VGG] if args.protocol == "3dgs" else []))
     perceptual = load_perceptual(distances) if distances else None
     for name, why in (perceptual.absent if perceptual else {}).items():

@@ -219,7 +219,7 @@ class Trainer:
             raise TrainError(f"{path}: found no training state, expected a checkpoint that pd4dgs-train saved")
         try:
             self.learner.restore(model, training)
-            self.seconds, self.curve = float(training["seconds"]), _curve(training["curve"])
+            self.seconds, self.curve = float(training["seconds"]), read_curve(training["curve"])
             if not 0 <= self.seconds < math.inf:
                 raise ValueError(f"seconds is {self.seconds}, expected a finite number >= 0")
         except Exception as error:  # a broken state can raise any exception
@@ -232,7 +232,7 @@ class Trainer:
             )
 
 
-def _curve(text: str) -> list[dict[str, Any]]:
+def read_curve(text: str) -> list[dict[str, Any]]:
     """Parses the curve of a checkpoint. Raises ValueError, KeyError or TypeError."""
     rows = list(json.loads(text))
     if not all(math.isfinite(v) for row in rows for v in (row["iteration"], row["seconds"], *row["psnr"])):

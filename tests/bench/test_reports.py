@@ -3,6 +3,7 @@
 import json
 import math
 import platform
+import shutil
 import time
 from dataclasses import replace
 
@@ -17,7 +18,9 @@ from pd4dgs_codec.bench import latency, report, runtime
 from pd4dgs_codec.cli import bench
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.format.info import info
+from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import PRESETS
+from pd4dgs_codec.model.model import from_scene
 from pd4dgs_codec.scene import Camera
 from pd4dgs_codec.web.server import Server
 
@@ -93,6 +96,12 @@ def test_a_file_alone_has_bytes_and_times_but_no_error(scene_pd4, tmp_path, caps
         assert f"{ignored[0]} needs a checkpoint" in capsys.readouterr().err
 
 
+def test_a_checkpoint_may_come_from_a_pipe(cli, model_pt):
+    options = ["--step-scales", "1", "--modes", "ans", "--efforts", "1", "--repeats", "1", "--views", "1"]
+    report = cli("bench", "codec", "-", *options, "--json", stdin=model_pt.read_bytes()).json
+    assert report["points"][0]["error"] > 0
+
+
 # -- render ------------------------------------------------------------------------------------------------------------
 
 
@@ -135,6 +144,27 @@ def test_existing_runs_are_reported(model_pt, capsys):
     (run,) = json.loads(capsys.readouterr().out)["runs"]
     assert run["name"] == "model.pt (tiny)"
     assert [p["rmse"] for p in run["curve"]] == pytest.approx([0.1, 0.01])
+
+
+def test_runs_of_one_file_name_are_told_apart(model_pt, tmp_path):
+    copy = shutil.copy(model_pt, tmp_path / "model.pt")
+    runs = runtime.recorded_runs([str(model_pt), str(copy), str(copy)])
+    assert [run["name"] for run in runs] == [f"{model_pt} (tiny)", f"{copy} (tiny)"]
+
+
+def test_a_run_without_held_out_views_says_so(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(PRESETS, "tiny", TINY)
+    argv = ["train", str(write_views(tmp_path)), "--holdout", "0", "--presets", "tiny", "--iterations", "1"]
+    assert bench.main(argv) == 0 and "no held-out views" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "curve", ['[{"seconds": 1}]', '[{"iteration": 1, "seconds": 1, "psnr": []}]', "[1]", "{", "[]"]
+)
+def test_a_run_with_a_broken_record_is_refused(scene, tmp_path, curve):
+    checkpoint.save(tmp_path / "a.pt", from_scene(scene), {"curve": curve})
+    with pytest.raises(DataError, match=r"a\.pt: .* curve of quality"):
+        runtime.recorded_runs([str(tmp_path / "a.pt")])
 
 
 def test_presets_are_trained_and_compared(tmp_path, capsys, monkeypatch):
