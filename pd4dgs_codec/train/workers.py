@@ -2,12 +2,15 @@
 
 All hold the same model. Gradients are summed, so that all make the same update. The first worker makes occasional
 measurements, such as the errors of pruning, for all. A single process communicates nothing.
+
+If a worker ends early, those that wait for it raise TrainError.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from typing import Any, TypeVar
 
@@ -30,7 +33,8 @@ def start(device: str, views: int) -> None:
         import_module("torch.distributed.nn.functional")
         if device == "cuda":
             torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
-        distributed.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo")
+        with _met():
+            distributed.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo")
 
 
 def stop() -> None:
@@ -49,6 +53,15 @@ def rank() -> int:
     return distributed.get_rank() if count() > 1 else 0
 
 
+@contextmanager
+def _met() -> Iterator[None]:
+    """Raises TrainError if the other workers do not answer. The one that failed says why itself."""
+    try:
+        yield
+    except (RuntimeError, ValueError) as error:
+        raise TrainError(f"another worker has ended or cannot be reached: {error}") from None
+
+
 def alike(measure: Callable[[], T]) -> T:
     """Returns the first worker's measure() on all workers, as rounding on another machine might change a decision.
     Raises its NotFinite on all workers. Tensors must be on the CPU: each worker has its own device."""
@@ -60,7 +73,8 @@ def alike(measure: Callable[[], T]) -> T:
             found[1] = measure()
         except NotFinite as error:
             found[0] = str(error)
-    distributed.broadcast_object_list(found)
+    with _met():
+        distributed.broadcast_object_list(found)
     diverged, value = found
     if diverged is not None:
         raise NotFinite(diverged)
@@ -73,14 +87,16 @@ def largest(*values: float) -> tuple[float, ...]:
     if count() == 1:
         return values
     shared = torch.tensor(values, dtype=torch.float64)
-    distributed.all_reduce(shared, distributed.ReduceOp.MAX)
+    with _met():
+        distributed.all_reduce(shared, distributed.ReduceOp.MAX)
     return tuple(shared.tolist())
 
 
 def add_up(tensors: Sequence[Tensor]) -> None:
     """Replaces each tensor by its sum over all workers. All are on one device, of one type."""
     flat = torch.cat([tensor.flatten() for tensor in tensors])
-    distributed.all_reduce(flat)
+    with _met():
+        distributed.all_reduce(flat)
     start = 0
     for tensor in tensors:
         tensor.copy_(flat[start : start + tensor.numel()].view_as(tensor))

@@ -1,6 +1,7 @@
 """Several workers on one scene learn what one process learns, write one checkpoint, and go on in another number."""
 
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -31,6 +32,20 @@ left = [name for task in Path("/proc/self/task").glob("*/comm") if "gloo" in (na
 sys.exit(code or (f"threads left: {{left}}" if left else 0))
 """
 STEPS = 60
+
+#: The second worker ends at once; the first says what it hears of it.
+LEFT = """
+import os
+from pd4dgs_codec.errors import TrainError
+from pd4dgs_codec.train import workers
+workers.start("cpu", 2)
+if workers.rank():
+    os._exit(0)
+try:
+    workers.largest(1.0)
+except TrainError as error:
+    print(error)
+"""
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +103,21 @@ def test_a_run_goes_on_with_another_number_of_workers(program):
     assert 0 < begun < STEPS
     assert _alone(program, "cut.pt", "--resume", program.with_name("cut.pt"), "--max-seconds", "1000") == 0
     assert_same_weights(program.with_name("one.pt"), program.with_name("cut.pt"), rtol=1e-3, atol=1e-4)
+
+
+def test_a_worker_that_ends_is_missed_in_one_line():
+    """Whatever torch calls the broken connection."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    shared = os.environ | {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
+    left, ended = (
+        subprocess.Popen([sys.executable, "-c", LEFT], env=shared | {"RANK": rank}, stdout=subprocess.PIPE, text=True)
+        for rank in "01"
+    )
+    told = left.communicate(timeout=600)[0]
+    assert (left.returncode, ended.wait(), ended.communicate()[0]) == (0, 0, "")
+    assert told.startswith("another worker has ended") and told.count("\n") == 1
 
 
 def test_workers_that_cannot_share_the_views_evenly_are_named(monkeypatch):
