@@ -296,6 +296,16 @@ def test_a_level_that_changes_no_picture_and_stays_leaves_the_model_as_it_is(dat
     assert learner.model.level == 2 and all(map(torch.equal, learner.optimiser.parameters, before))
 
 
+@pytest.mark.usefixtures("short_runs_have_phases")
+def test_the_first_worker_decides_whether_a_level_changes_pictures(dataset, monkeypatch):
+    """Were each to decide alone, one might try a level out while another goes on, for the sake of a pixel."""
+    monkeypatch.setattr(levels, "MIN_CONTRAST", 2.0)  # this one finds no pixel
+    monkeypatch.setattr(levels.workers, "alike", lambda measure: 1e6)
+    monkeypatch.setattr(learner.Learner, "practise", practised := Mock())
+    selected(dataset, monkeypatch, 0.0)
+    assert practised.called
+
+
 def test_steps_since_a_snapshot_are_undone_as_often_as_needed(dataset):
     learner, after = trainer_of(dataset, steps=2).learner, []
     before = learner.snapshot()

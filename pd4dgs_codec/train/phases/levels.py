@@ -83,7 +83,7 @@ class SelectLevels(phases.Phase):
         needed = MIN_GAIN_1 * min(1.0, state.steps_in(1.0) / LEARNT) - above
         if level == 2:
             needed = max(MIN_GAIN_2, SHARE_2 * workers.alike(lambda: gain_over(0)))
-        if sum(int(mask.sum()) for mask in acts) < MIN_PIXELS:
+        if workers.alike(lambda: sum(int(mask.sum()) for mask in acts)) < MIN_PIXELS:
             return 0.0, needed
 
         before, logits = state.snapshot(), state.model.mask_logits
