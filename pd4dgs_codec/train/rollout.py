@@ -83,8 +83,10 @@ def _near(state: TrainState, level: int) -> list[int]:
 
 
 def _held_back(state: TrainState) -> set[int]:
-    """The training views that are held back until levels are selected."""
-    return held_back_views(state) if state.position <= state.schedule.rounding else set()
+    """The training views that are held back until levels are selected. A timed run may select them a few positions
+    behind `Schedule.rounding`, so its trial holds them back too."""
+    selected = state.position > state.schedule.rounding and not state.practising
+    return set() if selected else held_back_views(state)
 
 
 def near_key(state: TrainState, among: list[int]) -> list[int]:

@@ -306,6 +306,17 @@ def test_the_first_worker_decides_whether_a_level_changes_pictures(dataset, monk
     assert practised.called
 
 
+@pytest.mark.usefixtures("short_runs_have_phases")
+@pytest.mark.parametrize("share", [None, 0.7])
+def test_a_trial_sees_no_view_that_judges_it(dataset, monkeypatch, share):
+    """A timed run may begin it some positions behind `Schedule.rounding`."""
+    learner, drawn = trainer_of(replace(dataset, train=dataset.train * 12)).learner, []
+    learner.iteration, learner.share = learner.schedule.rounding, share
+    monkeypatch.setattr(learner, "_learn", lambda pairs, *_: drawn.extend(view for view, _ in pairs))
+    learner.practise(0, 2 * len(learner.views))
+    assert set(range(len(learner.views))) - set(drawn) == held_back_views(learner)
+
+
 def test_steps_since_a_snapshot_are_undone_as_often_as_needed(dataset):
     learner, after = trainer_of(dataset, steps=2).learner, []
     before = learner.snapshot()
