@@ -82,7 +82,7 @@ def interruptible() -> Iterator[bool]:
 
 @contextmanager
 def stop_request() -> Iterator[threading.Event]:
-    """Yields an event that the first Ctrl-C or SIGTERM sets; every further one raises KeyboardInterrupt. Ignored
+    """Yields an event that the first signal in ENDING sets; every further one raises KeyboardInterrupt. Ignored
     signals stay ignored, and outside the main thread nothing changes."""
     stop = threading.Event()
 
@@ -91,7 +91,7 @@ def stop_request() -> Iterator[threading.Event]:
             raise KeyboardInterrupt
         stop.set()
 
-    with _handled((signal.SIGINT, signal.SIGTERM), received, lambda handler: handler is not signal.SIG_IGN):
+    with _handled(ENDING, received, lambda handler: handler is not signal.SIG_IGN):
         yield stop
 
 

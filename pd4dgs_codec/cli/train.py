@@ -20,8 +20,9 @@ if TYPE_CHECKING:
 
 DETAILS = f"""\
 Training ends after --iterations steps. --max-seconds alone spreads the whole schedule over this time; with --iterations
-it stops the run early. Ctrl-C or SIGTERM stops the run after the current step with a complete checkpoint, from which
---resume continues. A second Ctrl-C stops it at once and loses the steps since the last save (one a minute).
+it stops the run early. Ctrl-C, SIGTERM or a closed terminal stops the run after the current step with a complete
+checkpoint, from which --resume continues. A second Ctrl-C stops it at once and loses the steps since the last save (one
+a minute).
 
 --quality sets the weights of the bitrate, pruning and quantisation steps together; --rate-scale, --prune and --grading
 override single ones.

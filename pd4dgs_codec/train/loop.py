@@ -103,7 +103,7 @@ class Trainer:
     ) -> None:
         """Trains to the end, the time limit or a signal, then writes a complete checkpoint to `output`.
 
-        Ctrl-C or SIGTERM ends the run after the current step and sets `interrupted`. A second signal raises
+        Ctrl-C, SIGTERM or SIGHUP ends the run after the current step and sets `interrupted`. A second signal raises
         KeyboardInterrupt at once and leaves `output` as last saved. save_every: seconds between checkpoints. Raises
         DataError if the checkpoint or the log cannot be written; a log's error is raised after saving.
         """

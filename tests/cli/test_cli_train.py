@@ -197,6 +197,13 @@ def test_a_second_interrupt_is_one_line(train, tmp_path, monkeypatch):
     assert result.code == 1 and "interrupted twice" in result.error_lines[-1] and not (tmp_path / "m.pt").exists()
 
 
+@pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="needs SIGHUP")
+def test_a_terminal_that_closes_loses_no_step(train, tmp_path, monkeypatch):
+    step, path = Learner.step, tmp_path / "m.pt"
+    monkeypatch.setattr(Learner, "step", lambda self: signal.raise_signal(signal.SIGHUP) or step(self))
+    assert train(path).code == 0 and checkpoint.load(path)[1]["iteration"] == 1
+
+
 @pytest.mark.skipif(os.name != "posix", reason="links, pipes and /dev/null")
 def test_links_and_devices_stay_what_they_are(train, tmp_path):
     log, output = tmp_path / "log", tmp_path / "link.pt"
