@@ -27,7 +27,7 @@ from pd4dgs_codec.train.learner import Learner
 from pd4dgs_codec.train.schedule import COARSE_SHARE, Schedule
 
 #: A timed run estimates the N of its schedule after TIMED_STEPS steps. A slow run does so once it has spent the coarse
-#: phase's share of the limit, but not before FEWEST_TIMED_STEPS, since the first steps compile kernels.
+#: phase's share of the limit, but not before FEWEST_TIMED_STEPS of this process, whose first steps compile kernels.
 TIMED_STEPS = 50
 FEWEST_TIMED_STEPS = 5
 #: Mean cost of a step over a run, relative to its first steps, which train level 0 only.
@@ -169,7 +169,7 @@ class Trainer:
             return limit is not None and self.seconds >= limit
         if self.total is None:
             self._costs.append(seconds)
-            slow = self.iteration >= FEWEST_TIMED_STEPS and self.seconds >= COARSE_SHARE * limit
+            slow = len(self._costs) >= FEWEST_TIMED_STEPS and self.seconds >= COARSE_SHARE * limit
             if len(self._costs) >= TIMED_STEPS or slow:
                 self.learner.schedule = Schedule(max(1, round(limit / (LATER_COST * median(self._costs)))))
             return self.seconds >= limit

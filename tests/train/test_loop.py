@@ -151,6 +151,26 @@ def test_a_resumed_timed_run_spends_what_is_left(dataset, tmp_path, monkeypatch,
     assert positions == sorted(positions) and positions[0] == first.learner.position
 
 
+def test_the_first_step_after_a_resumption_does_not_set_n(dataset, tmp_path, monkeypatch, clock):
+    """It compiles kernels, as the very first step does."""
+    first = timed(dataset, monkeypatch, clock, "quiet")
+    interrupt(first, signal.SIGINT, lambda: first.iteration == 3)
+    first.run(tmp_path / "m.pt")
+    assert first.iteration == 4 and first.total is None
+    second = timed(dataset, monkeypatch, clock, "quiet")
+    second.resume(tmp_path / "m.pt")
+    step = second.learner.step
+
+    def compiling():
+        clock.now += 0.2 * LIMIT if second.iteration == first.iteration else 0.0
+        return step()
+
+    monkeypatch.setattr(second.learner, "step", compiling)
+    interrupt(second, signal.SIGINT, lambda: second.total is not None)
+    second.run(tmp_path / "m.pt")
+    assert second.total == pytest.approx(LIMIT / (loop.LATER_COST * COST[0]), rel=0.01)
+
+
 def test_a_pause_beyond_the_limit_leaves_a_cut_run_that_says_so(dataset, tmp_path, monkeypatch, clock):
     trainer = timed(dataset, monkeypatch, clock, "quiet")
     step = trainer.learner.step
