@@ -114,10 +114,10 @@ def _train(args: argparse.Namespace, console: Console) -> int:
         _check_time_left(trainer, args.resume)
     progress, log = None, None
     if first:
+        _announce(trainer, console)
+        progress = _progress(args, trainer)  # may fail, and an earlier log is kept then
         log = _prepare_log(args, trainer.iteration)
         remove_leftovers(args.output)
-        _announce(trainer, console)
-        progress = _progress(args, trainer)
     try:
         trainer.run(Path(args.output), log=log, progress=progress)
     except KeyboardInterrupt:

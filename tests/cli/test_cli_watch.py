@@ -160,6 +160,14 @@ def test_without_viser_it_is_one_line(trainer, monkeypatch):
         WatchedProgress(trainer, 0)
 
 
+def test_a_view_that_cannot_open_keeps_the_earlier_log(tmp_path, monkeypatch, shared_dataset):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    (tmp_path / "m.jsonl").write_text("{}\n")
+    options = ["--log", str(tmp_path / "m.jsonl"), "-f", "--iterations", "2", "--preset", "tiny", "--view", "0"]
+    assert main([str(shared_dataset), "-o", str(tmp_path / "m.pt"), *options]) == 1
+    assert (tmp_path / "m.jsonl").read_text() == "{}\n"
+
+
 def test_the_command_says_where_to_look(tmp_path, capsys, shared_dataset):
     pytest.importorskip("viser")
     options = ["--preset", "tiny", "--iterations", "2", "--view", "0"]
