@@ -13,6 +13,7 @@ from types import FrameType
 from typing import Any
 
 ENDING = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+HANGUP = getattr(signal, "SIGHUP", None)  #: None on Windows
 AGAIN_SECONDS = 0.01  #: delay before a signal is raised again whose exception Python only printed
 UNHANDLED = (signal.SIG_DFL, signal.default_int_handler)
 
@@ -82,12 +83,13 @@ def interruptible() -> Iterator[bool]:
 
 @contextmanager
 def stop_request() -> Iterator[threading.Event]:
-    """Yields an event that the first signal in ENDING sets; every further one raises KeyboardInterrupt. Ignored
-    signals stay ignored, and outside the main thread nothing changes."""
+    """Yields an event that the first signal in ENDING sets; every further one raises KeyboardInterrupt, except SIGHUP:
+    the shell and the kernel both send it when a terminal closes. Ignored signals stay ignored, and outside the main
+    thread nothing changes."""
     stop = threading.Event()
 
     def received(number: int, frame: FrameType | None) -> None:
-        if stop.is_set():
+        if stop.is_set() and number != HANGUP:
             raise KeyboardInterrupt
         stop.set()
 

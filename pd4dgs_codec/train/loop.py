@@ -103,9 +103,10 @@ class Trainer:
     ) -> None:
         """Trains to the end, the time limit or a signal, then writes a complete checkpoint to `output`.
 
-        Ctrl-C, SIGTERM or SIGHUP ends the run after the current step and sets `interrupted`. A second signal raises
-        KeyboardInterrupt at once and leaves `output` as last saved. save_every: seconds between checkpoints. Raises
-        DataError if the checkpoint or the log cannot be written; a log's error is raised after saving.
+        Ctrl-C, SIGTERM or SIGHUP ends the run after the current step and sets `interrupted`. A second signal, unless it
+        is SIGHUP, raises KeyboardInterrupt at once and leaves `output` as last saved. save_every: seconds between
+        checkpoints. Raises DataError if the checkpoint or the log cannot be written; a log's error is raised after
+        saving.
         """
         with stop_request() as stop, one_torch_thread():
             records = RecordLog(log)
