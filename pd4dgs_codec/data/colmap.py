@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.data.dataset import COLMAP
-from pd4dgs_codec.data.files import LARGEST, Color, inside, last_numbers, number, read_file, whole_number
+from pd4dgs_codec.data.files import LARGEST, Color, files_of, inside, last_numbers, number, read_file, whole_number
 from pd4dgs_codec.data.videos import open_video, synchronised_dataset
 from pd4dgs_codec.data.view import (
     LARGEST_TIME,
@@ -41,7 +41,7 @@ MODELS = {
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
 MAX_SIDE, MAX_NUMBER = 65535, 1 << 32
-VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".MP4", ".MOV")
+VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm")
 
 
 #: A registered picture: its name, the number of its camera, and quaternion wxyz and translation of world to camera.
@@ -75,7 +75,7 @@ def _videos(folder: Path) -> dict[str, Path]:
         if (folder / "images").is_dir():
             return {}
         place = folder
-    return {file.stem: file for file in sorted(place.iterdir()) if file.suffix in VIDEOS}
+    return {file.stem: file for file in files_of(place, VIDEOS)}
 
 
 def _rig(model: Path, cameras: list[UnreadView], videos: dict[str, Path]) -> list[UnreadView]:

@@ -9,6 +9,7 @@ from folders import CAMERAS, COUNT, POINTS, assert_same, eye, quaternion, rig_vi
 
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.data.view import Dataset
+from pd4dgs_codec.errors import DataError
 
 
 def colmap_name(i: int) -> str:
@@ -132,6 +133,13 @@ def test_distortion_of_a_colmap_camera_is_removed(scene, tmp_path):
     view = load(folder).train[0]
     assert view.mask is not None and 0.5 < view.mask.mean() < 1
     assert np.abs(view.image.astype(int) - scene.train[0].image).max() > 20
+
+
+def test_hidden_files_are_no_videos(scene, tmp_path):
+    folder = write_synchronised(scene, tmp_path)
+    (folder / "videos" / "cam1.mp4").rename(folder / "videos" / "._cam1.mp4")
+    with pytest.raises(DataError, match=f"among {CAMERAS - 1}, expected one per picture"):
+        load(folder)
 
 
 def test_videos_of_a_distorting_lens_are_undistorted(scene, tmp_path):
