@@ -119,7 +119,7 @@ def check_folder(output: Path, overwrite: bool) -> None:
 
 def _begin(work: Path, recording: Recording, options: Options) -> None:
     """Keeps the work of an earlier run with the same recording and options, else begins anew."""
-    stats = [path.stat() for path in (recording.path, *recording.files)]  # a folder's own time is that of its names
+    stats = [path.stat() for path in {recording.path, *recording.files}]  # a folder's own time is that of its names
     asked = {"source": str(recording.path.resolve()), "size": sum(each.st_size for each in stats)}
     asked |= {"changed": max(each.st_mtime_ns for each in stats)}
     asked |= {name: value for name, value in asdict(options).items() if name != "threads"}
