@@ -55,11 +55,12 @@ def rank() -> int:
 
 @contextmanager
 def _met() -> Iterator[None]:
-    """Raises TrainError if the other workers do not answer. The one that failed says why itself."""
+    """Raises TrainError if the other workers do not answer, or a variable that torchrun sets is missing. A worker that
+    failed says why itself."""
     try:
         yield
     except (RuntimeError, ValueError) as error:
-        raise TrainError(f"another worker has ended or cannot be reached: {error}") from None
+        raise TrainError(f"cannot reach the other workers, or one has ended: {error}") from None
 
 
 def alike(measure: Callable[[], T]) -> T:

@@ -38,10 +38,10 @@ LEFT = """
 import os
 from pd4dgs_codec.errors import TrainError
 from pd4dgs_codec.train import workers
-workers.start("cpu", 2)
-if workers.rank():
-    os._exit(0)
 try:
+    workers.start("cpu", 2)  # fails already if the other one ends meanwhile
+    if workers.rank():
+        os._exit(0)
     workers.largest(1.0)
 except TrainError as error:
     print(error)
@@ -117,7 +117,14 @@ def test_a_worker_that_ends_is_missed_in_one_line():
     )
     told = left.communicate(timeout=600)[0]
     assert (left.returncode, ended.wait(), ended.communicate()[0]) == (0, 0, "")
-    assert told.startswith("another worker has ended") and told.count("\n") == 1
+    assert told.startswith("cannot reach the other workers, or one has ended: ") and told.count("\n") == 1
+
+
+def test_a_variable_of_torchrun_that_is_missing_is_named(monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    monkeypatch.delenv("RANK", raising=False)
+    with pytest.raises(TrainError, match="cannot reach the other workers.* RANK expected"):
+        workers.start("cpu", 2)
 
 
 def test_workers_that_cannot_share_the_views_evenly_are_named(monkeypatch):
