@@ -161,7 +161,7 @@ finite_float = checked(float, math.isfinite, "a number")
 
 
 def ending(suffix: str, *others: str) -> Callable[[str], str]:
-    """Makes the type of outputs that end in `suffix`, so that none is an input by mistake. others: names without it."""
+    """Makes the type of outputs that end in `suffix`, so that none is an input by mistake. others: further names."""
     return checked(str, lambda text: text in others or text.lower().endswith(suffix), f"a name that ends in {suffix}")
 
 
