@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from pd4dgs_codec.bench.report import Panel, clock, markdown, optional, spread, summary
-from pd4dgs_codec.errors import DataError, RenderError, one_line
+from pd4dgs_codec.errors import DataError, RenderError
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.info import hashes, info
@@ -227,7 +227,7 @@ def recorded_runs(paths: Sequence[str]) -> list[Point]:
             curve = read_curve(training.get("curve", "[]"))
             runs.append(run_of(f"{shown} ({preset})" if preset else shown, curve, len(model.anchor_q)))
         except Exception as error:  # a broken record can raise any exception
-            reason = one_line(f"{type(error).__name__}: {error}")
+            reason = f"{type(error).__name__}: {error}"
             raise DataError(f"{path}: its curve of quality cannot be read: {reason}") from None
         if not curve:
             raise DataError(

@@ -7,7 +7,7 @@ import io
 import json
 import re
 import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextvars import ContextVar
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -163,11 +163,10 @@ def inside(folder: Path, name: str) -> Path:
     raise DataError(f"{folder}: {one_line(repr(name), 120)} is not the name of a file in this folder")
 
 
-def files_of(folder: Path, suffixes: Iterable[str]) -> list[Path]:
+def files_of(folder: Path, suffixes: Collection[str]) -> list[Path]:
     """The files of a folder with one of these suffixes, in lower or upper case, by name; without hidden ones, such as
     the `._NAME` that macOS adds to each NAME."""
-    wanted = set(suffixes)
-    return sorted(p for p in folder.iterdir() if p.suffix.lower() in wanted and not p.name.startswith("."))
+    return sorted(p for p in folder.iterdir() if p.suffix.lower() in suffixes and not p.name.startswith("."))
 
 
 def last_numbers(paths: Iterable[Path]) -> list[int] | None:

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import torch
 
 from pd4dgs_codec.data.view import Dataset
-from pd4dgs_codec.errors import DataError, TrainError, one_line
+from pd4dgs_codec.errors import DataError, TrainError
 from pd4dgs_codec.io import finite
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import ModelConfig
@@ -224,7 +224,7 @@ class Trainer:
             if not 0 <= self.seconds < math.inf:
                 raise ValueError(f"seconds is {self.seconds}, expected a finite number >= 0")
         except Exception as error:  # a broken state can raise any exception
-            reason = one_line(f"{type(error).__name__}: {error}")  # torch's messages have several lines
+            reason = f"{type(error).__name__}: {error}"
             raise DataError(f"{path}: its training state cannot be read: {reason}") from None
         order, count = self.learner.order, len(self.dataset.train)
         if not all(0 <= index < count for index in order):
