@@ -6,15 +6,13 @@ import numpy as np
 import pytest
 from strategies import make_scene
 
-from pd4dgs_codec.errors import EncodeError, Malformed
+from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format import deformation, encoder, quantise
 from pd4dgs_codec.format.check import ErrorBound
 from pd4dgs_codec.format.container import read_preamble
-from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode, encode_with_report
 from pd4dgs_codec.format.header import TENSOR_KINDS, unpack_header
 from pd4dgs_codec.format.info import info
-from pd4dgs_codec.format.registry import LAYER_KINDS
 
 
 def scene_off_the_grid():
@@ -80,20 +78,6 @@ def test_an_error_above_the_declared_bound_is_refused(monkeypatch):
     with pytest.raises(EncodeError, match=r"verification: feature: .* expected an error of at most 0.025"):
         encode(scene_off_the_grid(), layers=2, effort=1)
     assert declared(encode(scene_off_the_grid(), layers=2, effort=1, verify=False)) == low
-
-
-@pytest.mark.parametrize("layer", [1, 2])
-def test_a_deformation_without_a_bound_is_refused_and_the_layers_before_it_decode(monkeypatch, layer):
-    names = [LAYER_KINDS[layer].planes_step, LAYER_KINDS[layer].weights_step]
-    bounds = encoder.rounding_bounds
-    for name in names:
-        drop = lambda *args, name=name: {k: v for k, v in bounds(*args).items() if k != name}  # noqa: E731
-        monkeypatch.setattr(encoder, "rounding_bounds", drop)
-        data = encode(make_scene(2, anchors=5), layers=2, effort=1, verify=False)
-        with pytest.raises(Malformed, match=f"layer {layer}: no error bound of {name}") as caught:
-            decode(data)
-        assert caught.value.chunk == layer
-        assert decode(data, max_layer=layer - 1).level == layer - 1
 
 
 @pytest.mark.parametrize("module, what", [(quantise, "feature"), (deformation, "weights_scaffold")])
