@@ -54,7 +54,7 @@ def test_everything_active_comes_back_and_encodes_to_the_same_bytes(scene, mode,
     for index, (first, last) in enumerate(pairwise((0, *decoded.rows))):
         assert (np.diff(morton_codes(decoded.anchor_q[first:last])) > 0).all(), "rows are not in Morton order"
         assert (decoded.mask[index][first:last] >= 3).all(), "a layer has rows that are not active in it"
-    assert encode(decoded, **options) == data
+    assert encode(decoded, **options, verify=False) == data
 
 
 @pytest.mark.parametrize("with_camera", [True, False])
@@ -211,9 +211,9 @@ def test_step_classes_and_centres_come_back(seed, priors, mode):
     data = encode(noisy, **options)
     scene = decode(data)
     assert scene.grading is not None and scene.grading.classes.max() > 0
-    assert encode(scene, **options) == data
+    assert encode(scene, **options, verify=False) == data
     scaled = decode(encode(noisy, step_scale=1.5, **options))
-    assert_same_scene(scaled, decode(encode(scaled, **options)))
+    assert_same_scene(scaled, decode(encode(scaled, **options, verify=False)))
     for step, found in ((1.0, scene), (1.5, scaled)):
         sent = noisy.feature[noisy.mask[-1] > 0]
         error = np.abs(np.sort(found.feature.ravel()) - np.sort(sent.ravel())).max()
