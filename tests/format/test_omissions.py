@@ -1,6 +1,7 @@
 """Plane cells that no anchor reads are left out, and no picture changes."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -31,6 +32,12 @@ def lively_scene(widths: Widths = DEFAULT_WIDTHS) -> Scene:
     return replace(scene, mask=masks, scaling_log=scaling_log, global_deformation=Deformation(near_one, heads))
 
 
+@cache
+def coded(omit: str) -> Scene:
+    """The lively scene, encoded and decoded."""
+    return decode(encode(lively_scene(), layers=2, effort=1, omit=omit))
+
+
 @pytest.mark.parametrize("widths", [Widths(), Widths(graded=True), Widths(viewing=("color",))])
 def test_the_planned_scene_is_rounded_to_the_planned_symbols(widths):
     planned = plan(lively_scene(widths), EncodeOptions(layers=2))
@@ -46,8 +53,7 @@ def test_no_pixel_changes():
     from pd4dgs_codec.model.model import from_scene
     from pd4dgs_codec.model.picture import render_image
 
-    files = [encode(lively_scene(), layers=2, effort=1, omit=omit) for omit in ("nothing", "lossless")]
-    whole, less = (from_scene(decode(data)) for data in files)
+    whole, less = (from_scene(coded(omit)) for omit in ("nothing", "lossless"))
     rng = np.random.default_rng(3)
     seen = 0.0
     for level in (0, 1, 2):
@@ -61,11 +67,9 @@ def test_no_pixel_changes():
 
 def test_nothing_that_matters_goes():
     """Only cells that nothing reaches go, and what is kept stays as given."""
-    scene = lively_scene()
-    planned = decode(encode(scene, layers=2, effort=1))
-    left_out = plan(scene, EncodeOptions(layers=2)).left_out
+    left_out = plan(lively_scene(), EncodeOptions(layers=2)).left_out
     assert all("cells" in item.what for item in left_out)
-    untouched = decode(encode(scene, layers=2, effort=1, omit="nothing"))
+    planned, untouched = coded("lossless"), coded("nothing")
     low, high = untouched.info.box
     unit, free = np.clip((untouched.anchor - low) / (high - low), 0, 1), 0
     for layer in (1, 2):
