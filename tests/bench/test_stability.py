@@ -103,8 +103,8 @@ FAULTS = {
         reference, "ALPHA_MAX", 0.99, "rasteriser", {"64 coincident, opaque", "centre on a pixel"}, "behind",
     ),
     "a picture with a NaN": (
-        stable_scenes, "picture_error", lambda model, level, *_: math.nan if level == 2 else 0.0, "an ordinary run",
-        {"an ordinary run"}, "",
+        stable_scenes, "picture_error", lambda model, level, *_: math.nan if level == 2 else 0.0,
+        "a single Gaussian", {"a single Gaussian"}, "",
     ),
 }  # fmt: skip
 
