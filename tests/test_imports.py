@@ -10,10 +10,9 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
-from strategies import make_scene
+from strategies import small_file
 
 import pd4dgs_codec
-from pd4dgs_codec.format.encoder import encode
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -142,8 +141,7 @@ print(scene.layers, len(scene.anchor_q), pd4dgs_codec.FORMAT_VERSION)
 
 
 def test_decoding_needs_no_torch():
-    scene = make_scene(3, anchors=12)
-    data = encode(scene, layers=2, effort=1)
+    data = small_file()
     done = subprocess.run([sys.executable, "-c", SCRIPT], input=data, capture_output=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr.decode()
     assert done.stdout.decode().split() == ["(0,", "1,", "2)", str(len(pd4dgs_codec.decode(data).anchor_q)), "3.0"]

@@ -10,7 +10,7 @@ import numpy as np
 import refdec
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import busy, make_scene, scenes
+from strategies import busy, make_scene, scenes, small_file
 
 from pd4dgs_codec.entropy.positions import position_channels
 from pd4dgs_codec.entropy.priors import K_MAX
@@ -36,7 +36,7 @@ def test_hashes_of_any_scene_are_those_of_the_package(scene, coding):
 
 
 def test_tensors_by_name_and_prefixes():
-    data = encode(make_scene(7, anchors=20), layers=2, effort=1)
+    data = small_file()
     scene, layers = decode(data), refdec.decode(data)
     assert [layer.number for layer in layers] == [0, 1, 2]
     own = slice(scene.rows[0], scene.rows[1])
@@ -61,8 +61,9 @@ def test_hashes_of_busy_planes():
 
 
 def test_it_imports_the_standard_library_alone():
-    names = {a.name for n in ast.walk(ast.parse(SOURCE)) if isinstance(n, ast.Import) for a in n.names}
-    names |= {n.module for n in ast.walk(ast.parse(SOURCE)) if isinstance(n, ast.ImportFrom)}
+    nodes = list(ast.walk(ast.parse(SOURCE)))
+    names = {alias.name for node in nodes if isinstance(node, ast.Import) for alias in node.names}
+    names |= {node.module for node in nodes if isinstance(node, ast.ImportFrom)}
     assert "struct" in names and names <= set(sys.stdlib_module_names)
 
 
