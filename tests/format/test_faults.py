@@ -13,7 +13,6 @@ from strategies import memory_below, small_file
 from pd4dgs_codec.errors import DecodeError, LimitExceeded
 from pd4dgs_codec.format.container import FLAG_ANCILLARY, read_chunk, read_preamble
 from pd4dgs_codec.format.decoder import decode
-from pd4dgs_codec.format.header import unpack_header
 
 VECTORS = Path(__file__).parents[2] / "spec" / "vectors" / "faulty"
 
@@ -92,4 +91,3 @@ def test_a_few_bytes_cannot_ask_for_gigabytes(name):
 
 def test_the_header_is_small():
     assert len(read_preamble(small_file()).header) < 512
-    assert unpack_header(read_preamble(small_file()).header).mode == "ans"
