@@ -37,26 +37,21 @@ def test_ci_installs_on_each_python_that_the_package_names():
     assert matrix is not None and re.findall(r'"([\d.]+)"', matrix[1]) == named
 
 
-@pytest.fixture
-def stamped(tmp_path: Path) -> Path:
-    """What tools/public_url.py changes, in a copy."""
+def test_a_release_has_public_addresses_and_no_dead_links(tmp_path):
+    """tools/public_url.py changes a copy of these files."""
     for name in ("pyproject.toml", "CITATION.cff", "README.md", "player/README.md", "player/package.json"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         shutil.copy(ROOT / name, tmp_path / name)
     (tmp_path / "tools").mkdir()
     shutil.copy(ROOT / "tools" / "public_url.py", tmp_path / "tools")
     subprocess.run([sys.executable, tmp_path / "tools" / "public_url.py", URL + "/"], check=True)
-    return tmp_path
-
-
-def test_a_release_has_public_addresses_and_no_dead_links(stamped):
-    assert f'[project.urls]\nHomepage = "{URL}"\n' in text("pyproject.toml", stamped)
-    assert json.loads(text("player/package.json", stamped))["repository"]["url"] == f"git+{URL}.git"
-    assert text("CITATION.cff", stamped).endswith(f"repository-code: {URL}\n")
+    assert f'[project.urls]\nHomepage = "{URL}"\n' in text("pyproject.toml", tmp_path)
+    assert json.loads(text("player/package.json", tmp_path))["repository"]["url"] == f"git+{URL}.git"
+    assert text("CITATION.cff", tmp_path).endswith(f"repository-code: {URL}\n")
     for name in ("README.md", "player/README.md"):
-        links = re.findall(r"\]\(([^)]+)\)", text(name, stamped))
+        links = re.findall(r"\]\(([^)]+)\)", text(name, tmp_path))
         assert links and all(link.startswith(("https:", "#")) for link in links)
-    assert f"plays]({URL}/raw/HEAD/docs/img/refining.gif)" in text("README.md", stamped)
+    assert f"plays]({URL}/raw/HEAD/docs/img/refining.gif)" in text("README.md", tmp_path)
 
 
 def test_the_repository_names_no_address_of_its_own():
