@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import npm_package
 import pytest
 
 from pd4dgs_codec import __version__
@@ -73,8 +74,8 @@ def test_every_promise_names_tests_that_exist(page):
 
 
 def test_the_npm_package_has_all_that_it_exports(tmp_path):
-    subprocess.run([sys.executable, ROOT / "tools" / "npm_package.py", tmp_path / "package"], check=True)
     package = tmp_path / "package"
+    npm_package.main(str(package))
     about = json.loads(text("package.json", package))
     wanted = {entry["default"] for entry in about["exports"].values()} | set(about["files"]) | {"LICENSE"}
     assert all((package / name).exists() for name in wanted if not name.startswith("types/"))
