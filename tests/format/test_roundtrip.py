@@ -48,6 +48,7 @@ def test_everything_active_comes_back_and_encodes_to_the_same_bytes(scene, mode,
     active = {cell: row for cell, row in rows_by_voxel(scene).items() if row[1][-1] > 0}
     assert rows_by_voxel(decoded) == active
     assert decoded.layers == scene.layers
+    assert_same_info(decoded.info, scene.info)
     assert_same_networks(decoded.networks, scene.networks)
     for layer in (1, 2):
         assert_same_deformation(decoded.deformation(layer), scene.deformation(layer))
@@ -55,12 +56,6 @@ def test_everything_active_comes_back_and_encodes_to_the_same_bytes(scene, mode,
         assert (np.diff(morton_codes(decoded.anchor_q[first:last])) > 0).all(), "rows are not in Morton order"
         assert (decoded.mask[index][first:last] >= 3).all(), "a layer has rows that are not active in it"
     assert encode(decoded, **options, verify=False) == data
-
-
-@pytest.mark.parametrize("with_camera", [True, False])
-def test_the_header_information_comes_back(with_camera):
-    scene = make_scene(5, with_camera=with_camera)
-    assert_same_info(decode(encode(scene, layers=2)).info, scene.info)
 
 
 @pytest.mark.parametrize("kind", RANGES[:3])
