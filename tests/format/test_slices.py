@@ -30,8 +30,13 @@ def one_slice():
 
 
 @cache
+def with_report():
+    """(file in slices, report)."""
+    return encode_with_report(scene(), effort=2, slices=1750)
+
+
 def sliced():
-    return encode(scene(), effort=2, slices=1750)
+    return with_report()[0]
 
 
 def test_all_slices_are_what_one_slice_per_layer_holds():
@@ -85,7 +90,7 @@ def test_utility_decides_what_comes_first():
 
 
 def test_slices_take_what_was_asked_and_the_report_says_so():
-    data, report = encode_with_report(scene(), effort=2, slices=1750)
+    data, report = with_report()
     rows = [row for layer in report.layers for row in layer.slices]
     assert [row.bytes for row in rows] == [CHUNK_OVERHEAD + len(chunk.payload) for chunk in take_apart(data).chunks]
     assert all(row.bytes <= 1750 for row in rows)
