@@ -194,11 +194,9 @@ def test_a_command_settles_the_policy_before_numpy_is_there():
 
 
 LIBRARY = """
-import sys
-sys.path.append("tests")
 import numpy
 from threadpoolctl import threadpool_info
-from strategies import make_scene
+from pd4dgs_codec import decode
 from pd4dgs_codec.format import encoder
 
 def threads():
@@ -207,7 +205,8 @@ def threads():
 seen, check = [], encoder.check_scene
 encoder.check_scene = lambda scene: (seen.append(threads()), check(scene))
 before = threads()
-encoder.encode(make_scene(3, anchors=12), effort=1)
+with open("spec/vectors/valid/layers-0-1-2.pd4", "rb") as file:
+    encoder.encode(decode(file.read()), effort=1)
 assert seen == [{1}], seen
 assert threads() == before
 print(max(before))
