@@ -1,4 +1,4 @@
-"""What tests ask of runs: runs of a size, their logs, their weights, and that resuming changes nothing."""
+"""Helpers of tests that train: runs of a few steps, their logs and weights, and that resuming changes nothing."""
 
 import json
 import signal
@@ -16,7 +16,7 @@ def read_log(path) -> list[dict]:
 
 
 def trainer_of(dataset, iterations: int | None = 30, steps: int = 0, **options) -> Trainer:
-    """A run of the preset tiny after so many steps."""
+    """A run of the preset tiny that has made so many steps."""
     trainer = Trainer(TrainConfig(preset="tiny", iterations=iterations, **options), dataset)
     for _ in range(steps):
         trainer.learner.step()
@@ -24,7 +24,7 @@ def trainer_of(dataset, iterations: int | None = 30, steps: int = 0, **options) 
 
 
 def records_of(trainer, folder, name: str = "m.pt") -> list[dict]:
-    """Runs a trainer to the checkpoint `name` in the folder; its log."""
+    """Runs a trainer, which writes the checkpoint `name` in the folder, and returns its log."""
     trainer.run(folder / name, log=folder / "log.jsonl")
     return read_log(folder / "log.jsonl")
 
@@ -36,7 +36,7 @@ def assert_same_weights(path, other, rtol: float = 0.0, atol: float = 0.0) -> No
 
 
 def interrupt(trainer, number, when) -> None:
-    """The signal comes in the middle of each step in which `when()` is true."""
+    """Raises the signal in the middle of each step in which `when()` is true."""
     update = trainer.learner.optimiser.step
 
     def interrupted(*at):
@@ -48,8 +48,8 @@ def interrupt(trainer, number, when) -> None:
 
 
 def run_saving(trainer, folder, cuts) -> list[dict]:
-    """Runs a trainer to folder/whole.pt; its log. Before each of the steps `cuts` it saves what a run cut there
-    leaves."""
+    """Runs a trainer to folder/whole.pt and returns its log. Before each step in `cuts` it saves the checkpoint that a
+    run interrupted there leaves."""
     step = trainer.learner.step
 
     def saved_before():

@@ -153,8 +153,8 @@ def test_trainings_side_by_side_are_those_that_are_measured(tmp_path, monkeypatc
 
 
 def test_sections_whose_code_has_changed_are_named(tmp_path, monkeypatch):
-    """Docstrings and comments do not count; on the player's code only the section that opens it depends, and on code
-    that is apart only the section that names it."""
+    """Docstrings and comments do not count. The player's code counts only for the section that opens the player, and
+    code in APART only for the section that names it."""
     assert all((ROOT / "pd4dgs_codec" / path).exists() for paths in common.APART.values() for path in paths)
     monkeypatch.setattr(common, "ROOT", tmp_path)
 

@@ -115,7 +115,7 @@ def payload_of(*numbers: int) -> bytes:
 
 
 def test_tables_of_a_section_are_bounded():
-    """Eight bytes define a table of 128 KiB: 86 kB of them took 1.6 GB."""
+    """Eight bytes define a table of 128 KiB; a section of 86 kB once took 1.6 GB."""
     wide = payload_of(2, 0, MAX_WINDOW - 2, 0, 1280)
     most = FREE_ENTRIES // MAX_WINDOW
     assert len(decode_channels(wide * most, [1] * most)) == most

@@ -1,5 +1,4 @@
-"""What files of Gaussian scenes cost: against the rate model, against the better priors, against LZMA, and against the
-trainer's own sum."""
+"""The size of files of Gaussian scenes against the rate model, other priors, LZMA, and the trainer's own sum."""
 
 from dataclasses import replace
 from functools import cache
@@ -15,7 +14,7 @@ VARIANTS = {"best": {}, "gauss": {"priors": "gauss"}, "lzma": {"mode": "lzma"}}
 #: Spread of a channel over its step, from nearly constant to seven bits a symbol.
 SPREADS = 2.0 ** np.linspace(-0.5, 5.0, 68)
 
-#: Of a layer's hundred priors, at most.
+#: Most bits that the hundred priors of a layer take.
 PRIOR_BITS = 5_000
 
 

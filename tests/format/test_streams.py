@@ -66,7 +66,7 @@ SPLITS = {
 
 @pytest.mark.parametrize("split", SPLITS)
 def test_any_split_takes_the_time_and_memory_of_decoding(split):
-    """Making a scene of all rows for each slice took the square of their number."""
+    """A scene of all rows for each slice once took time that grew with the square of their number."""
     cuts = SPLITS[split]()
     seconds, peak = cost_of_decoding()
     found_seconds, found_peak = cost(lambda: streamed(cuts, keep=1), 2)

@@ -1,4 +1,4 @@
-"""Hostile input: a short run of the fuzzer, bounds of time and memory, and the fuzzer's own eyes."""
+"""Hostile input: a short run of the fuzzer, bounds of time and memory, and faults that the fuzzer must notice."""
 
 import os
 import random
@@ -77,7 +77,7 @@ def crafted(chunk, sections, meta=None):
 
 
 def alike(count):
-    """A section of so many channels, all of them the symbol 1 alone."""
+    """A section of so many channels that hold only the symbol 1."""
     return varint(0, 2, *[16] * (count - 1))
 
 
@@ -196,11 +196,11 @@ def test_taking_apart_and_putting_together_changes_nothing():
 
 
 class Panic(BaseException):
-    """As the coder library raises."""
+    """Such as the coder library raises."""
 
 
-class Endless(DecodeError):
-    """With a message of two lines, which the package's own errors never have."""
+class TwoLines(DecodeError):
+    """The package's own errors never have such a message."""
 
     def __str__(self) -> str:
         return "one\ntwo"
@@ -210,7 +210,7 @@ class Endless(DecodeError):
     "error, kind",
     [
         *((error, "exception") for error in (ValueError("x"), MemoryError(), RecursionError(), Panic("x"))),
-        (Endless("it"), "message"),
+        (TwoLines("it"), "message"),
     ],
 )
 def test_an_error_that_no_decoder_may_raise(monkeypatch, error, kind):
