@@ -235,23 +235,15 @@ def assert_same_scene(a: Scene, b: Scene) -> None:
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name, strict=True)
     np.testing.assert_equal(*(scene.grading and asdict(scene.grading) for scene in (a, b)))
     np.testing.assert_equal(a.mask, b.mask)
-    assert_same_networks(a.networks, b.networks)
+    assert_same_tensors(a, b)
+
+
+def assert_same_tensors(a: Scene, b: Scene) -> None:
+    """Equal networks and planes, the planes in one order."""
+    np.testing.assert_equal(a.networks, b.networks)
     for layer in (1, 2):
-        assert_same_deformation(a.deformation(layer), b.deformation(layer))
-
-
-def assert_same_deformation(a: Deformation | None, b: Deformation | None) -> None:
-    """Both are absent, or have equal networks and planes."""
-    assert (a is None) == (b is None)
-    if a is not None and b is not None:
-        assert_same_networks(a.networks, b.networks)
-        np.testing.assert_equal(a.planes, b.planes)
-        assert [list(scale) for scale in a.planes] == [list(scale) for scale in b.planes], "planes in another order"
-
-
-def assert_same_networks(a: dict[str, Network], b: dict[str, Network]) -> None:
-    """Equal names and equal weights."""
-    np.testing.assert_equal(a, b)
+        fields = a.deformation(layer), b.deformation(layer)
+        np.testing.assert_equal(*(f and (f.networks, [list(scale.items()) for scale in f.planes]) for f in fields))
 
 
 def assert_same_info(a: SceneInfo, b: SceneInfo) -> None:

@@ -8,15 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import (
-    RANGES,
-    assert_same_deformation,
-    assert_same_info,
-    assert_same_networks,
-    assert_same_scene,
-    make_scene,
-    scenes,
-)
+from strategies import RANGES, assert_same_info, assert_same_scene, assert_same_tensors, make_scene, scenes
 
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format import encoder
@@ -49,9 +41,7 @@ def test_everything_active_comes_back_and_encodes_to_the_same_bytes(scene, mode,
     assert rows_by_voxel(decoded) == active
     assert decoded.layers == scene.layers
     assert_same_info(decoded.info, scene.info)
-    assert_same_networks(decoded.networks, scene.networks)
-    for layer in (1, 2):
-        assert_same_deformation(decoded.deformation(layer), scene.deformation(layer))
+    assert_same_tensors(decoded, scene)
     for index, (first, last) in enumerate(pairwise((0, *decoded.rows))):
         assert (np.diff(morton_codes(decoded.anchor_q[first:last])) > 0).all(), "rows are not in Morton order"
         assert (decoded.mask[index][first:last] >= 3).all(), "a layer has rows that are not active in it"
