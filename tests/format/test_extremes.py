@@ -15,27 +15,23 @@ from pd4dgs_codec.scene import Widths
 MANY = 300_000
 
 
-def many(anchors, widths):
-    """A scene of layer 0 with that many anchors on a line through a cube, half of them in step classes above 0."""
+def many(widths):
+    """A scene of layer 0 with MANY anchors, which fill a box."""
     rng, base = np.random.default_rng(0), make_scene(5, layers=(0,), anchors=1, widths=widths, hidden=())
-    index = np.arange(anchors)
+    index = np.arange(MANY)
     cells = np.stack([index % 97, index // 97 % 89, index // (97 * 89)], axis=1).astype(np.int32)
-    rows = rng.permutation(anchors)
-    values = {}
-    for name, shape in widths.attributes.items():
-        values[name] = rng.integers(-3, 4, (anchors, *shape)) * np.float32(base.steps.attributes[name])
-    return replace(
-        base,
-        rows=(anchors,),
-        anchor_q=cells[rows],
-        mask=(rng.integers(3, 256, anchors).astype(np.uint8),),
-        **{name: value.astype(np.float32) for name, value in values.items()},
-    )
+    rows = rng.permutation(MANY)
+    values = {
+        name: rng.integers(-3, 4, (MANY, *shape)).astype(np.float32) * np.float32(base.steps.attributes[name])
+        for name, shape in widths.attributes.items()
+    }
+    mask = (rng.integers(3, 256, MANY).astype(np.uint8),)
+    return replace(base, rows=(MANY,), anchor_q=cells[rows], mask=mask, **values)
 
 
 @pytest.mark.parametrize("slices", [0, pytest.param(200_000, marks=pytest.mark.slow)])
 def test_three_hundred_thousand_anchors(slices):
-    scene = many(MANY, Widths(1, 1))
+    scene = many(Widths(1, 1))
     got = decode(encode(scene, layers=0, effort=1, slices=slices, omit="nothing", verify=False))
     assert got.rows == (MANY,)
     order = morton_order(scene.anchor_q)
