@@ -59,22 +59,20 @@ def test_hashes_name_the_contents_not_the_coding():
 
 
 def test_npz_keys_and_symbols():
-    data = small_file(omit="nothing")
-    scene = decode(data)
-    arrays = to_npz_dict(scene, symbols=True)
-    plain = to_npz_dict(scene)
+    scene = decode(small_file(omit="nothing"))
+    arrays, plain = to_npz_dict(scene, symbols=True), to_npz_dict(scene)
     assert {"anchor", "feature", "scaling_log", "offset", "mask_0", "mask_1", "mask_2"} <= set(plain)
     assert {"mlp.opacity.weight.0", "mlp.color.bias.1"} <= set(plain)
     assert {"mlp.global.trunk.weight.0", "mlp.local.position.bias.0"} <= set(plain)
     assert {"planes.global.0.xy", "planes.local.0.zt"} <= set(plain)
     assert not any(name.endswith(("_q", "_step")) for name in plain)
-    data = [name for name in plain if not name.startswith("meta_")]
-    for name in data:
+    tensors = [name for name in plain if not name.startswith("meta_")]
+    for name in tensors:
         k, step = arrays[f"{name}_q"], arrays[f"{name}_step"]
         assert k.dtype == np.int32 and plain[name].dtype == np.float32 == step.dtype
         value = (k.astype(np.float64) * np.float64(step)).astype(np.float32)
         np.testing.assert_array_equal(value, plain[name], err_msg=name)
-    assert set(arrays) - set(plain) == {f"{name}_{end}" for name in data for end in ("q", "step")}
+    assert set(arrays) - set(plain) == {f"{name}_{end}" for name in tensors for end in ("q", "step")}
     assert tuple(arrays["meta_rows"]) == scene.rows and arrays["meta_camera_K"].shape == (3, 3)
 
 
