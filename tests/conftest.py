@@ -33,7 +33,7 @@ sys.path[:0] = [str(ROOT / name) for name in ("tools", "spec", "benchmarks")]
 
 #: Rooms that need the extra `train`; without it their tests are not even collected.
 NEED_TRAIN = ["batch", "bench", "benchmarks", "cli", "data", "interchange", "model", "draw", "quality", "train"]
-NEED_NO_KERNEL = ["entropy", "spec"]
+NEED_FEW_KERNELS = ["entropy", "spec"]
 collect_ignore = [] if find_spec("torch") and find_spec("numba") else NEED_TRAIN
 
 settings.register_profile("pd4dgs", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -41,11 +41,11 @@ settings.load_profile("pd4dgs")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Each worker begins with a run of the tests in their order. The first one's needs kernels, the others' begin with
-    rooms that need none: one worker compiles the kernels, which takes a minute, and the others find them compiled."""
+    """Each worker begins with a run of the tests in their order. The first worker compiles most kernels, which takes a
+    minute; the next begins with rooms that need only those of the encoder, and finds the others compiled."""
     rooms = [item.path.relative_to(ROOT / "tests").parts[0] for item in items]
-    free = [item for item, room in zip(items, rooms, strict=True) if room in NEED_NO_KERNEL]
-    others = [item for item, room in zip(items, rooms, strict=True) if room not in NEED_NO_KERNEL]
+    free = [item for item, room in zip(items, rooms, strict=True) if room in NEED_FEW_KERNELS]
+    others = [item for item, room in zip(items, rooms, strict=True) if room not in NEED_FEW_KERNELS]
     run = len(items) // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     items[:] = [*others[:run], *free, *others[run:]]
 
