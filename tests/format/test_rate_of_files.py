@@ -2,13 +2,14 @@
 
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
 from strategies import make_scene
 
 from pd4dgs_codec.format.encoder import Report, encode_with_report
-from pd4dgs_codec.scene import Deformation, Network, Scene
+from pd4dgs_codec.scene import Deformation, Scene
 
 VARIANTS = {"best": {}, "gauss": {"priors": "gauss"}, "lzma": {"mode": "lzma"}}
 #: Spread of a channel over its step, from nearly constant to seven bits a symbol.
@@ -25,8 +26,7 @@ def gaussian_scene() -> Scene:
     rng = np.random.default_rng(21)
     scene = make_scene(21, anchors=6_000, extent=500, hidden=(32,), channels=4, sides=(12, 12, 12, 8), width=32)
     n = len(scene.anchor_q)
-    steps = {name: getattr(scene.steps, name) for name in ("feature", "scaling_log", "offset")}
-    step = np.repeat([*steps.values()], [32, 6, 30])
+    step = np.repeat([*scene.steps.attributes.values()], [32, 6, 30])
     values = step * (rng.normal(0, 20, 68) + SPREADS * rng.normal(size=(n, 68)))
     feature, scaling_log, offset = np.split(values.astype(np.float32), [32, 38], axis=1)
     first = rng.integers(0, 3, n)
@@ -38,26 +38,23 @@ def gaussian_scene() -> Scene:
         scaling_log=scaling_log,
         offset=offset.reshape(n, 10, 3),
         mask=mask,
-        networks={k: _gaussian_network(rng, net, scene.steps.weights_scaffold) for k, net in scene.networks.items()},
-        global_deformation=_gaussian_deformation(rng, scene.global_deformation, scene.steps.planes_global),
-        local_deformation=_gaussian_deformation(rng, scene.local_deformation, scene.steps.planes_local),
+        networks=noise(rng, scene.networks, 0, 6 * scene.steps.weights_scaffold),
+        global_deformation=noisy_deformation(rng, scene.global_deformation, scene.steps.planes_global),
+        local_deformation=noisy_deformation(rng, scene.local_deformation, scene.steps.planes_local),
     )
 
 
-def _gaussian_network(rng: np.random.Generator, network: Network, step: float) -> Network:
-    return tuple(
-        (rng.normal(0, 6 * step, w.shape).astype(np.float32), rng.normal(0, 6 * step, b.shape).astype(np.float32))
-        for w, b in network
-    )
+def noise(rng: np.random.Generator, arrays: Any, mean: float, spread: float) -> Any:
+    """Gaussian noise in place of arrays in dicts and tuples."""
+    if isinstance(arrays, dict):
+        return {name: noise(rng, value, mean, spread) for name, value in arrays.items()}
+    if isinstance(arrays, tuple):
+        return tuple(noise(rng, value, mean, spread) for value in arrays)
+    return rng.normal(mean, spread, arrays.shape).astype(np.float32)
 
 
-def _gaussian_deformation(rng: np.random.Generator, field: Deformation, step: float) -> Deformation:
-    planes = tuple(
-        {name: rng.normal(1, 4 * step, plane.shape).astype(np.float32) for name, plane in scale.items()}
-        for scale in field.planes
-    )
-    networks = {name: _gaussian_network(rng, network, 2.0**-6) for name, network in field.networks.items()}
-    return Deformation(planes, networks)
+def noisy_deformation(rng: np.random.Generator, field: Deformation, step: float) -> Deformation:
+    return Deformation(noise(rng, field.planes, 1, 4 * step), noise(rng, field.networks, 0, 6 * 2.0**-6))
 
 
 @cache
