@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from tiny import TINY, write_views
+from tiny import TINY, camera_ahead, write_views
 
 from pd4dgs_codec import encode
 from pd4dgs_codec.bench import latency, report, runtime
@@ -21,7 +21,6 @@ from pd4dgs_codec.format.info import info
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import PRESETS
 from pd4dgs_codec.model.model import from_scene
-from pd4dgs_codec.scene import Camera
 from pd4dgs_codec.web.server import Server
 
 
@@ -114,10 +113,9 @@ def random_view(n: int = 150) -> runtime.View:
         "opacities": rng.uniform(0.0, 1.0, n),
         "colors": rng.uniform(0, 1, (n, 3)),
     }
-    viewmat, K = np.eye(4, dtype=np.float32), np.array([[40, 0, 25], [0, 40, 17], [0, 0, 1]], np.float32)
-    viewmat[2, 3] = 2.0
     tensors = {name: torch.from_numpy(value.astype(np.float32)) for name, value in splats.items()}
-    return {**tensors, "camera": Camera(viewmat, K, 50, 35), "background": (0.2, 0.5, 0.9), "near_plane": 0.1}
+    camera = camera_ahead(2.0, 40.0, 50, 35)
+    return {**tensors, "camera": camera, "background": (0.2, 0.5, 0.9), "near_plane": 0.1}
 
 
 def test_rasterisers_are_compared_with_the_reference():
