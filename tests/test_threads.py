@@ -22,7 +22,6 @@ pytestmark = pytest.mark.usefixtures("kernel_threads")
 def _run(code: str, **variables: str) -> list[str]:
     """The words that `code` prints in a process of its own, in which no number of threads is asked for."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMP_", "OPENBLAS_"))} | variables
-    environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), *sys.path[1:]])
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr
     return done.stdout.split()
