@@ -239,11 +239,11 @@ def assert_same_scene(a: Scene, b: Scene) -> None:
 
 
 def assert_same_tensors(a: Scene, b: Scene) -> None:
-    """Equal networks and planes, the planes in one order."""
+    """Equal networks, planes and key instants, the planes in one order."""
     np.testing.assert_equal(a.networks, b.networks)
     for layer in (1, 2):
-        fields = a.deformation(layer), b.deformation(layer)
-        np.testing.assert_equal(*(f and (f.networks, [list(scale.items()) for scale in f.planes]) for f in fields))
+        fields = [scene.deformation(layer) for scene in (a, b)]
+        np.testing.assert_equal(*(f and (f.key, f.networks, [list(s.items()) for s in f.planes]) for f in fields))
 
 
 def assert_same_info(a: SceneInfo, b: SceneInfo) -> None:
