@@ -9,7 +9,7 @@ import pytest
 
 from pd4dgs_codec import FORMAT_VERSION, io
 from pd4dgs_codec import __main__ as dispatcher
-from pd4dgs_codec.cli import common, options
+from pd4dgs_codec.cli import common
 from pd4dgs_codec.data.bodies import MOTIONS, THINGS
 
 VERBS = {verb: import_module(f"pd4dgs_codec.cli.{dispatcher.MODULES.get(verb, verb)}") for verb in dispatcher.VERBS}
@@ -70,10 +70,6 @@ def test_links_and_other_spellings_name_one_file(tmp_path, monkeypatch):
     assert common.same_file("a", str(tmp_path / "a")) and common.same_file("./link", "a")
     assert common.same_file("missing", "./missing") and not common.same_file("a", "b")
     assert not common.same_file("-", "-") and not common.same_file("-", "./-"), "stdin is no file"
-
-
-def test_rates_are_bits_per_second():
-    assert options.rates("500k,2M,1G,64") == {"500k": 5e5, "2M": 2e6, "1G": 1e9, "64": 64.0}
 
 
 def test_infinite_and_nan_become_null():
