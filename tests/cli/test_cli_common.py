@@ -7,7 +7,7 @@ from importlib import import_module
 
 import pytest
 
-from pd4dgs_codec import FORMAT_VERSION, io
+from pd4dgs_codec import FORMAT_VERSION
 from pd4dgs_codec import __main__ as dispatcher
 from pd4dgs_codec.cli import common
 from pd4dgs_codec.data.bodies import MOTIONS, THINGS
@@ -69,7 +69,3 @@ def test_links_and_other_spellings_name_one_file(tmp_path, monkeypatch):
     assert common.same_file("a", str(tmp_path / "a")) and common.same_file("./link", "a")
     assert common.same_file("missing", "./missing") and not common.same_file("a", "b")
     assert not common.same_file("-", "-") and not common.same_file("-", "./-"), "stdin is no file"
-
-
-def test_infinite_and_nan_become_null():
-    assert io.finite({"a": [float("inf"), 1.0], "b": (float("nan"), "x")}) == {"a": [None, 1.0], "b": [None, "x"]}
