@@ -45,14 +45,6 @@ def test_a_target_is_met_and_its_loss_is_reported(cli, model_pt, tmp_path):
     assert all(10 < level["error_psnr"] < 100 for level in target["levels"])
 
 
-def test_a_target_out_of_reach_writes_nothing(cli, model_pt, tmp_path):
-    output = tmp_path / "s.pd4"
-    result = cli("encode", model_pt, "-o", output, "--mode", "lzma", "--target-size", "L2=10")
-    assert result.code == 1 and not output.exists()
-    (line,) = [line for line in result.error_lines if "error" in line]
-    assert "layer 2 takes at least" in line and "expected at most 10" in line
-
-
 def test_layers_with_too_little_gain_are_left_out_with_their_figures(cli, model_pt, shared_dataset, tmp_path):
     judged = ("encode", model_pt, "-o", tmp_path / "s.pd4", "--data", shared_dataset, "--holdout", 3, *FAST)
     costly = cli(*judged, "--min-gain", 1e5).json
