@@ -487,28 +487,30 @@ FAULTS: dict[str, tuple[Any, int | None, str]] = {
 }
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_bad_input_is_one_line_and_keeps_what_was_valid(page, server, folder, lively, fault):
-    make, shown, words = FAULTS[fault]
-    data = make(lively, [row["end"] for row in info(lively)["layers"]])
-    name = fault.replace(" ", "-") + ".pd4"
-    if data is not None:
-        (folder / name).write_bytes(data)
-    player = element(page, server, f'controls src="{server.url_of(name)}"')
+def test_bad_input_is_one_line_and_keeps_what_was_valid(page, server, folder, lively):
+    """On one page, where a whole scene follows each."""
+    ends = [row["end"] for row in info(lively)["layers"]]
+    player = element(page, server, "controls")
     alert = player.get_by_role("alert")
-    alert.wait_for()
-    text = alert.inner_text()
-    assert words in text and "\n" not in text and len(text) < 300
-    page.wait_for_function("seen.some(([name]) => name === 'error')")
-    (error,) = (detail for name, detail in page.evaluate("seen") if name == "error")
-    assert error["message"] == text and error["kind"]
-    if shown is not None:
-        wait_for_level(page, shown)
-    else:
-        assert page.evaluate("document.querySelector('pd4-player').player.status.level") is None
-    page.evaluate("(url) => { document.querySelector('pd4-player').src = url }", server.url_of("scene.pd4"))
-    wait_for_level(page, 2)
-    assert alert.is_hidden()
+    source = f"(url) => {{ seen.length = 0; {ELEMENT}.src = url }}"
+    for fault, (make, shown, words) in FAULTS.items():
+        name, data = fault.replace(" ", "-") + ".pd4", make(lively, ends)
+        if data is not None:
+            (folder / name).write_bytes(data)
+        page.evaluate(source, server.url_of(name))
+        alert.wait_for()
+        text = alert.inner_text()
+        assert words in text and "\n" not in text and len(text) < 300, (fault, text)
+        page.wait_for_function("seen.some(([name]) => name === 'error')")
+        (error,) = (detail for name, detail in page.evaluate("seen") if name == "error")
+        assert error["message"] == text and error["kind"], fault
+        if shown is not None:
+            wait_for_level(page, shown)
+        else:
+            assert page.evaluate(f"{ELEMENT}.player.status.level") is None, fault
+        page.evaluate(source, server.url_of("scene.pd4"))
+        wait_for_level(page, 2)
+        assert alert.is_hidden(), fault
 
 
 # -- robustness --------------------------------------------------------------------------------------------------------
