@@ -612,7 +612,7 @@ def test_an_evaluation_that_ends_after_its_scene_was_replaced_is_not_shown(harne
 def test_controls(page, server):
     player = element(page, server, f'controls src="{server.url_of("scene.pd4")}"')
     wait_for_level(page, 2)
-    state = "(() => { const p = document.querySelector('pd4-player'); return [...p.camera.viewmat] })()"
+    state = f"[...{ELEMENT}.camera.viewmat]"
 
     slider = player.get_by_role("slider", name="Time")
     slider.fill("2.5")
@@ -642,8 +642,7 @@ def test_controls(page, server):
     assert page.evaluate(state) == home
 
     far = np.array(home).reshape(4, 4) + np.array([[0, 0, 0, 50.0]] + 3 * [[0, 0, 0, 0]])
-    look = "(v) => void (player.camera = { ...player.camera, viewmat: new Float32Array(v) })"
-    page.evaluate(f"void (window.player = {ELEMENT})")
+    look = f"(v) => void ({ELEMENT}.camera = {{ ...{ELEMENT}.camera, viewmat: new Float32Array(v) }})"
     page.evaluate(look, far.ravel().tolist())
     page.keyboard.press("ArrowLeft")
     near = np.array(page.evaluate(state)).reshape(4, 4)
@@ -659,7 +658,7 @@ def test_controls(page, server):
     before = page.evaluate(changes)
     page.keyboard.press("Space")
     assert page.evaluate(changes) > before
-    page.evaluate("document.querySelector('pd4-player').pause()")
+    page.evaluate(f"{ELEMENT}.pause()")
 
     area = surface.bounding_box()
     x, y = area["x"] + 160, area["y"] + 100
@@ -770,7 +769,7 @@ def test_attributes_and_removal(page, server):
     wait_for_level(page, 1)
     assert player.locator("img").is_hidden() and player.get_by_role("group").is_hidden()
     assert page.evaluate(f"{ELEMENT}.player.canvas.tabIndex") == -1  # no key does anything
-    page.wait_for_function("document.querySelector('pd4-player').time < 2")  # it plays, and begins anew
+    page.wait_for_function(f"{ELEMENT}.time < 2")  # it plays, and begins anew
     names = [name for name, _ in page.evaluate("seen")]
     assert names.count("firstpicture") == 1 and names.count("upgrade") <= 1 and "progress" in names
     page.evaluate(f"{ELEMENT}.removeAttribute('loop')")
@@ -866,7 +865,7 @@ def test_the_page_asks_nobody_else_and_measures_itself(page, server):
     page.on("request", lambda request: hosts.add(request.url.split("/player/")[0]))
     page.goto(server.url_of("player/index.html"))
     wait_for_level(page, 2)
-    assert not page.evaluate("document.querySelector('pd4-player').paused")
+    assert not page.evaluate(f"{ELEMENT}.paused")
     assert page.get_by_role("main").get_by_role("heading", level=1).count() == 1
     page.goto(server.url_of("player/index.html") + "?bench&src=scene.pd4&sizes=48x36")
     page.wait_for_function("!!window.benchResult")
