@@ -137,11 +137,18 @@ def lively() -> bytes:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory, lively: bytes) -> Path:
+def small() -> bytes:
+    """For tests that compare no pictures."""
+    return encode(lively_scene(150), layers=2, effort=1)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, lively: bytes, small: bytes) -> Path:
     """The player and scenes beside it."""
     root = tmp_path_factory.mktemp("www")
     shutil.copytree(PLAYER, root / "player", ignore=shutil.ignore_patterns("node_modules", "test"))
     (root / "scene.pd4").write_bytes(lively)
+    (root / "small.pd4").write_bytes(small)
     shutil.copy(root / "scene.pd4", root / "player" / "scene.pd4")
     return root
 
@@ -487,14 +494,14 @@ FAULTS: dict[str, tuple[Any, int | None, str]] = {
 }
 
 
-def test_bad_input_is_one_line_and_keeps_what_was_valid(page, server, folder, lively):
+def test_bad_input_is_one_line_and_keeps_what_was_valid(page, server, folder, small):
     """On one page, where a whole scene follows each."""
-    ends = [row["end"] for row in info(lively)["layers"]]
+    ends = [row["end"] for row in info(small)["layers"]]
     player = element(page, server, "controls")
     alert = player.get_by_role("alert")
     source = f"(url) => {{ seen.length = 0; {ELEMENT}.src = url }}"
     for fault, (make, shown, words) in FAULTS.items():
-        name, data = fault.replace(" ", "-") + ".pd4", make(lively, ends)
+        name, data = fault.replace(" ", "-") + ".pd4", make(small, ends)
         if data is not None:
             (folder / name).write_bytes(data)
         page.evaluate(source, server.url_of(name))
@@ -508,7 +515,7 @@ def test_bad_input_is_one_line_and_keeps_what_was_valid(page, server, folder, li
             wait_for_level(page, shown)
         else:
             assert page.evaluate(f"{ELEMENT}.player.status.level") is None, fault
-        page.evaluate(source, server.url_of("scene.pd4"))
+        page.evaluate(source, server.url_of("small.pd4"))
         wait_for_level(page, 2)
         assert alert.is_hidden(), fault
 
@@ -610,7 +617,7 @@ def test_an_evaluation_that_ends_after_its_scene_was_replaced_is_not_shown(harne
 
 
 def test_controls(page, server):
-    player = element(page, server, f'controls src="{server.url_of("scene.pd4")}"')
+    player = element(page, server, f'controls src="{server.url_of("small.pd4")}"')
     wait_for_level(page, 2)
     state = f"[...{ELEMENT}.camera.viewmat]"
 
@@ -690,7 +697,7 @@ def test_controls(page, server):
 
 def test_every_control_has_a_name_and_is_reached_by_key(page, server):
     """A button for a headset is there only if a headset is."""
-    player = element(page, server, f'controls src="{server.url_of("scene.pd4")}"')
+    player = element(page, server, f'controls src="{server.url_of("small.pd4")}"')
     wait_for_level(page, 2)
     names = []
     for _ in range(6):
@@ -754,7 +761,7 @@ def test_a_headset_shows_each_eye_its_picture(page, server, folder):
 
 def test_a_headset_that_fails_is_one_line(page, server):
     page.add_init_script(path=PLAYER / "test-browser" / "headset.js")
-    player = element(page, server, f'controls src="{server.url_of("scene.pd4")}"')
+    player = element(page, server, f'controls src="{server.url_of("small.pd4")}"')
     wait_for_level(page, 2)
     page.evaluate("void (XRWebGLLayer = class { constructor() { throw Error('no') } })")
     player.get_by_role("button", name="Show in the headset").click()
@@ -763,7 +770,7 @@ def test_a_headset_that_fails_is_one_line(page, server):
 
 
 def test_attributes_and_removal(page, server):
-    attributes = f'src="{server.url_of("scene.pd4")}" time="2" level="1" autoplay loop poster="data:,"'
+    attributes = f'src="{server.url_of("small.pd4")}" time="2" level="1" autoplay loop poster="data:,"'
     player = element(page, server, attributes)
     assert player.locator("img").count() == 1
     wait_for_level(page, 1)
@@ -786,7 +793,7 @@ def test_attributes_and_removal(page, server):
 
 def test_code_and_scene_may_come_from_other_servers(page, server, folder):
     with Server(folder) as other, other.running():
-        element(page, server, f'src="{other.url_of("scene.pd4")}"', other)
+        element(page, server, f'src="{other.url_of("small.pd4")}"', other)
         wait_for_level(page, 2)
 
 
@@ -826,11 +833,11 @@ def test_a_package_by_the_installed_wheel_plays_from_any_web_server(page, instal
     assert [Path(urlsplit(url).path).name for url in asked if url.startswith("http")] == ["moved", "scene.pd4"]
 
 
-def test_the_scene_is_asked_for_while_the_page_arrives(page, folder, lively):
+def test_the_scene_is_asked_for_while_the_page_arrives(page, folder, small):
     """Once, and the answer is the one that is shown."""
     (folder / "packed").mkdir()
     (folder / "packed" / "index.html").write_text(packed_page())
-    (folder / "packed" / "scene.pd4").write_bytes(lively)
+    (folder / "packed" / "scene.pd4").write_bytes(small)
     asked: list[float] = []
     log = lambda line: asked.append(time.time()) if "scene.pd4" in line else None  # noqa: E731
     with Server(folder, link=Link(2e5), log=log) as slow, slow.running():
@@ -841,8 +848,8 @@ def test_the_scene_is_asked_for_while_the_page_arrives(page, folder, lively):
 
 
 @pytest.mark.parametrize("place", ["notebook", "file"])
-def test_one_page_holds_player_and_scene(page, server, lively, place):
-    shown = show(lively, height=240)
+def test_one_page_holds_player_and_scene(page, server, small, place):
+    shown = show(small, height=240)
     asked: list[str] = []
     page.on("request", lambda request: asked.append(request.url.split(":")[0]))
     if place == "notebook":
