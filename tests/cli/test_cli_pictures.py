@@ -106,7 +106,7 @@ def test_a_model_keeps_the_background_that_it_is_trained_on(cli, tmp_path, trans
     options = ("--preset", "tiny", "--iterations", 1, "--background", "0,0.5,1")
     assert cli("train", transparent, "-o", tmp_path / "m.pt", *options).code == 0
     assert checkpoint.load(tmp_path / "m.pt")[0].info.background == (0, 0.5, 1)
-    assert cli("encode", tmp_path / "m.pt", "-o", tmp_path / "m.pd4").code == 0
+    assert cli("encode", tmp_path / "m.pt", "-o", tmp_path / "m.pd4", "--effort", 1).code == 0
     assert decode((tmp_path / "m.pd4").read_bytes()).info.background == (0, 0.5, 1)
     assert cli("eval", tmp_path / "m.pd4", transparent, "--background", "red").code == 2
 

@@ -59,7 +59,7 @@ def test_options_reach_the_configuration(train, tmp_path):
         config[k] for k in ("seed", "downscale", "holdout", "rate_scale", "rollout", "preset", "max_layer", "prune")
     ]
     scene = to_scene(checkpoint.load(tmp_path / "m.pt")[0])
-    assert scene.widths == decode(encode(scene)).widths == Widths(5, 3, viewing=("color",))
+    assert scene.widths == decode(encode(scene, effort=1)).widths == Widths(5, 3, viewing=("color",))
     assert found == [7, 2, 3, 0.5, "fixed", "tiny", 1, 0.1]
     assert not (config["noise"] or config["tmc_binary"] or config["tmc_smooth"]) and config["keep_layers"]
 
