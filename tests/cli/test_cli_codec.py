@@ -12,18 +12,16 @@ from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.format.metadata import Metadata
-from pd4dgs_codec.model import checkpoint
-from pd4dgs_codec.model.model import to_scene
 
 ENCODE_KEYS = {"mode", "bytes", "verified", "seconds", "layers", "left_out"}
 LAYER_KEYS = {"layer", "bytes", "payload_bits", "rate_bits", "position_bits", "symbols", "anchors"}
 
 
-def test_encode_writes_what_the_codec_encodes(cli, model_pt, tmp_path):
+def test_encode_writes_what_the_codec_encodes(cli, model_pt, scene_pd4, tmp_path):
     output = tmp_path / "s.pd4"
     result = cli("encode", model_pt, "-o", output, "--effort", 1, "--json")
     assert result.code == 0 and result.err == ""
-    assert output.read_bytes() == encode(to_scene(checkpoint.load(model_pt)[0]), effort=1)
+    assert output.read_bytes() == scene_pd4.read_bytes()
     report = result.json
     assert ENCODE_KEYS <= set(report) and report["verified"] is True
     assert report["bytes"] == output.stat().st_size
