@@ -1,8 +1,6 @@
 """encode, decode and info, as their users call them."""
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -153,16 +151,14 @@ def test_info_names_what_is_left_out(cli, model_pt, tmp_path):
     assert cli("decode", output, "--max-layer", 1, "--json").json["absent"] == []
 
 
-def test_decoding_needs_no_torch_no_numba_and_for_a_local_file_no_network(scene_pd4):
+def test_decoding_needs_no_torch_no_numba_and_for_a_local_file_no_network(scene_pd4, python):
     program = (
         "import sys; sys.modules['torch'] = sys.modules['numba'] = None\n"
         "from pd4dgs_codec.__main__ import main\n"
         f"code = main(['decode', {str(scene_pd4)!r}, '--json']) or main(['info', {str(scene_pd4)!r}])\n"
         "assert not {'http', 'ssl', 'email'} & set(sys.modules)\nsys.exit(code)"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
-    assert done.returncode == 0, done.stderr
-    assert json.loads(done.stdout.splitlines()[0])["complete"] is True
+    assert json.loads(python(program).splitlines()[0])["complete"] is True
 
 
 def test_max_bytes_and_a_truncated_file_stop_at_a_slice(cli, tmp_path):
