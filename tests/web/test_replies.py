@@ -10,10 +10,9 @@ from collections.abc import Callable, Iterator
 import pytest
 
 from pd4dgs_codec.errors import DeliveryError, Pd4Error
-from pd4dgs_codec.web.client import SceneClient, Transfer
+from pd4dgs_codec.web.client import SceneClient
 
 FILE = bytes(range(256)) * 4
-WHOLE = b'HTTP/1.1 200 OK\r\nContent-Length: %d\r\nETag: "a"\r\n\r\n' % len(FILE) + FILE
 
 
 @contextlib.contextmanager
@@ -123,8 +122,3 @@ def test_replies_at_random_end_with_the_file_or_an_error_of_one_line(seed, count
                     assert str(error).isprintable(), (seed, i, str(error))
                 except Exception as error:
                     raise AssertionError(f"seed {seed}, case {i}: {error!r} from {given}") from error
-
-
-def test_the_plain_answer_is_taken():
-    with answering(lambda c: c.sendall(WHOLE)) as url:
-        assert Transfer(url).read(len(FILE)) == FILE
