@@ -106,16 +106,14 @@ def test_a_browser_sees_the_scene_from_its_camera(watched, trainer, dataset, mon
     assert watched.state.content.startswith("step 4 of 6")
 
 
-@pytest.mark.parametrize(
-    "origin", ["http://evil.example", "null", "http://127.0.0.1.evil.example", "https://localhost"]
-)
-def test_a_page_of_another_site_sees_nothing(watched, origin):
+def test_a_page_of_another_site_sees_nothing(watched):
     """A site can open a socket to this machine in its visitor's browser, which says whose page it is."""
     from websockets.exceptions import InvalidStatus
 
-    with pytest.raises(InvalidStatus) as refused:
-        connected(watched, origin=origin)
-    assert refused.value.response.status_code == 403
+    for origin in ("http://evil.example", "null", "http://127.0.0.1.evil.example", "https://localhost"):
+        with pytest.raises(InvalidStatus) as refused:
+            connected(watched, origin=origin)
+        assert refused.value.response.status_code == 403, origin
     connected(watched, origin=watched.url).close()
 
 
