@@ -33,8 +33,8 @@ def shelf(tmp_path, packages):
     return tmp_path
 
 
-def test_what_others_name_carries_its_digest(scene_bytes):
-    files = package(scene_bytes, lambda scene: VIDEO, immutable=True)
+def test_what_others_name_carries_its_digest(scene_bytes, packages):
+    files = packages["a b"]
     plain = package(scene_bytes, lambda scene: VIDEO)
     named = {name: found for name in files if (found := re.search("-([0-9a-f]{16})[.]", name))}
     assert len(named) == 4 and len(files) == len(plain) and all(files.values())
@@ -48,14 +48,14 @@ def test_what_others_name_carries_its_digest(scene_bytes):
     assert package(scene_bytes, lambda scene: VIDEO, immutable=True) == files
 
 
-def test_the_index_says_what_caches_may_keep_and_when_a_picture_is_there(scene_bytes):
+def test_the_index_says_what_caches_may_keep_and_when_a_picture_is_there(scene_bytes, packages):
     files = package(scene_bytes, immutable=True)
     index = json.loads(files["index.json"])
     assert set(index["cache_control"]) == set(files)
     assert index["cache_control"][index["file"]] == IMMUTABLE and index["cache_control"]["index.html"] == CHANGES
     first = index["layers"][0]["range"][1]
     assert index["first_frame_seconds"]["2M"] == pytest.approx(8 * first / 2e6)
-    assert set(json.loads(package(scene_bytes)["index.json"])["cache_control"].values()) == {CHANGES}
+    assert set(json.loads(packages["c"]["index.json"])["cache_control"].values()) == {CHANGES}
 
 
 def test_a_library_lists_its_packages(shelf, scene_bytes):

@@ -14,7 +14,9 @@ from strategies import LAYER_SETS, make_scene
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import DeliveryError, Malformed, Truncated
 from pd4dgs_codec.format import decoder
-from pd4dgs_codec.format.container import write_chunk
+from pd4dgs_codec.format.container import read_preamble, write_chunk, write_preamble
+from pd4dgs_codec.format.header import pack_header, unpack_header
+from pd4dgs_codec.format.info import info
 from pd4dgs_codec.web import manifests
 from pd4dgs_codec.web.manifests import Video
 from pd4dgs_codec.web.package import MPD, PLAYLIST, package
@@ -130,10 +132,6 @@ def test_the_playlist_names_the_index(packaged):
 
 
 def test_ancillary_chunks_travel_along(scene_bytes):
-    from pd4dgs_codec.format.container import read_preamble, write_preamble
-    from pd4dgs_codec.format.header import pack_header, unpack_header
-    from pd4dgs_codec.format.info import info
-
     preamble = read_preamble(scene_bytes)
     header = unpack_header(preamble.header)
     first = info(scene_bytes)["layers"][0]

@@ -6,7 +6,7 @@ import shutil
 import subprocess
 
 import pytest
-from strategies import make_scene
+from strategies import make_scene, small_file
 
 from pd4dgs_codec import encode, show
 from pd4dgs_codec.errors import DataError, DecodeError, DeliveryError
@@ -38,7 +38,7 @@ def test_a_notebook_gets_a_frame_that_holds_everything(tmp_path):
 @pytest.mark.parametrize("cut", [0, 100, -1])
 def test_a_notebook_shows_no_damaged_scene(cut):
     with pytest.raises(DecodeError):
-        show(encode(make_scene(0), effort=1)[:cut])
+        show(small_file()[:cut])
 
 
 def test_a_player_that_is_nowhere_is_named(tmp_path, monkeypatch):
