@@ -11,7 +11,7 @@ from pd4dgs_codec.__main__ import VERBS
 
 pytestmark = pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a device that is always full, as Linux has")
 
-#: Arguments (FILE is a whole file), what the shell does to the streams, exit code, what stderr says if it is there.
+#: Arguments (FILE is a whole file), redirections of the shell, exit code, and a part of the message on stderr.
 CASES = {
     "stdout is closed": ("info FILE", ">&-", 1, "stdout: Bad file descriptor"),
     "stdout is full": ("info FILE", ">/dev/full", 1, "stdout: No space left on device"),

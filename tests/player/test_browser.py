@@ -50,9 +50,9 @@ from pd4dgs_codec.web.server import Link, Server
 ROOT = Path(__file__).parents[2]
 
 WIDTH, HEIGHT = 96, 72
-#: Of pictures against the rasteriser. Eight bits alone leave 59.
+#: Least PSNR of the player's pictures against the rasteriser's. Rounding to eight bits alone gives 59.
 LEAST_DB = 45.0
-#: Of pictures that Spark and PlayCanvas draw, whose Gaussians are half floats and small integers.
+#: The same for Spark and PlayCanvas, which store Gaussians as half floats and small integers.
 SPARK_DB = 40.0
 
 
@@ -222,7 +222,7 @@ def shoot(page: Any, **state: Any) -> np.ndarray:
 
 
 OPACITY_SEES = Widths(5, 4, viewing=("opacity",))
-#: Each width, number of layers, absent part and key instant stands in one of them; shaders of a shape take a second.
+#: Each width, number of layers, absent part and key instant is in one of them; each takes a second to compile shaders.
 SHAPES: dict[str, dict[str, Any]] = {
     "usual": {},
     "small, 16 and 4": dict(hidden=(5,), channels=2, scales=1, trunk=(3,), widths=Widths(16, 4)),
@@ -469,7 +469,7 @@ def test_a_level_may_be_raised_while_a_lower_one_loads(harness, folder, lively):
 
 
 def element(page: Any, server: Server, attributes: str, code: Server | None = None) -> Any:
-    """A page of `server` with one element, whose code is on another server perhaps."""
+    """A page of `server` with one element. code: the server of the element's code, if it is another one."""
     script = (code or server).url_of("player/element.js")
     html = f"""<!doctype html><title>t</title><script type="module" src="{script}"></script>
       <pd4-player {attributes} style="width: 320px; height: 240px"></pd4-player>"""
@@ -711,7 +711,8 @@ def test_every_control_has_a_name_and_is_reached_by_key(page, server):
     assert status.endswith(" · no GPU: drawn by the CPU, with fewer pixels in motion")
 
 
-#: Of the headset of test-browser/headset.js: the head, then of each eye metres to the right and tangents of its sides.
+#: The headset of test-browser/headset.js: turn (radians to the left) and place (metres) of the head; of each eye its
+#: place (metres to the right) and the tangents of the sides of its picture.
 TURN, PLACE = 0.2, (0.1, 0.05, -0.3)
 EYES = ((-0.03, -0.7, 0.5, -0.4, 0.5), (0.03, -0.5, 0.7, -0.4, 0.5))
 
@@ -834,7 +835,7 @@ def test_a_package_by_the_installed_wheel_plays_from_any_web_server(page, instal
 
 
 def test_the_scene_is_asked_for_while_the_page_arrives(page, folder, small):
-    """Once, and the answer is the one that is shown."""
+    """It is asked for once, and the page shows that answer."""
     (folder / "packed").mkdir()
     (folder / "packed" / "index.html").write_text(packed_page())
     (folder / "packed" / "scene.pd4").write_bytes(small)

@@ -1,6 +1,6 @@
-"""The paced link, on a clock that moves only while somebody waits: 8S/B, alone, shared, and after rests.
+"""S bytes take 8S/B seconds over a link of B bits per second: alone, shared and after pauses.
 
-The slow tests hold it against the wall clock: within max(3 %, 10 ms).
+The clock moves only while the link sleeps. The slow tests measure real time, within max(3 %, 10 ms).
 """
 
 import contextlib

@@ -1,4 +1,4 @@
-"""What tells systems of the media type: packaging/, by the programs that read it."""
+"""The files in packaging/ that describe the media type to systems, as the programs that read them see them."""
 
 import os
 import shutil

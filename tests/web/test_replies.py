@@ -1,4 +1,4 @@
-"""What a server may answer instead of the file: the client ends in time, with scenes or in one line."""
+"""Whatever a server answers instead of the file, the client ends in time, with scenes or with an error of one line."""
 
 import contextlib
 import random
