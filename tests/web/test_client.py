@@ -10,6 +10,7 @@ import subprocess
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cache
 from urllib.parse import urlsplit
 
 import pytest
@@ -35,6 +36,8 @@ from pd4dgs_codec.web.client import MAX_CHANGES, SceneClient, Transfer, fetch, s
 from pd4dgs_codec.web.server import Link, Server
 
 SAME = {"ETag": '"same"'}
+#: `decode`, once for all tests that compare with a scene.
+decoded = cache(decode)
 
 
 class File:
@@ -49,7 +52,7 @@ class File:
     def levels(self, data: bytes | None = None, size: float = math.inf) -> list[Scene]:
         """The scenes of the prefixes that end within `size` bytes."""
         data = self.data if data is None else data
-        return [decode(data, max_layer=layer) for layer, end in slice_ends(data) if end <= size]
+        return [decoded(data, max_layer=layer) for layer, end in slice_ends(data) if end <= size]
 
     def damaged(self, layer: int) -> bytes:
         """One bit of the layer differs."""
