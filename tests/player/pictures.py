@@ -60,13 +60,13 @@ class Shot:
 
 
 def shots(
-    page: Any, data: bytes, views: Sequence[Camera], times: Sequence[float], levels: Sequence[int] | None = None
+    page: Any, data: bytes, views: Sequence[tuple[Camera, Sequence[float]]], levels: Sequence[int] | None = None
 ) -> Iterator[Shot]:
-    """Pictures of the file `data`, which the harness has open: each level, time and camera; cameras of one size."""
+    """Pictures of the file `data`, which the harness has open: each level at the times of cameras of one size."""
     scenes = [decode(data, max_layer=level) for level in levels or decode(data).layers]
     players = [Rasterised(scene) for scene in scenes]
     low, high = scenes[0].info.time_range
-    for number, camera in enumerate(views):
+    for number, (camera, times) in enumerate(views):
         for t in times:
             for scene, player in zip(scenes, players, strict=True):
                 got = shoot(page, camera, scene.level, low + t * (high - low))

@@ -274,7 +274,7 @@ def test_pictures_are_those_of_the_rasteriser(harness, server, folder, kind, eva
     views = [resized(camera, WIDTH, HEIGHT) for camera in cameras(scene, turns)]
     opened(harness, server.url_of(f"{kind}.pd4"), evaluator=evaluator)
     seen = []
-    for shot in (*shots(harness, data, views[:1], (0.0, 0.37, 1.0)), *shots(harness, data, views[1:], (0.37,))):
+    for shot in shots(harness, data, [(views[0], (0.0, 0.37, 1.0)), *((view, (0.37,)) for view in views[1:])]):
         assert np.abs(shot.expected - scene.info.background).max() > 0.2
         assert decibels(shot.player, shot.expected) > LEAST_DB, (shot.level, shot.t, shot.camera)
         seen.append(shot.player)
@@ -314,7 +314,8 @@ def test_pictures_through_other_viewers_are_those_of_the_rasteriser(page, reposi
     views = [seen_by(camera) for camera in cameras(scene, [(0.3, 0.1)])]
     seen = []
     # level 2 has Gaussians larger than the picture or outside of it, which these engines draw otherwise or leave out
-    for shot in (*shots(page, lively, views[:1], (0.0, 1.0), [0, 1]), *shots(page, lively, views[1:], (0.5,), [1])):
+    own, aside = [(views[0], (0.0, 1.0))], [(views[1], (0.5,))]
+    for shot in (*shots(page, lively, own, [0, 1]), *shots(page, lively, aside, [1])):
         assert decibels(shot.player, shot.expected) > SPARK_DB, (shot.level, shot.t, shot.camera)
         assert np.abs(shot.expected - scene.info.background).max() > 0.2
         seen.append(shot.player)
@@ -442,7 +443,7 @@ def test_the_first_picture_comes_before_layer_0_is_whole(harness, folder):
     shown = [detail for name, detail in harness.evaluate("harness.events") if name in ("firstpicture", "upgrade")]
     assert shown[0]["bytes"] < ends[0] and shown[0]["level"] == shown[1]["level"] == 0
     assert [detail["level"] for detail in shown][-1] == 2 and len(shown) > 4
-    (shot,) = shots(harness, data, [decode(data).info.camera], [0.37], [2])
+    (shot,) = shots(harness, data, [(decode(data).info.camera, (0.37,))], [2])
     assert decibels(shot.player, shot.expected) > LEAST_DB
 
 
