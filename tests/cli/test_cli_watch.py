@@ -118,11 +118,8 @@ def test_a_page_of_another_site_sees_nothing(watched):
 
 
 def test_nothing_is_drawn_while_nobody_looks(watched, trainer, monkeypatch):
-    def never(*_: object) -> None:
-        raise AssertionError("drawn for nobody")
-
-    monkeypatch.setattr(watched, "_show", never)
-    monkeypatch.setattr(watched, "_tell", never)
+    for name in ("_show", "_tell"):
+        monkeypatch.setattr(watched, name, lambda *_: pytest.fail("drawn for nobody"))
     for _ in range(3):
         _step(trainer, watched)
 

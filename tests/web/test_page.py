@@ -63,9 +63,7 @@ console.log(twice(y) + /** @type {number} */ (z), "a // b", `c // ${ "d" }`);
         "const z = 20;\nexport const x = z; // same\n/** Twice. */\nexport function twice(n) {\n  return 2 * n;\n}\n"
     )
     bundled = page.bundle(tmp_path, "a.js")
-    assert (
-        "Twice." not in bundled and "A module" not in bundled and "same" not in bundled and "\n  return" not in bundled
-    )
+    assert not any(gone in bundled for gone in ("Twice.", "A module", "same", "\n  return"))
     node = shutil.which("node")
     if node is not None:
         done = subprocess.run([node, "-e", bundled], capture_output=True, text=True, timeout=60, check=True)
