@@ -7,7 +7,7 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
-from folders import CAMERAS, FPS, rig_views
+from folders import CAMERAS, FPS, INSTANTS, rig_views
 from test_colmap import write_synchronised
 from videos import write_video
 
@@ -28,6 +28,12 @@ def written(scene, once):
 def folder(written, tmp_path):
     """A copy that a test may damage."""
     return shutil.copytree(written, tmp_path / "set")
+
+
+@pytest.fixture
+def stored(written):
+    """Reads the frames of one video through the cache."""
+    return lambda: cached.stored_frames(written / "videos" / "cam0.mp4", "", np.asarray)
 
 
 def test_frames_are_decoded_once(folder, monkeypatch, cache):
@@ -67,21 +73,26 @@ def test_a_full_disk_keeps_no_part_of_a_video(folder, monkeypatch, cache):
     assert not list(cache.iterdir())
 
 
-def test_a_video_that_another_process_has_just_removed_takes_no_room(folder, cache):
-    cache.mkdir(exist_ok=True)
+def test_a_video_that_another_process_has_just_removed_takes_no_room(stored, cache):
+    cache.mkdir()
     (cache / "gone.frames").symlink_to("nothing")  # is listed and cannot be measured
-    assert load(folder).train
+    assert len(stored()) == INSTANTS
 
 
-def test_a_cache_that_is_lost_or_broken_is_reported_and_made_anew(folder, cache):
-    view = load(folder).train[0]
-    expected = view.image
-    for spoil in (lambda file: file.write_bytes(bytes(file.stat().st_size)), Path.unlink):
-        for file in cache.glob("*.frames"):
-            spoil(file)
+def test_a_cut_or_foreign_cache_file_and_a_lost_one_are_made_anew(stored, cache):
+    frames = stored()
+    (file,) = cache.glob("*.frames")
+    expected, whole = frames.read(0), file.read_bytes()
+    zeros, foreign = bytes(len(whole)), b"[]" + b"\2" + bytes(7)
+    for damaged in (zeros, whole[: len(whole) // 2], whole[100:], foreign):
+        file.write_bytes(damaged)
+        np.testing.assert_array_equal(stored().read(0), expected)
+        assert file.read_bytes() == whole
+    file.write_bytes(zeros)
+    for _ in range(2):  # the first error removes the file
         with pytest.raises(DataError, match="missing or broken"):
-            _ = view.image
-        np.testing.assert_array_equal(load(folder).train[0].image, expected)
+            frames.read(0)
+    np.testing.assert_array_equal(stored().read(0), expected)
 
 
 def test_training_views_are_kept_within_a_budget(scene, monkeypatch):
@@ -148,11 +159,3 @@ def test_damage_inside_a_video_is_told(film):
             list(cached.open_video(film).pictures)
     except DataError as error:  # a decoder may give up
         assert "is damaged" in str(error)
-
-
-def test_a_cut_or_foreign_cache_file_is_made_anew(folder, cache):
-    expected = load(folder).train[0].image
-    for damage in (lambda data: data[: len(data) // 2], lambda data: data[100:], lambda _: b"[]" + b"\2" + bytes(7)):
-        for file in cache.glob("*.frames"):
-            file.write_bytes(damage(file.read_bytes()))
-        np.testing.assert_array_equal(load(folder).train[0].image, expected)
