@@ -140,13 +140,13 @@ def test_any_name_of_a_video_is_written_and_read(name, tmp_path, monkeypatch):
     assert sum(1 for _ in cached.open_video(Path(name)).pictures) == 3
 
 
-@pytest.mark.parametrize("share", [0.3, 0.6, 0.97])
-def test_a_video_that_is_cut_is_refused(film, share):
+def test_a_video_that_is_cut_is_refused(film):
     whole = film.read_bytes()
     assert sum(1 for _ in cached.open_video(film).pictures) == 60
-    film.write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(DataError, match=r"film.mp4: is damaged: found \d+ of 60 frames"):
-        list(cached.open_video(film).pictures)
+    for share in (0.3, 0.6, 0.97):
+        film.write_bytes(whole[: int(share * len(whole))])
+        with pytest.raises(DataError, match=r"film.mp4: is damaged: found \d+ of 60 frames"):
+            list(cached.open_video(film).pictures)
 
 
 def test_damage_inside_a_video_is_told(film):
