@@ -210,11 +210,15 @@ def test_uniform_border_is_the_background(blender, color):
         assert d.train[0].image[0, 0].tolist() == [*color]
     save(folder / "r_001.png", np.full((8, 12, 4), 9, np.uint8))
     assert load(folder, holdout=0).background == (1, 1, 1)  # for the one that has alpha
-    assert load("synthetic:static?frames=8", downscale=4, background=(1.0, 0.0, 0.0)).background == (1, 0, 0)
 
 
 def test_busy_border_means_black(blender):
     assert load(blender()).background == (0, 0, 0)
+
+
+def test_a_synthetic_scene_takes_another_background():
+    source = "synthetic:static?frames=3&size=16x12"
+    assert load(source, downscale=4, background=(1.0, 0.0, 0.0)).background == (1, 0, 0)
 
 
 def test_binary_and_ascii_points_agree(blender):
