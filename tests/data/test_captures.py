@@ -282,9 +282,8 @@ def same_views(a: tuple[View, ...], b: tuple[View, ...]) -> None:
         np.testing.assert_array_equal(x.mask, y.mask)
 
 
-def test_an_iphone_scene_is_read_back(tmp_path):
-    a = load("synthetic:local?frames=6")
-    b = load(write_iphone(a, tmp_path / "out"))
+def test_an_iphone_scene_is_read_back(scene, tmp_path):
+    a, b = scene, load(write_iphone(scene, tmp_path / "out"))
     same_views(a.train + a.test, b.train + b.test)
     assert a.masked and b.masked
     np.testing.assert_array_equal(a.points, b.points)
