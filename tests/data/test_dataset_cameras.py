@@ -64,11 +64,6 @@ def test_box_finds_the_common_point():
     np.testing.assert_allclose(cameras_box(frames), [[1 - 2.6, 2 - 2.6, 3 - 2.6], [3.6, 4.6, 5.6]], atol=1e-5)
 
 
-def test_times():
-    assert normalised_times([3.0, 5.0, 4.0], "x") == ([0.0, 1.0, 0.5], 3.0, 5.0)
-    assert normalised_times([3.0, 3.0], "x")[0] == [0.0, 0.0]
-
-
 @pytest.mark.parametrize(
     ("span", "expected"),
     [

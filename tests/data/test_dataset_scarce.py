@@ -35,6 +35,7 @@ def test_one_place_and_one_instant_are_remarked(blender):
     change_frames(folder, lambda i: {"transform_matrix": pose(0.2 * i), "time": 7.5})
     dataset = load(folder)
     assert ["one instant" in r for r in dataset.remarks()] == [True] and dataset.time_range == (0.0, 1.0)
+    assert {view.time for view in dataset.train} == {0.0}
 
 
 @pytest.mark.parametrize("start", [0.0, -5.0, 100.0, 1.7e9])
