@@ -210,3 +210,5 @@ def test_teaching(tmp_path, cli, monkeypatch):
     assert cli("encode", made, "-o", packed).code == 0
     levels = cli("eval", packed, source, "--json").json["levels"]
     assert levels[-1]["mpsnr"] > 18
+    wrong = cli("train", f"teacher:{tmp_path / 'nowhere'}", "-o", tmp_path / "no.pt")
+    assert wrong.code == 1 and len(wrong.error_lines) == 1 and not (tmp_path / "no.pt").exists()

@@ -262,14 +262,3 @@ def test_bad_spz_files_are_refused_before_they_fill_memory(tmp_path, capfd, data
     with pytest.raises(DataError, match=message):
         read_splats(path)
     assert capfd.readouterr() == ("", "")  # the library has its own words on stdout and stderr
-
-
-def test_training_learns_from_a_teacher(tmp_path, cli):
-    folder = _sequence(tmp_path / "seq")
-    out = tmp_path / "model.pt"
-    source = f"teacher:{folder}?views=16&size=40x30"
-    result = cli("train", source, "-o", out, "--preset", "tiny", "--iterations", 4, "--json")
-    assert result.code == 0, result.err
-    assert result.json["anchors"] > 100 and out.is_file()
-    wrong = cli("train", f"teacher:{tmp_path / 'nowhere'}", "-o", tmp_path / "no.pt")
-    assert wrong.code == 1 and len(wrong.error_lines) == 1 and not (tmp_path / "no.pt").exists()
