@@ -21,14 +21,6 @@ def test_harmonics_are_the_real_ones_with_the_condon_shortley_phase():
     np.testing.assert_array_equal(harmonics(directions, 1), harmonics(directions, 3)[:, :4])
 
 
-def test_the_first_harmonics_have_the_signs_of_3d_gaussian_splatting():
-    c = 0.4886025119029199
-    x, y, z = np.eye(3)
-    np.testing.assert_allclose(
-        harmonics(np.stack([x, y, z]), 1)[:, 1:], c * np.array([[0, 0, -1], [-1, 0, 0], [0, 1, 0]])
-    )
-
-
 def test_quaternions_and_rotations_are_inverse():
     quats = unit(np.random.default_rng(1).normal(size=(200, 4)))
     half_turns = np.eye(4)[1:]
