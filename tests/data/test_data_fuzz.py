@@ -7,7 +7,6 @@ headers; bytes are flipped and files cut. A seed makes a case.
 import copy
 import json
 import random
-import shutil
 import warnings
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.errors import DataError
 
 KINDS = [kind for kind in LAYOUTS if kind not in VIDEOS]
+MANY = [range(500 * part, 500 * (part + 1)) for part in range(10)]
 VALUES: list[Any] = [
     *(None, True, False, 0, -1, 1, 2, 0.5, -0.0, 1e-300, 1e300, -1e300, 1e38, 3e38, float("nan"), float("inf")),
     *(65_536, 2**31, 10**40, "", "0", "\0", "r_000", "../r_000", "/dev/null", "é\ud800", "x" * 5000, "FISHEYE"),
@@ -104,52 +104,37 @@ class Folder:
                     (self.root / name).write_bytes(damage_bytes(written(content), rng))
                 else:
                     (self.root / name).write_bytes(written(damage_json(content, rng)))
-            return self._examine(seed, chosen)
+            return self.examine(f"seed {seed}: {', '.join(chosen)}")
         finally:
             for name in chosen:
                 (self.root / name).write_bytes(written(self.files[name]))
 
-    def _names(self, message: str) -> bool:
-        """Whether the message says where: in this folder, or in a file that the damaged one names."""
-        return str(self.root) in message or "/dev/null" in message
-
-    def _examine(self, seed: int, chosen: list[str]) -> str:
-        said = f"seed {seed}: {', '.join(chosen)}: "
+    def examine(self, case: str) -> str:
+        """Returns "read" or "refused". An error names the folder, or a file that the damaged one names."""
         try:
             dataset = load(self.root)
         except DataError as error:
             message = str(error)
-            assert message.isprintable() and len(message) < 500 and self._names(message), said + repr(message)
+            assert message.isprintable() and len(message) < 500, f"{case}: {message!r}"
+            assert str(self.root) in message or "/dev/null" in message, f"{case}: {message!r}"
             return "refused"
         except BaseException as error:
-            raise AssertionError(f"{said}{type(error).__name__}: {error}") from error
+            raise AssertionError(f"{case}: {type(error).__name__}: {error}") from error
         numbers = [dataset.box, dataset.near, dataset.far, dataset.background, dataset.time_range, dataset.up]
         numbers += [x for view in (*dataset.train, *dataset.test) for x in (view.viewmat, view.K, view.time)]
         for x in numbers:
-            assert (np.abs(np.asarray(x, np.float64)) <= BINARY32).all(), said + repr(x)
+            assert (np.abs(np.asarray(x, np.float64)) <= BINARY32).all(), f"{case}: {x!r}"
         return "read"
 
 
-def check_cases(scene: object, tmp_path: Path, kind: str, seeds: range) -> dict[str, int]:
+@pytest.mark.parametrize("seeds", [range(120), *(pytest.param(many, marks=pytest.mark.slow) for many in MANY)])
+@pytest.mark.parametrize("kind", KINDS)
+def test_damaged_datasets(scene, tmp_path, kind, seeds):
     folder, counts = Folder(LAYOUTS[kind](scene, tmp_path / "set")), {"read": 0, "refused": 0}
-    assert folder._examine(-1, []) == "read"
+    assert folder.examine("whole") == "read"
     with warnings.catch_warnings():
         warnings.simplefilter("error")  # a warning on the terminal is no answer
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         for seed in seeds:
             counts[folder.try_damage(seed)] += 1
-    shutil.rmtree(folder.root)
-    return counts
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_damaged_datasets(scene, tmp_path, kind):
-    counts = check_cases(scene, tmp_path, kind, range(120))
     assert min(counts.values()) > 5, counts  # the damage is neither harmless nor fatal throughout
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("part", range(10))
-@pytest.mark.parametrize("kind", KINDS)
-def test_many_damaged_datasets(scene, tmp_path, kind, part):
-    check_cases(scene, tmp_path, kind, range(500 * part, 500 * (part + 1)))
