@@ -207,7 +207,7 @@ def test_teaching(tmp_path, cli, monkeypatch):
     source = f"teacher:{model.save(tmp_path / 'run', ball(300))}?views=12&size=40x40"
     made, packed = tmp_path / "model.pt", tmp_path / "scene.pd4"
     assert cli("train", source, "-o", made, "--preset", "tiny", "--iterations", 60).code == 0
-    assert cli("encode", made, "-o", packed).code == 0
+    assert cli("encode", made, "-o", packed, "--effort", 1).code == 0
     levels = cli("eval", packed, source, "--json").json["levels"]
     assert levels[-1]["mpsnr"] > 18
     wrong = cli("train", f"teacher:{tmp_path / 'nowhere'}", "-o", tmp_path / "no.pt")
