@@ -1,4 +1,4 @@
-"""Batches of stand-in scenes: small texts, which the stand-in command writes in capitals."""
+"""Batches whose scenes are small texts, and whose command writes them in capitals."""
 
 import json
 from pathlib import Path
@@ -45,7 +45,7 @@ class Library:
         return run(jobs, upper, on, Settings(**{"workers": 0} | settings), retries, report)
 
     def made(self) -> list[str]:
-        """The texts that the command has written, as often as it did."""
+        """The texts that the command has written, each as often as it was written."""
         return sorted(path.read_text() for path in self.notes.iterdir())
 
 

@@ -143,7 +143,7 @@ def test_a_place_that_no_store_has_holds_no_manifest(place):
     "place", ["dir:///", "reference://", "github://", "", "file:", "file://", "file://host/x", "s3:", "s3:/x", "s3:x"]
 )
 def test_a_place_that_no_store_has_takes_no_output(place, tmp_path, monkeypatch):
-    """Without its last slashes a URI became the name of a folder, and / the folder where the command runs."""
+    """The last slashes belong to a place: without them a URI would name a folder, and / the working folder."""
     monkeypatch.chdir(tmp_path)
     with pytest.raises(DataError) as caught:
         store.Root(place).check()

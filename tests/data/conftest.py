@@ -37,7 +37,7 @@ def official():
 
 @pytest.fixture(scope="session")
 def scene(once) -> Dataset:
-    """A small synthetic scene, for writers, drawn by one worker."""
+    """A small synthetic scene, which one worker draws for all."""
 
     def make(folder: Path) -> None:
         (folder / "scene").write_bytes(pickle.dumps(load("synthetic:local?frames=13&size=40x30")))

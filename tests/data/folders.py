@@ -19,7 +19,7 @@ COUNT = 12  #: pictures of a moving camera
 CAMERAS, INSTANTS, FPS = 3, 4, 10  #: of a rig
 POINTS = 50
 NAN = float("nan")
-SOCKET = object()  #: a change of a file: it is none, as a pipe would be, for which a reader could wait
+SOCKET = object()  #: a change that replaces a file by a socket; like a pipe, it could keep a reader waiting
 
 
 def pose(angle: float = 0.0, distance: float = 4.0) -> list:
@@ -29,7 +29,7 @@ def pose(angle: float = 0.0, distance: float = 4.0) -> list:
 
 
 def gradient(w: int, h: int, shift: int = 0) -> np.ndarray:
-    """A picture in which every pixel differs."""
+    """A picture of pixels that all differ."""
     y, x = np.mgrid[:h, :w]
     return np.stack([x * 7 + shift, y * 11, x * 3 + y * 5], axis=2).astype(np.uint8)
 

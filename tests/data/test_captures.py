@@ -47,7 +47,7 @@ def _camera(view: View, factor: int = 1, scale: float = 1.0, center: float | np.
 
 
 def write_iphone(dataset: Dataset, folder: Path, factors: tuple[int, ...] = (1,)) -> Path:
-    """Masks of training views and colours of points have no place in the layout. factors: of the sets of pictures."""
+    """The layout has no masks of training views and no colours of points. factors: of the sets of pictures."""
     views = [*dataset.train, *dataset.test]
     for view in views:
         save(folder / "camera" / f"{view.name}.json", _camera(view))
@@ -158,7 +158,7 @@ def write_panoptic(scene: Dataset, folder: Path) -> Path:
     return folder
 
 
-#: Of the header of a .npy file, up to its shape.
+#: The header of a .npy file; its shape is filled in.
 DESCRIBED = "{{'descr': '<f8', 'fortran_order': False, 'shape': {}}}"
 
 

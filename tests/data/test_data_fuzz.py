@@ -1,7 +1,7 @@
-"""Datasets damaged with their structure in mind: each is read into finite numbers or refused in one line.
+"""Damaged datasets: each is read into finite numbers or refused in one line.
 
-Values in JSON files are replaced, removed, nested or made huge, and so are words of PLY and text files and numbers in
-headers; bytes are flipped and files cut. A seed makes a case.
+A seed replaces, removes, nests or enlarges values in JSON files, words in PLY and text files and numbers in headers; or
+it changes bytes or cuts a file.
 """
 
 import copy

@@ -1,4 +1,4 @@
-"""Every broken input of every reader is one DataError of one line that says what and where."""
+"""Broken datasets: each reader raises a DataError of one line, which says what is wrong and where."""
 
 import time
 from collections.abc import Callable
@@ -11,8 +11,8 @@ from folders import changed
 
 from pd4dgs_codec.data.dataset import READERS, dataset_folders
 
-#: The tests of each reader. Their LAYOUTS write whole folders, from a synthetic scene, and their FAULTS damage these:
-#: file, change as in `folders.changed`, and what the error says.
+#: The tests of each reader. Their LAYOUTS write a synthetic scene into whole folders. Each of their FAULTS is a file of
+#: such a folder, its change (see `folders.changed`), and a part of the error.
 READERS_TESTS = [import_module(f"test_{name}") for name in sorted({r.function.split(":")[0] for r in READERS})]
 LAYOUTS: dict[str, Callable[[Any, Path], Path]] = {}
 FAULTS: dict[str, list[tuple[str, Any, str]]] = {}
@@ -20,7 +20,7 @@ for module in READERS_TESTS:
     LAYOUTS |= module.LAYOUTS
     FAULTS |= module.FAULTS
 VIDEOS = [layout for layout, faults in FAULTS.items() if any(file.endswith(".mp4") for file, *_ in faults)]
-SECONDS = 20  #: of processor time, which no case may take: most take a hundredth
+SECONDS = 20  #: of processor time that a case may take; most take a hundredth of it
 UNREAD = ("frames", "rigs")  #: files of COLMAP's that no reader opens
 
 
@@ -41,7 +41,7 @@ def test_broken_folders(layout, scene, tmp_path, refused):
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_no_file_of_a_folder_is_a_link_out_of_it(layout, scene, tmp_path, refused):
-    """Whoever chose its name, the layout or another file: an archive of a stranger may hold links to anything."""
+    """Neither those that the layout names nor those that other files name: a stranger's archive may link anywhere."""
     folder, elsewhere = LAYOUTS[layout](scene, tmp_path / "set"), tmp_path / "elsewhere"
     every = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.stem not in UNREAD]
     of_each_kind = {(path.parent, path.suffix in (".png", ".jpg") or path.name): path for path in every}

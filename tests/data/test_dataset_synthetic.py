@@ -53,7 +53,7 @@ def marched_hidden(placed, origin, target, own):
 
 
 def test_visibility_agrees_with_marching():
-    """_seen, on surface points that moved with their bodies, against sampling the segment to the camera."""
+    """Points moved with their bodies; whether the camera sees them, against samples of the segment to the camera."""
     scene = bodies("fast", 0)
     body, point = syn._surface(scene, syn.ROOM.fixed[1], 0.6, LENS)
     rng = np.random.default_rng(1)

@@ -1,4 +1,4 @@
-"""A scene to export: the one of a trained file's kind, decoded, and the same with networks that see no direction."""
+"""A scene to export, decoded from a file, as it is and with networks that do not see the view direction."""
 
 import pytest
 from tiny import sighted, trained_like_scene

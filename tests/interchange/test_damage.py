@@ -105,7 +105,7 @@ def test_damaged_files(tmp_path, name: str, make: Callable[[Path], None], read: 
 
 
 def test_a_few_bytes_that_stand_for_many_numbers_are_refused(tmp_path):
-    """fourdgs took 350 bytes for each of any number of equal Gaussians."""
+    """A small file may hold any number of equal Gaussians, for each of which fourdgs takes 350 bytes of memory."""
     splats = make_splats(1, 0)
     many = Splats(**{name: np.repeat(getattr(splats, name), 200_000, axis=0) for name in PARTS})
     path = tmp_path / "a.4dgs"
@@ -117,7 +117,7 @@ def test_a_few_bytes_that_stand_for_many_numbers_are_refused(tmp_path):
 
 @pytest.mark.parametrize("seconds, expected", [(1e300, None), (0.0, (0.0, 1.0)), (1e-320, (0.0, 1.0))])
 def test_a_duration_that_no_file_holds_is_found_before_training(tmp_path, seconds, expected):
-    """The time range of a .pd4 file is binary32, which training met at its end."""
+    """A .pd4 file holds its time range in binary32; training failed only at its end."""
     path, one = tmp_path / "a.4dgs", struct.pack("<d", 1.0)
     _fourdgs(path)
     path.write_bytes(path.read_bytes().replace(one, struct.pack("<d", seconds)))

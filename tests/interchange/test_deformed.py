@@ -1,5 +1,5 @@
-"""Runs of 4DGaussians and Deformable-3DGS: synthetic ones in their layouts, evaluated with the plain torch modules of
-`benchmarks/teachers.py`, which follow the published formulas."""
+"""Runs in the layouts of 4DGaussians and Deformable-3DGS, against the plain torch modules of `benchmarks/teachers.py`,
+which follow the published formulas."""
 
 import json
 from pathlib import Path

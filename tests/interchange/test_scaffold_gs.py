@@ -1,4 +1,4 @@
-"""Checkpoints of Scaffold-GS: synthetic ones in its layout, evaluated by its published formulas in float64."""
+"""Checkpoints in the layout of Scaffold-GS, against its published formulas in float64."""
 
 import json
 from pathlib import Path
@@ -138,8 +138,8 @@ def test_imported_scene_encodes_and_keeps_its_anchors(tmp_path):
 
 @pytest.mark.parametrize("silent", [False, True])
 def test_features_are_whitened(tmp_path, silent):
-    """Channels mixed from five sources become independent ones, which take fewer bytes; decoders without weights have
-    no say in it."""
+    """Channels mixed from five sources become independent and take fewer bytes. silent: decoders without weights, which
+    leave the features as they are."""
     theirs, rng = Checkpoint(2), np.random.default_rng(2)
     n = len(theirs.anchor)
     mixed = rng.normal(size=(n, 5)) @ rng.normal(size=(5, F)) + rng.normal(size=(n, F)) / 9

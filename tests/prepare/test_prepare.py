@@ -35,7 +35,7 @@ def room(once):
 
 @pytest.fixture(scope="module")
 def prepared(room, once):
-    """What the command makes of it, interrupted once on the way."""
+    """What the command makes of the room when it is interrupted once."""
     return once("prepared", lambda folder: prepare(room, folder / "out")) / "out"
 
 
