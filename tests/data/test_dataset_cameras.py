@@ -23,19 +23,19 @@ def test_matches_opencv_formula():
     np.testing.assert_allclose([xd, yd], [1.5 + 0.04 + 0.02 * 7, 3.0 + 0.08 + 0.01 * 13])
 
 
-def test_folded_pixels_are_masked():
-    """With k1 = -.5 the image is folded beyond r = sqrt(2/3), where the stored picture would be shown a second time."""
-    lens = Lens(96, 64, 40.0, 40.0, 48.0, 32.0, 0.0, (-0.5, 0.0, 0.0))
+@pytest.mark.parametrize(
+    "lens, limit",
+    [
+        (Lens(96, 64, 40.0, 40.0, 48.0, 32.0, 0.0, (-0.5, 0.0, 0.0)), np.sqrt(2 / 3)),
+        (Lens(96, 64, 12.0, 12.0, 48.0, 32.0, fisheye=(-0.2, 0.0, 0.0, 0.0)), np.tan(np.sqrt(1 / 0.6))),
+    ],
+    ids=["radial", "fisheye"],
+)
+def test_folded_pixels_are_masked(lens, limit):
+    """Beyond the limit the lens folds the image: the stored picture would be shown a second time."""
     _, seen = rectify(np.full((64, 96, 3), 200, np.uint8), lens)
-    x, y = np.meshgrid((np.arange(96) + 0.5 - 48) / 40, (np.arange(64) + 0.5 - 32) / 40)
-    np.testing.assert_array_equal(seen, np.hypot(x, y) < np.sqrt(2 / 3))
-
-
-def test_a_folded_fisheye_is_masked():
-    """With k1 = -.2 the angle stops to grow at sqrt(1 / .6)."""
-    lens = Lens(96, 64, 12.0, 12.0, 48.0, 32.0, fisheye=(-0.2, 0.0, 0.0, 0.0))
-    x, y = np.meshgrid((np.arange(96) + 0.5 - 48) / 12, (np.arange(64) + 0.5 - 32) / 12)
-    np.testing.assert_array_equal(distort(x, y, lens)[2], np.arctan(np.hypot(x, y)) < np.sqrt(1 / 0.6))
+    x, y = np.meshgrid((np.arange(96) + 0.5 - 48) / lens.fx, (np.arange(64) + 0.5 - 32) / lens.fy)
+    np.testing.assert_array_equal(seen, np.hypot(x, y) < limit)
 
 
 def test_skew_moves_along_x():
