@@ -12,7 +12,7 @@ def write_video(path: Path, pictures: list[np.ndarray], fps: int) -> None:
     height, width = pictures[0].shape[:2]
     writer = imageio_ffmpeg.write_frames(
         str(path), (width, height), fps=fps, codec="libx264rgb", pix_fmt_out="rgb24", quality=None,
-        macro_block_size=1, output_params=["-qp", "0"],
+        macro_block_size=1, output_params=["-preset", "ultrafast", "-qp", "0"],
     )  # fmt: skip
     writer.send(None)
     for picture in pictures:
