@@ -8,8 +8,8 @@ from pathlib import Path
 
 
 def upper(verb: str, argv: list[str]) -> tuple[int, str, str]:
-    """Writes its input in capitals; fails, dies or dawdles where the input says so, or once where a flag is not there
-    yet: "die FLAG"."""
+    """Writes its input in capitals, or fails or dies where the input says so. "die FLAG", "dawdle FLAG" and "fail FLAG"
+    happen once: they make the flag, a file."""
     text = Path(argv[0]).read_text()
     word, _, flag = text.partition(" ")
     if flag and not Path(flag).exists():

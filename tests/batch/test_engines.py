@@ -36,7 +36,7 @@ def filled(library):
 
 @pytest.fixture
 def temporary(tmp_path, monkeypatch):
-    """The folder for temporary files, of which none stays."""
+    """The folder for temporary files. At the end it must be empty."""
     folder = tmp_path / "temporary"
     folder.mkdir()
     monkeypatch.setenv("TMPDIR", str(folder))
@@ -60,7 +60,7 @@ def test_a_job_whose_worker_dies_is_tried_again(filled, temporary):
 
 @pytest.mark.parametrize("text, tries, says", [("die", 2, "worker"), ("die no-such-folder/flag", 1, "no-such-folder")])
 def test_a_job_that_always_kills_its_worker_or_raises_is_named(filled, temporary, text, tries, says):
-    """The flag in a folder that is not there cannot be made."""
+    """Making a flag in a missing folder raises an error."""
     filled.add("z.pt", text)
     assert filled.run(workers=1, retries=1)["done"] == 8
     outcome, found = filled.outcomes["z.pd4"]
@@ -198,7 +198,7 @@ def test_ray_makes_what_one_process_makes_though_a_worker_dies(filled, ray_clust
     assert filled.run("ray", workers=2, retries=0, address="local")["already"] == 9
     with pytest.raises(DataError, match="no node .* with the 999 CPU"):
         filled.run("ray", address="local", threads=999)
-    assert capsys.readouterr().out == ""  # Ray says of its workers' deaths on stdout
+    assert capsys.readouterr().out == ""  # where Ray tells of workers that died
 
 
 def test_a_cluster_that_is_not_there_is_named(filled, ray_cluster):

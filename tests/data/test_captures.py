@@ -349,7 +349,7 @@ def test_hypernerf_is_read_back(scene, tmp_path):
         assert_same(found, view)
         assert found.name == f"{i:06d}" and found.time == pytest.approx(i / (COUNT - 1))
     np.testing.assert_allclose(data.points, scene.points[:POINTS], atol=1e-5)
-    changed(tmp_path / "set" / "dataset.json", {"val_ids": []})  # HyperNeRF's rule then
+    changed(tmp_path / "set" / "dataset.json", {"val_ids": []})  # then HyperNeRF's rule holds
     data = load(tmp_path / "set")
     assert [v.name for v in data.train] == ["000000", "000004", "000008"]
     assert [v.name for v in data.test] == ["000002", "000006", "000010"]

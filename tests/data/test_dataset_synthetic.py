@@ -161,7 +161,7 @@ def test_content_depends_on_the_string_alone(local):
 
 
 def test_size_and_frames_options(large):
-    """As much from top to bottom, the same motion over the same seconds."""
+    """The field of view from top to bottom, the motion and its seconds stay."""
     other = load("synthetic:local?size=96x48&frames=7")
     assert len(other.train) == 7 and [v.time for v in other.train] == [i / 6 for i in range(7)]
     assert other.time_range == large.time_range and len(other.test) == 2 * 5
@@ -217,8 +217,8 @@ def test_a_camera_passes_once_or_jumps():
 
 @pytest.mark.parametrize("name", THINGS)
 def test_scenes_on_white(name):
-    """In D-NeRF's manner: no points, a camera that jumps on the hemisphere, whole things inside box and pictures; two
-    cameras that stand still, away from all others, see each instant, and something moves there."""
+    """As in D-NeRF: no points, a camera that jumps over the hemisphere, things that are whole in each picture. Two
+    still cameras, away from all others, show each instant; something moves there."""
     d = load(f"synthetic:{name}?size=48x48&frames=20")
     assert len(d.train) == 20 and len(d.test) == 40 and d.points is None and not d.masked
     assert d.background == (1, 1, 1) and all(v.mask is None for v in (*d.train, *d.test))

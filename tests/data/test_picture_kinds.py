@@ -123,7 +123,7 @@ REFUSED = {
         lambda p: Image.fromarray(COLOUR).save(p, save_all=True, append_images=[Image.fromarray(255 - COLOUR)]),
         "holds several pictures",
     ),
-    "many-cut.tif": (several_cut, "holds several pictures"),  # not counted: that took the square of their number
+    "many-cut.tif": (several_cut, "holds several pictures"),  # counting them takes the square of their number
     "gamma.png": (lambda p: Image.fromarray(COLOUR).save(p, pnginfo=gamma_one()), "gamma of 1"),
     "broken-profile.png": (lambda p: Image.fromarray(COLOUR).save(p, icc_profile=b"no profile"), "colour profile"),
     "key-16.png": (

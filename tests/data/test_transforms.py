@@ -209,7 +209,7 @@ def test_uniform_border_is_the_background(blender, color):
         assert d.background == (asked or pytest.approx([c / 255 for c in color]))
         assert d.train[0].image[0, 0].tolist() == [*color]
     save(folder / "r_001.png", np.full((8, 12, 4), 9, np.uint8))
-    assert load(folder, holdout=0).background == (1, 1, 1)  # for the one that has alpha
+    assert load(folder, holdout=0).background == (1, 1, 1)  # one picture has alpha
 
 
 def test_busy_border_means_black(blender):

@@ -20,7 +20,7 @@ F, K, N, PICTURES, APPEARANCE = 32, 10, 40, 5, 8
 
 
 class Checkpoint:
-    """One in memory: anchors on a grid, decoders, perhaps an embedding."""
+    """A checkpoint in memory: anchors on a grid, decoders, perhaps an embedding."""
 
     def __init__(self, seed: int = 0, appearance: bool = False, distance: bool = False, voxel: float = 0.01):
         rng = np.random.default_rng(seed)

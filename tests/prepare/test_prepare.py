@@ -103,7 +103,7 @@ def test_pictures_that_changed_since_an_interruption_are_read_anew(tmp_path, mon
 
 @pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
 def test_signals_are_ours_once_pycolmap_is_loaded(number):
-    """Its C++ would print a stack."""
+    """The handlers of pycolmap's C++ would print a stack."""
     program = f"""
 import os, signal
 from pd4dgs_codec.prepare.poses import colmap
@@ -134,7 +134,7 @@ def test_the_estimate_grows_with_frames_and_shrinks_with_cores():
     assert 100 < poses.estimate(80, (854, 480), 2) < 150  # 226 CPU seconds were measured
     assert poses.estimate(80, (854, 480), 1) == 2 * poses.estimate(80, (854, 480), 2)
     large, shrunk = (poses.estimate(80, size, 2) for size in ((3840, 2160), (1600, 900)))
-    assert large == pytest.approx(shrunk)  # of which the features are
+    assert large == pytest.approx(shrunk)  # features are found in shrunk pictures
 
 
 def test_unregistrable_recording_is_refused_and_leaves_nothing(tmp_path, capsys):
