@@ -103,10 +103,10 @@ def rig_views(scene: Dataset, camera: int) -> list[View]:
 _ENCODED: dict[int, bytes] = {}
 
 
-def rig_videos(scene: Dataset, folder: Path) -> None:
+def rig_videos(scene: Dataset, folder: Path, cameras: int) -> None:
     """A video per camera."""
     pytest.importorskip("imageio_ffmpeg")
-    for camera in range(CAMERAS):
+    for camera in range(cameras):
         path = folder / f"cam{camera}.mp4"
         if camera not in _ENCODED:
             write_video(path, [view.image for view in rig_views(scene, camera)], FPS)
