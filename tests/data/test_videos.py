@@ -32,8 +32,13 @@ def folder(written, tmp_path):
 
 @pytest.fixture
 def stored(written):
-    """Reads the frames of one video through the cache."""
-    return lambda: cached.stored_frames(written / "videos" / "cam0.mp4", "", np.asarray)
+    """Reads every k-th pixel of a camera's video through the cache."""
+
+    def frames(camera=0, k=1):
+        video = written / "videos" / f"cam{camera}.mp4"
+        return cached.stored_frames(video, str(k), lambda picture: picture[::k, ::k])
+
+    return frames
 
 
 def test_frames_are_decoded_once(folder, monkeypatch, cache):
@@ -50,20 +55,25 @@ def test_videos_of_other_lengths_are_refused(scene, folder, refused):
     refused(folder, "cam1.mp4: has 3 frames at 10 per second and cam0.mp4 4")
 
 
-def test_the_cache_stays_within_its_size(folder, monkeypatch, cache, refused):
-    load(folder)
+def test_the_cache_stays_within_its_size(stored, monkeypatch, cache):
+    def allow(size):
+        monkeypatch.setattr(cached, "_IN_USE", set())
+        monkeypatch.setenv(cached.SIZE, str(size / 2**30))
+
+    for camera in (0, 1):
+        stored(camera)
     full = sum(file.stat().st_size for file in cache.glob("*.frames"))
-    monkeypatch.setattr(cached, "_IN_USE", set())
-    monkeypatch.setenv(cached.SIZE, str(1.01 * full / 2**30))
-    load(folder, downscale=2)  # others leave for these
+    allow(1.01 * full)
+    stored(0, 2)  # another one leaves for it
     assert sum(file.stat().st_size for file in cache.glob("*.frames")) <= 1.01 * full
-    monkeypatch.setattr(cached, "_IN_USE", set())
-    monkeypatch.setenv(cached.SIZE, str(0.4 * full / 2**30))
-    refused(folder, "expected a larger PD4DGS_CACHE_GIB or a larger --downscale")
+    allow(0.7 * full)
+    stored(0)
+    with pytest.raises(DataError, match="cam1.mp4: .* expected a larger PD4DGS_CACHE_GIB or a larger --downscale"):
+        stored(1)
     assert not list(cache.glob(".pd4dgs-*"))
     monkeypatch.setenv(cached.SIZE, "much")
     with pytest.raises(DataError, match="PD4DGS_CACHE_GIB is 'much', expected GiB > 0"):
-        load(folder, downscale=3)
+        stored(0, 3)
 
 
 def test_a_full_disk_keeps_no_part_of_a_video(folder, monkeypatch, cache):
