@@ -17,6 +17,7 @@ from pd4dgs_codec.interchange.splats import Splats, fourdgs_bytes, ply_bytes, re
 from pd4dgs_codec.interchange.teacher import PARTS, load_source, read_model
 
 CASES = 150
+SPLATS = make_splats(4, 1)
 
 
 def damaged(data: bytes, rng: random.Random) -> bytes:
@@ -35,36 +36,13 @@ def damaged(data: bytes, rng: random.Random) -> bytes:
     return bytes(found)
 
 
-def _gsplat(path: Path) -> None:
-    torch.save({"splats": gsplat_state(make_splats(4, 1))}, path)
-
-
 def _script(path: Path) -> None:
     layer = torch.nn.Sequential(torch.nn.Linear(3, 2), torch.nn.Tanh())
     torch.jit.trace(layer, torch.zeros(1, 3)).save(path)
 
 
-def _ply(path: Path) -> None:
-    path.write_bytes(ply_bytes(make_splats(4, 1)))
-
-
 def _fourdgs(path: Path) -> None:
-    splats = make_splats(4, 1)
-    path.write_bytes(fourdgs_bytes([(t, splats, np.arange(4)) for t in (0.0, 0.5)], 1.0))
-
-
-def _run(kind: type[FourD | Deformable]) -> Callable[[Path], None]:
-    """Makes the run that a network belongs to."""
-
-    def make(path: Path) -> None:
-        splats = make_splats(4, 1)
-        kind(splats).save(path.parents[2], splats)
-
-    return make
-
-
-def _moved(path: Path) -> object:
-    return read_model(str(path.parents[2]), 30).splats(0.5)
+    path.write_bytes(fourdgs_bytes([(t, SPLATS, np.arange(4)) for t in (0.0, 0.5)], 1.0))
 
 
 def _cameras(path: Path) -> None:
@@ -74,15 +52,24 @@ def _cameras(path: Path) -> None:
     path.write_text(f"[{row}, {row}]")
 
 
+def _model(path: Path) -> Splats:
+    return read_model(str(path), 30).splats(0.5)
+
+
+def _run(path: Path) -> Splats:
+    """Of the run that a network belongs to."""
+    return _model(path.parents[2])
+
+
 @pytest.mark.parametrize(
     "name, make, read",
     [
-        ("ckpt.pt", _gsplat, lambda path: read_model(str(path), 30).splats(0)),
+        ("ckpt.pt", lambda path: torch.save({"splats": gsplat_state(SPLATS)}, path), _model),
         ("mlp.pt", _script, read_torch),
-        ("run/point_cloud/iteration_7/deformation.pth", _run(FourD), _moved),
-        ("run/deform/iteration_7/deform.pth", _run(Deformable), _moved),
-        ("a.ply", _ply, read_splats),
-        ("a.4dgs", _fourdgs, lambda path: read_model(str(path), 30).splats(0.5)),
+        ("run/point_cloud/iteration_7/deformation.pth", lambda path: FourD(SPLATS).save(path.parents[2], SPLATS), _run),
+        ("run/deform/iteration_7/deform.pth", lambda path: Deformable(SPLATS).save(path.parents[2], SPLATS), _run),
+        ("a.ply", lambda path: path.write_bytes(ply_bytes(SPLATS)), read_splats),
+        ("a.4dgs", _fourdgs, _model),
         ("cameras.json", _cameras, read_cameras),
     ],
 )
