@@ -75,6 +75,7 @@ def test_bad_options(blender, refused):
     for k in (0, -1, 2.0, True):
         refused(folder, f"downscale is {k}, expected", downscale=k)
     refused(folder, "downscale 9", downscale=9)
+    refused("synthetic:static", "downscale 200 leaves nothing of 160x120", downscale=200)
     for k in (1, -2):
         refused(folder, f"holdout {k} leaves", holdout=k)
 
@@ -100,7 +101,3 @@ SYNTHETIC = {
 @pytest.mark.parametrize("name", SYNTHETIC)
 def test_broken_synthetic_sources(name, refused):
     refused(f"synthetic:{name}", SYNTHETIC[name])
-
-
-def test_synthetic_downscale_too_large(refused):
-    refused("synthetic:static", "downscale 200 leaves nothing of 160x120", downscale=200)
