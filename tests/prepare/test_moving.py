@@ -31,13 +31,10 @@ def test_static_points_have_no_residual_and_moving_ones_the_sampson_distance(sce
     assert found[:150].max() < 1e-9 and found[150:].min() > 0.01
     # the Sampson distance is, to first order, how far a match is from the nearest pair that fits
     shifted = places[3][:150] + 1e-5 * np.array([0, 1])
-    there_and_back = sampson(places[0][:150], shifted, relative), sampson(shifted, places[0][:150], _inverse(relative))
+    inverse = np.column_stack([rotation.T, -rotation.T @ relative[:, 3]])
+    there_and_back = sampson(places[0][:150], shifted, relative), sampson(shifted, places[0][:150], inverse)
     np.testing.assert_allclose(*there_and_back, rtol=1e-6)
     assert there_and_back[0].max() <= 1e-5
-
-
-def _inverse(relative: np.ndarray) -> np.ndarray:
-    return np.column_stack([relative[:, :3].T, -relative[:, :3].T @ relative[:, 3]])
 
 
 def test_moving_features_are_found(scene):
