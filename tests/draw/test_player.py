@@ -12,8 +12,9 @@ from tiny import camera_ahead, camera_around
 from pd4dgs_codec.draw.layers import Layers
 from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.errors import RenderError
-from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
+from pd4dgs_codec.format.options import EncodeOptions
+from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.model.model import from_scene
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.scene import SCAFFOLD_NETWORKS, Camera, Deformation, Scene, Widths, instant
@@ -26,10 +27,11 @@ def _camera(seed: int) -> Camera:
 
 
 def _scene(**changes: object) -> Scene:
+    """A scene as the decoder would return it."""
     settings = {"hidden": (12,), "channels": 8, "scales": 2, "width": 8, "extent": 30}
     scene = make_scene(5, anchors=60, kind="gaussian", **(settings | changes))
     masks = tuple(np.maximum(codes, 77) for codes in scene.mask)
-    return decode(encode(replace(scene, mask=masks), layers=2, effort=1, omit="nothing"))
+    return plan(replace(scene, mask=masks), EncodeOptions(layers=2, omit="nothing")).symbols.scene()
 
 
 @pytest.mark.parametrize(
