@@ -1,5 +1,6 @@
 """Pictures without torch: those of the torch model, to rounding, and in a process where torch cannot be imported."""
 
+import hashlib
 from dataclasses import replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from tiny import camera_ahead, camera_around
 from pd4dgs_codec.draw.layers import Layers
 from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.errors import RenderError
+from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import plan
@@ -148,20 +150,32 @@ def test_layers_are_those_of_torch(count):
 
 
 RENDER = """
-import sys
+import hashlib, pkgutil, sys
+from pathlib import Path
 sys.modules["torch"] = None
 from pd4dgs_codec.cli.render import main
 code = main([sys.argv[1], "-o", sys.argv[2], "--frames", "1"])
 late = "data.transforms", "data.captures", "interchange.teacher", "quality.perceptual", "train", "web.client"
 loaded = {f"pd4dgs_codec.{name}" for name in late} & set(sys.modules)
 assert not loaded, f"a file of its own camera waits for {loaded}"
+import pd4dgs_codec.draw
+for module in pkgutil.iter_modules(pd4dgs_codec.draw.__path__, "pd4dgs_codec.draw."):
+    __import__(module.name)
+from pd4dgs_codec import decode
+from pd4dgs_codec.draw.player import Player
+scene = decode(Path(sys.argv[1]).read_bytes())
+picture = Player(scene).picture(scene.info.camera, 0.5)
+print(hashlib.sha256(picture.tobytes()).hexdigest())
 sys.exit(code)
 """
 
 
 def test_rendering_a_file_needs_no_torch_and_no_datasets(tmp_path, python):
-    file = tmp_path / "scene.pd4"
+    """Without torch the picture has the same bits."""
     scene = _scene()
-    file.write_bytes(encode(replace(scene, info=replace(scene.info, camera=_camera(0))), layers=2, effort=1))
-    python(RENDER, file, tmp_path / "out.png")
+    data = encode(replace(scene, info=replace(scene.info, camera=_camera(0))), layers=2, effort=1)
+    (tmp_path / "scene.pd4").write_bytes(data)
+    told = python(RENDER, tmp_path / "scene.pd4", tmp_path / "out.png")
     assert Image.open(tmp_path / "out.png").size == (48, 36)
+    picture = Player(decode(data)).picture(_camera(0), 0.5)
+    assert (picture != picture[0, 0]).any() and told.split()[-1] == hashlib.sha256(picture.tobytes()).hexdigest()

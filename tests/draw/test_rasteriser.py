@@ -1,7 +1,6 @@
-"""Drawing numpy arrays: the picture of `rasterization`, the stages alone, refusals, and no need of torch."""
+"""Drawing numpy arrays: the picture of `rasterization`, the stages alone, and refusals."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -149,25 +148,3 @@ def test_every_pixel_above_the_alpha_limit_is_in_a_tile_and_block(size):
         assert covered[i][alpha >= 1 / 255].all()
         drawn += (alpha >= 1 / 255).sum()
     assert 0.25 * covered.sum() < drawn < covered.sum()  # tight: most lanes of the blocks are used
-
-
-# -- without torch -----------------------------------------------------------------------------------------------------
-
-SCRIPT = """
-import pkgutil, sys
-sys.path.insert(0, sys.argv[1])
-sys.modules["torch"] = None
-import numpy as np
-import pd4dgs_codec.draw
-for module in pkgutil.iter_modules(pd4dgs_codec.draw.__path__, "pd4dgs_codec.draw."):
-    __import__(module.name)
-assert "pd4dgs_codec.draw.rasteriser" in sys.modules
-from test_rasteriser import CAMERA, gaussians
-from pd4dgs_codec.draw.rasteriser import draw
-print(float(draw(*gaussians(), CAMERA)[0].astype(np.float64).sum()).hex())
-"""
-
-
-def test_drawing_works_without_torch(python):
-    expected = float(rasteriser.draw(*gaussians(), CAMERA)[0].astype(np.float64).sum()).hex()
-    assert python(SCRIPT, Path(__file__).parent).strip() == expected
