@@ -66,15 +66,20 @@ def _arguments(folder: Path, output: str, *options: object) -> list[str]:
     return [*paths, "--preset", "tiny", "--device", "cpu", *map(str, options)]
 
 
-def _together(program: Path, output: str, *options: object) -> subprocess.CompletedProcess[str]:
-    """Two workers' training."""
+def _free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    launch = ["-m", "torch.distributed.run", "--nproc-per-node=2", f"--master-port={port}"]
-    launch += [f"--log-dir={program.parent}", "--", str(program)]  # else a folder stays in the temporary one
-    command = [sys.executable, *launch, *_arguments(program.parent, output, *options)]
-    return subprocess.run(command, cwd=program.parent, capture_output=True, text=True, timeout=900)
+        return probe.getsockname()[1]
+
+
+def _two_workers(*arguments: object) -> list[str]:
+    """What each of two workers prints, started without the process of torchrun. None may fail."""
+    command = [sys.executable, *map(str, arguments)]
+    shared = os.environ | {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(_free_port())}
+    both = [subprocess.Popen(command, env=shared | {"RANK": rank}, stdout=subprocess.PIPE, text=True) for rank in "01"]
+    told = [worker.communicate(timeout=600)[0] for worker in both]
+    assert [worker.returncode for worker in both] == [0, 0]
+    return told
 
 
 def _alone(program: Path, output: str, *options: object) -> int:
@@ -85,7 +90,11 @@ def _alone(program: Path, output: str, *options: object) -> int:
 
 
 def test_two_workers_learn_what_one_process_learns(program):
-    done = _together(program, "two.pt", "--iterations", STEPS, "--views-per-step", 2, "--json", "--log", "two.jsonl")
+    launch = ["-m", "torch.distributed.run", "--nproc-per-node=2", f"--master-port={_free_port()}"]
+    launch += [f"--log-dir={program.parent}", "--", str(program)]  # else a folder stays in the temporary one
+    options = ("--iterations", STEPS, "--views-per-step", 2, "--json", "--log", "two.jsonl")
+    command = [sys.executable, *launch, *_arguments(program.parent, "two.pt", *options)]
+    done = subprocess.run(command, cwd=program.parent, capture_output=True, text=True, timeout=900)
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)  # the first worker alone speaks
     assert told["iterations"] == STEPS and told["finished"]
@@ -97,8 +106,8 @@ def test_two_workers_learn_what_one_process_learns(program):
 
 
 def test_a_run_goes_on_with_another_number_of_workers(program):
-    cut = _together(program, "cut.pt", "--iterations", STEPS, "--views-per-step", 2, "--max-seconds", "0.01")
-    assert cut.returncode == 0, cut.stderr
+    options = ("--iterations", STEPS, "--views-per-step", 2, "--max-seconds", "0.01")
+    _two_workers(program, *_arguments(program.parent, "cut.pt", *options))
     begun = int(checkpoint.load(program.parent / "cut.pt")[1]["iteration"])
     assert 0 < begun < STEPS
     assert _alone(program, "cut.pt", "--resume", program.with_name("cut.pt"), "--max-seconds", "1000") == 0
@@ -107,17 +116,9 @@ def test_a_run_goes_on_with_another_number_of_workers(program):
 
 def test_a_worker_that_ends_is_missed_in_one_line():
     """Whatever torch calls the broken connection."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
-    shared = os.environ | {"WORLD_SIZE": "2", "MASTER_ADDR": "127.0.0.1", "MASTER_PORT": str(port)}
-    left, ended = (
-        subprocess.Popen([sys.executable, "-c", LEFT], env=shared | {"RANK": rank}, stdout=subprocess.PIPE, text=True)
-        for rank in "01"
-    )
-    told = left.communicate(timeout=600)[0]
-    assert (left.returncode, ended.wait(), ended.communicate()[0]) == (0, 0, "")
+    told, nothing = _two_workers("-c", LEFT)
     assert told.startswith("cannot reach the other workers, or one has ended: ") and told.count("\n") == 1
+    assert nothing == ""
 
 
 def test_a_variable_of_torchrun_that_is_missing_is_named(monkeypatch):
