@@ -80,8 +80,11 @@ def test_motion_changes_nothing_at_its_key_instant(level):
 
 @pytest.mark.parametrize("t", [float("nan"), float("inf")])
 def test_a_time_that_is_no_number_is_refused(t):
+    scene = _scene()
     with pytest.raises(RenderError, match="time is"):
-        Player(_scene()).picture(_camera(0), t)
+        Player(scene).picture(_camera(0), t)
+    with pytest.raises(RenderError, match="time is"):
+        render_image(from_scene(scene), 0, t, _camera(0))
 
 
 @pytest.mark.parametrize("viewing", [SCAFFOLD_NETWORKS, ("color",), ()])

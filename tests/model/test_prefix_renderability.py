@@ -10,7 +10,6 @@ from strategies import LAYER_SETS, make_scene, scenes
 from tiny import camera_ahead
 
 from pd4dgs_codec import decode, encode
-from pd4dgs_codec.errors import RenderError
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.model.model import from_scene
 from pd4dgs_codec.model.picture import render_image
@@ -139,10 +138,3 @@ def visible_scene(layers: tuple[int, ...], channels: int, seed: int = 0) -> Scen
     codes = np.sort(rng.choice(np.array([0, 100, 255], np.uint8), (len(scaling_log), len(layers))), axis=1)
     codes[: len(codes) // 2] = 255
     return replace(scene, scaling_log=scaling_log, networks=networks, mask=tuple(codes.T.copy()))
-
-
-@pytest.mark.parametrize("t", [float("nan"), float("inf")])
-def test_a_time_that_is_no_number_is_refused(t):
-    scene = make_scene(1)
-    with pytest.raises(RenderError, match="time is"):
-        render_image(from_scene(scene), 0, t, own_camera(scene))
