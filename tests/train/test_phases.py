@@ -282,18 +282,14 @@ def selected(dataset, monkeypatch, least):
 
 
 @pytest.mark.usefixtures("short_runs_have_phases")
-def test_the_practice_of_a_level_below_one_that_stays_is_undone(dataset, monkeypatch):
+@pytest.mark.parametrize("least_pixels", [levels.MIN_PIXELS, math.inf])
+def test_a_level_that_stays_leaves_the_model_as_it_was(dataset, monkeypatch, least_pixels):
+    """The practice of the level below is undone. A level that changes no picture can stay, too."""
+    monkeypatch.setattr(levels, "MIN_PIXELS", least_pixels)
     learner, before, moments = selected(dataset, monkeypatch, -math.inf)
     assert learner.model.level == 2 and learner.levels.left_out == []
     assert all(map(torch.equal, learner.optimiser.parameters, before))
     assert all(torch.equal(m["exp_avg"], b) for m, b in zip(learner.optimiser.moments.values(), moments, strict=True))
-
-
-@pytest.mark.usefixtures("short_runs_have_phases")
-def test_a_level_that_changes_no_picture_and_stays_leaves_the_model_as_it_is(dataset, monkeypatch):
-    monkeypatch.setattr(levels, "MIN_PIXELS", math.inf)
-    learner, before, _ = selected(dataset, monkeypatch, -math.inf)
-    assert learner.model.level == 2 and all(map(torch.equal, learner.optimiser.parameters, before))
 
 
 @pytest.mark.usefixtures("short_runs_have_phases")
