@@ -17,7 +17,7 @@ from pd4dgs_codec.train import phases
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.loop import Trainer
 from pd4dgs_codec.train.phases import levels, matching, opening
-from pd4dgs_codec.train.phases.matching import Match, Points, attraction, moving_points
+from pd4dgs_codec.train.phases.matching import Points, attraction, moving_points
 
 WHOLE_TINY = PRESETS["tiny"]  # tests have a smaller one
 
@@ -121,19 +121,6 @@ def test_points_far_away_or_of_other_colours_do_not_attract(dataset):
 
 
 @pytest.mark.usefixtures("short_runs_match")
-def test_points_guide_higher_levels_until_the_end_of_the_term(dataset):
-    trainer = trainer_of(dataset, 60, steps=7)
-    learner, terms = trainer.learner, []
-    (phase,) = [phase for phase in learner.before_step if isinstance(phase, Match)]
-    assert len(phase.points.time)
-    while learner.iteration < 60:
-        terms.append((learner.iteration, learner.step()))
-    with_it = {at for at, record in terms if "match" in record}
-    assert with_it == {at for at, record in terms if record["level"] and at < matching.STRENGTH[True].until * 60}
-    assert with_it and not len(phase.points.time) and not learner.guiding
-
-
-@pytest.mark.usefixtures("short_runs_match")
 def test_guided_pictures_of_motion_train_motion_alone(dataset):
     learner = trainer_of(dataset, 60, steps=7).learner
     assert learner.guiding
@@ -170,11 +157,14 @@ def test_steady_motion_needs_no_points(dataset, monkeypatch):
 
 
 @pytest.mark.usefixtures("short_runs_match")
-def test_a_guided_run_resumes_bit_for_bit(dataset, tmp_path):
+def test_points_guide_higher_levels_until_their_term_ends_and_the_run_resumes_bit_for_bit(dataset, tmp_path):
     config = TrainConfig(preset="tiny", iterations=40, seed=3)
     trainer = Trainer(config, dataset)
     records = run_saving(trainer, tmp_path, (9,))  # before the term ends
     assert sum(record.get("moving_points", 0) for record in records)
+    with_it, end = {r["iteration"] for r in records if "match" in r}, matching.STRENGTH[True].until * 40
+    assert with_it == {r["iteration"] for r in records if r["level"] and r["iteration"] < end} != set()
+    assert not len(trainer.learner.match.points.time) and not trainer.learner.guiding
     assert_resumes_bit_for_bit(config, dataset, tmp_path, (9,))
 
 
