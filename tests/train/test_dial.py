@@ -7,14 +7,11 @@ from trainer_rate import train_rate_bits
 from pd4dgs_codec.format.encoder import encode_with_report
 from pd4dgs_codec.model.model import to_scene
 from pd4dgs_codec.quality.measure import level_psnr
-from pd4dgs_codec.train import phases
 from pd4dgs_codec.train.config import at_quality
-from pd4dgs_codec.train.phases import opening
 
 
-def test_bytes_rise_with_the_dial(dataset, tmp_path, monkeypatch):
-    monkeypatch.setattr(phases, "MIN_ITERATIONS", 10)
-    monkeypatch.setattr(opening, "MIN_TRIAL", 6)
+@pytest.mark.usefixtures("short_runs_have_phases")
+def test_bytes_rise_with_the_dial(dataset, tmp_path):
     files, sizes, psnr = [], [], []
     for quality in (0, 100):
         trainer = trainer_of(dataset, 60, **at_quality(quality))

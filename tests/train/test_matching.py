@@ -13,22 +13,19 @@ from pd4dgs_codec.interchange.teacher import load_source
 from pd4dgs_codec.model.config import PRESETS
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.quality.image import moving_regions, mpsnr
-from pd4dgs_codec.train import phases
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.loop import Trainer
-from pd4dgs_codec.train.phases import levels, matching, opening
+from pd4dgs_codec.train.phases import matching, opening
 from pd4dgs_codec.train.phases.matching import Points, attraction, moving_points
 
 WHOLE_TINY = PRESETS["tiny"]  # tests have a smaller one
 
 
 @pytest.fixture
-def short_runs_match(monkeypatch):
-    """Short runs make a trial of motion, whose motion is not steady, and find points at any depth."""
-    monkeypatch.setattr(phases, "MIN_ITERATIONS", 10)
+def short_runs_match(monkeypatch, short_runs_have_phases):
+    """Short runs find points, at any depth; the trial never finds their motion steady."""
     monkeypatch.setattr(opening, "MIN_TRIAL", 4)
     monkeypatch.setattr(opening, "_predicted", lambda state: 0.0)
-    monkeypatch.setattr(levels, "MIN_PRACTICE", (3, 3))
     monkeypatch.setattr(matching, "AMBIGUOUS", 1.0)
     monkeypatch.setattr(matching, "LEAST_FOUND", 0.0)
     monkeypatch.setattr(matching, "ELSEWHERE", 0.0)

@@ -22,7 +22,7 @@ from pd4dgs_codec.model.networks import EXACT
 from pd4dgs_codec.model.picture import render, render_image
 from pd4dgs_codec.model.sensitivity import rounding_error
 from pd4dgs_codec.scene import ATTRIBUTES, MASK_THRESHOLD, MAX_CLASS
-from pd4dgs_codec.train import learner, losses, phases, rollout
+from pd4dgs_codec.train import learner, losses, rollout
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.loop import Trainer
 from pd4dgs_codec.train.phases import levels, opening, prefixes, prune, quantisation
@@ -32,13 +32,6 @@ from pd4dgs_codec.train.phases.prune import Prune, added_error, least, round_of
 from pd4dgs_codec.train.phases.quantisation import classes_within, whiten, whitening_transform
 from pd4dgs_codec.train.rollout import next_view
 from pd4dgs_codec.train.schedule import PRUNING_ROUNDS, Schedule
-
-
-@pytest.fixture
-def short_runs_have_phases(monkeypatch):
-    monkeypatch.setattr(phases, "MIN_ITERATIONS", 10)
-    monkeypatch.setattr(opening, "MIN_TRIAL", 6)
-    monkeypatch.setattr(levels, "MIN_PRACTICE", (3, 3))
 
 
 @pytest.mark.usefixtures("short_runs_have_phases")
