@@ -233,12 +233,12 @@ def test_other_versions(path, version):
     refusal(path, f"version {version!r}", "expected 1")
 
 
-# -- writing -----------------------------------------------------------------------------------------------------------
-
-
 def test_text_is_not_called_pickled_code(tmp_path):
     (tmp_path / "m.pt").write_text("hello")
     assert "pickled" not in refusal(tmp_path / "m.pt", "found a file that begins with")
+
+
+# -- writing -----------------------------------------------------------------------------------------------------------
 
 
 def test_a_folder_that_is_not_there(tmp_path):

@@ -103,8 +103,8 @@ def test_it_is_so_in_as_many_parts_as_there_are_threads(monkeypatch, parts):
 @pytest.mark.parametrize("count", [0, 1, 47, 48, 400])
 @pytest.mark.parametrize("parts", [1, 3])
 def test_layers_and_their_gradients_are_those_of_torch(count, parts, monkeypatch):
-    """The last layer takes some of what it is given, and what the others give is used elsewhere too. Of small whole
-    numbers, whose sums float32 holds in any order: bit for bit."""
+    """The last layer reads some of its input, and the outputs of the others are used elsewhere, too. All bits agree,
+    since float32 holds sums of small whole numbers in any order."""
     monkeypatch.setattr("pd4dgs_codec.draw.layers.kernel_threads", lambda: parts)
     shapes = ((40, 13), (24, 40), (21, 8))
     layers = [(whole(*shape).requires_grad_(), whole(shape[0]).requires_grad_()) for shape in shapes]

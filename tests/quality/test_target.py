@@ -135,7 +135,7 @@ def _few_values(monkeypatch):
 
 
 def error(scene, level):
-    """Anchors count the more, the farther up in the order of their voxels they are."""
+    """It rises with the place of an anchor in the order of the voxels."""
     return np.lexsort(scene.anchor_q.T).argsort().astype(np.float64)
 
 

@@ -66,7 +66,7 @@ def test_an_ablation_takes_out_its_terms_alone(dataset, part, gone):
 
 
 def test_the_planes_rate_joins_with_the_rate_terms_and_grows(dataset):
-    """Unweighted among the terms, ramped in the loss."""
+    """It stands unweighted among the terms; its weight in the loss rises."""
     steps = learner(dataset, plane_rate=1e-3)
     assert not any("rate_proxy" in name for _ in range(10) for name in steps.step())
     shares = []
@@ -91,7 +91,7 @@ def _model_terms(steps):
 
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_a_step_gathers_the_gradients_of_all_its_terms(dataset, level):
-    """As one graph over the model's own parameters has them, whichever thread found them."""
+    """They equal those of one graph over the model's own parameters, whichever thread computed them."""
     steps = learner(dataset, 30)
     for _ in range(12):
         steps.step()
@@ -172,7 +172,7 @@ def test_only_what_is_not_finite_is_skipped(dataset, monkeypatch):
 
 
 def test_large_pictures_are_small_at_first(dataset, monkeypatch):
-    """A quarter, then half of the size, by the mean of blocks, with the camera; others stay whole."""
+    """A quarter, then half as wide: means of blocks, before a camera of that size. Other pictures stay whole."""
     monkeypatch.setattr(state, "LARGE", 24)
     steps = learner(dataset, 40, small_pictures=0.5)
     sizes = {}
@@ -190,7 +190,7 @@ def test_large_pictures_are_small_at_first(dataset, monkeypatch):
 
 
 def test_the_loss_looks_at_what_is_drawn_or_shown(dataset):
-    """All that differs from the background, in the image or in the picture, and what a window on a window reaches."""
+    """At all that differs from the background, in the image or the picture, and as far around as two windows reach."""
     image = np.full((90, 80, 3), 90, np.uint8)
     image[30:32, 40, 1] += 1
     view = replace(dataset.train[0], image=image, width=80, height=90)

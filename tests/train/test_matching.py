@@ -37,7 +37,7 @@ def points(position: list[list[float]], colour: list[list[float]], time: float =
 
 
 def empty_level_0(trainer: Trainer) -> Trainer:
-    """Its level 0 shows the background alone."""
+    """Makes its level 0 show the background alone."""
     with torch.no_grad():
         trainer.learner.model.mask_logits[:, 0] = -20
     return trainer

@@ -235,7 +235,7 @@ def test_pruning_adds_about_its_share_of_error_and_keeps_the_masks_above(trained
         assert int(left.sum()) == record["left_level_0"]
         torch.testing.assert_close(model.masks(0).detach()[~left], masks[0][rows][~left])
     assert len(model.anchor_q) < 300  # of 600, most of them behind or beside others of the same grey
-    for level in range(3):  # estimates from single absences: together they weigh more, level 0 pays twice
+    for level in range(3):  # an estimate leaves out one anchor: many cost more together, and level 0 pays twice
         assert error_of(trained, level) < 1.5 * before[level]
 
 
@@ -287,7 +287,7 @@ def test_a_level_that_stays_leaves_the_model_as_it_was(dataset, monkeypatch, lea
 
 @pytest.mark.usefixtures("short_runs_have_phases")
 def test_the_first_worker_decides_whether_a_level_changes_pictures(dataset, monkeypatch):
-    """Were each to decide alone, one might try a level out while another goes on, for the sake of a pixel."""
+    """If each decided for itself, a single pixel could make one try a level while another goes on."""
     monkeypatch.setattr(levels, "MIN_CONTRAST", 2.0)  # this one finds no pixel
     monkeypatch.setattr(levels.workers, "alike", lambda measure: 1e6)
     monkeypatch.setattr(learner.Learner, "practise", practised := Mock())
@@ -298,7 +298,7 @@ def test_the_first_worker_decides_whether_a_level_changes_pictures(dataset, monk
 @pytest.mark.usefixtures("short_runs_have_phases")
 @pytest.mark.parametrize("share", [None, 0.7])
 def test_a_trial_sees_no_view_that_judges_it(dataset, monkeypatch, share):
-    """A timed run may begin it some positions behind `Schedule.rounding`."""
+    """A timed run may begin its trial some positions after `Schedule.rounding`."""
     learner, drawn = trainer_of(replace(dataset, train=dataset.train * 12)).learner, []
     learner.iteration, learner.share = learner.schedule.rounding, share
     monkeypatch.setattr(learner, "_learn", lambda pairs, *_: drawn.extend(view for view, _ in pairs))
@@ -334,8 +334,8 @@ def test_levels_without_gain_go_from_the_top_and_leave_their_anchors(dataset, mo
 def test_level_2_needs_a_share_of_all_motion_and_counts_for_level_1(
     dataset, monkeypatch, gain_2, over_0, gain_1, kept, steps
 ):
-    """Both tell that something moves: quick motion shows in level 2, and hardly in the few instants of level 1. Short
-    runs have learnt less of it."""
+    """Level 1 stays for the sum of both gains: quick motion shows in level 2, hardly in the few instants of level 1. A
+    short run needs less, as it has learnt less motion."""
     told, practised = iter([over_0, gain_2, gain_1]), []
     monkeypatch.setattr(levels, "gain_in", lambda *of: next(told))
     monkeypatch.setattr(levels, "MIN_PIXELS", 0)

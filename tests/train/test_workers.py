@@ -50,7 +50,7 @@ except TrainError as error:
 
 @pytest.fixture(scope="module")
 def program(once) -> Path:
-    """In a folder with the views, and what one process makes of two views a step."""
+    """Lies beside the views, and what one process learns from two views a step."""
 
     def make(folder: Path) -> None:
         (folder / "train.py").write_text(PROGRAM.format(folders=sys.path))
