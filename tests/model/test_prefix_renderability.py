@@ -50,16 +50,16 @@ def shoot(model, level: int, t: float, camera: Camera) -> np.ndarray:
     return image
 
 
-def prefixes(data: bytes) -> list[tuple[int, Scene]]:
-    """(layer, scene) per layer prefix of the file, from the prefix's bytes alone."""
+def prefixes(scene: Scene) -> list[tuple[int, Scene]]:
+    """(layer, scene) per layer prefix of the scene's file, from the prefix's bytes alone."""
+    data = encode(scene, layers=2, effort=1, verify=False)
     return [(row["layer"], decode(data[: row["end"]], max_layer=row["layer"])) for row in info(data)["layers"]]
 
 
 @given(scenes(), st.integers(0, 2**32 - 1), st.floats(-10, 10, width=32))
 @settings(max_examples=10)
 def test_every_prefix_renders_at_any_time_from_any_camera(scene, seed, t):
-    data = encode(scene, layers=2, effort=1, verify=False)
-    for layer, prefix in prefixes(data):
+    for layer, prefix in prefixes(scene):
         model = from_scene(prefix)
         cameras = [camera_near(prefix, seed)] + ([own_camera(prefix)] if prefix.info.camera else [])
         for camera in cameras:
@@ -73,9 +73,7 @@ def test_every_prefix_renders_at_any_time_from_any_camera(scene, seed, t):
 def test_prefixes_of_a_visible_scene_show_something_at_their_level(layers, channels):
     """8 channels go through the kernels, 2 through the reference. A level whose layer is missing looks like the one
     below it, and a moving layer moves."""
-    scene = visible_scene(layers, channels)
-    data = encode(scene, layers=2, effort=1)
-    for layer, prefix in prefixes(data):
+    for layer, prefix in prefixes(visible_scene(layers, channels)):
         model = from_scene(prefix)
         image = shoot(model, layer, 0.0, CAMERA)
         assert np.abs(image - np.array(prefix.info.background, np.float32)).max() > 0.1
@@ -91,8 +89,7 @@ def test_a_box_without_extent(flat):
     scene = visible_scene((0, 1, 2), 8)
     box = scene.info.box.copy()
     box[1, flat] = box[0, flat]
-    data = encode(replace(scene, info=replace(scene.info, box=box)), layers=2, effort=1)
-    for layer, prefix in prefixes(data):
+    for layer, prefix in prefixes(replace(scene, info=replace(scene.info, box=box))):
         shoot(from_scene(prefix), layer, 0.3, CAMERA)
 
 
@@ -106,7 +103,7 @@ def test_log_scalings_beyond_float32_leave_pictures_finite(seed):
     step = scene.steps.scaling_log
     extreme = rng.choice(np.array([-(1 << 23), -4000, 2800, 2839, 2840, 4000, 1 << 23]), scene.scaling_log.shape) * step
     scene = replace(scene, scaling_log=np.where(some, extreme, scene.scaling_log).astype(np.float32))
-    for layer, prefix in prefixes(encode(scene, layers=2, effort=1, verify=False)):
+    for layer, prefix in prefixes(scene):
         model = from_scene(prefix)
         for t in (0.0, 0.6):
             shoot(model, layer, t, CAMERA)
@@ -120,8 +117,8 @@ def test_features_that_overflow_hide_their_gaussians():
     planes = tuple({name: np.full_like(plane, 2e6) for name, plane in scale.items()} for scale in field.planes)
     (weight, bias), (feature, shift) = field.networks["trunk"][0], field.networks["feature"][0]
     networks = {"trunk": ((np.full_like(weight, 1000), bias),), "feature": ((0 * feature, np.full_like(shift, 0.5)),)}
-    data = encode(replace(scene, local_deformation=Deformation(planes, networks)), layers=2, effort=1)
-    base, top = (from_scene(prefix) for _, prefix in prefixes(data))
+    found = prefixes(replace(scene, local_deformation=Deformation(planes, networks)))
+    base, top = (from_scene(prefix) for _, prefix in found)
     background = np.float32(scene.info.background)
     assert np.abs(shoot(base, 0, 0.3, CAMERA) - background).max() > 0.1
     np.testing.assert_array_equal(shoot(top, 2, 0.3, CAMERA), np.broadcast_to(background, (HEIGHT, WIDTH, 3)))
