@@ -4,11 +4,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pd4dgs_codec.draw import compositing, rasteriser
 from pd4dgs_codec.errors import NotFinite, RenderError
+from pd4dgs_codec.model.picture import rasterization
 from pd4dgs_codec.scene import Camera
 
 CAMERA = Camera(np.eye(4, dtype=np.float32), np.array([[60, 0, 25], [0, 66, 20], [0, 0, 1]], np.float32), 50, 40)
@@ -26,9 +28,6 @@ def gaussians(n=300, seed=5, scale=0.1):
 
 @pytest.mark.parametrize("near_plane", [0.01, 3.0])
 def test_the_picture_is_that_of_rasterization(near_plane):
-    torch = pytest.importorskip("torch")
-    from pd4dgs_codec.model.picture import rasterization
-
     arrays, background = gaussians(), (0.1, 0.4, 0.9)
     image, alpha = rasteriser.draw(*arrays, CAMERA, background, near_plane=near_plane)
     assert image.dtype == alpha.dtype == np.float32 and image.shape == (40, 50, 3) and alpha.shape == (40, 50)
