@@ -74,16 +74,6 @@ def test_at_the_nodes_it_is_the_product_of_plane_cells():
         np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
 
 
-def test_arrays_round_trip():
-    plane = plane_of(dtype=torch.float32)
-    arrays = plane.arrays()
-    assert arrays[1]["xt"].shape == (8, 4, 14) and arrays[1]["xt"].dtype == np.float32
-    other = HexPlane.from_arrays(BOX, arrays)
-    assert torch.equal(other.grid, plane.grid)
-    points = points_in(50, dtype=torch.float32)
-    assert torch.equal(other(points, 0.2), plane(points, 0.2))
-
-
 def test_start_values():
     plane = HexPlane(BOX, scales((9, 10, 12, 3), (1, 2)), 8)
     torch.manual_seed(3)
