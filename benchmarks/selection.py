@@ -49,9 +49,9 @@ def text(rows: Sequence[Row]) -> str:
     return (
         f"`pd4dgs-train 'synthetic:SCENE?seed=SEED' --preset tiny --iterations {STEPS}`: the camera sweeps. "
         "*gain*: dB over the level below after its trial training, in the pixels that the level changes in views held "
-        f"back from training. Level 2 stays if it gains at least {SHARE_2:.0%} of its gain over level 0 and "
-        f"{MIN_GAIN_2:g} dB. If it is removed, level 1 is tested and stays if both gains sum to at least "
-        f"{MIN_GAIN_1 * min(1, STEPS / LEARNT):.2g} dB.\n\n{table(head, cells)}"
+        f"back from training. Level 2 needs {SHARE_2:.0%} of its gain over level 0 and {MIN_GAIN_2:g} dB. Both levels "
+        f"need gains that sum to {MIN_GAIN_1 * min(1, STEPS / LEARNT):.2g} dB; level 1 is not tested if level 2 gains "
+        f"as much.\n\n{table(head, cells)}"
     )
 
 

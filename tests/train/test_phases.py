@@ -328,22 +328,25 @@ def test_levels_without_gain_go_from_the_top_and_leave_their_anchors(dataset, mo
 
 @pytest.mark.parametrize(
     "gain_2, over_0, gain_1, kept, steps",
-    [(0.6, 3.9, 0.0, 2, 500), (0.6, 4.1, 0.1, 1, 500), (0.6, 4.1, 0.0, 0, 500)]
+    [(0.6, 3.9, 0.1, 2, 500), (0.6, 3.9, 0.0, 0, 500), (0.7, 3.9, 0.0, 2, 500)]
+    + [(0.6, 4.1, 0.1, 1, 500), (0.6, 4.1, 0.0, 0, 500), (1.0, 3.9, 0.0, 0, 3000), (1.0, 3.9, 0.2, 2, 3000)]
     + [(0.4, 0.1, 0.3, 1, 500), (0.4, 0.1, 0.2, 0, 500), (-3.0, 9.0, 0.7, 1, 500), (-3.0, 9.0, 0.6, 0, 500)]
     + [(0.4, 0.1, 0.8, 1, 3000), (0.4, 0.1, 0.6, 0, 3000), (-3.0, 9.0, 1.2, 1, 3000), (-3.0, 9.0, 0.8, 0, 3000)],
 )
 def test_level_2_needs_a_share_of_all_motion_and_counts_for_level_1(
     dataset, monkeypatch, gain_2, over_0, gain_1, kept, steps
 ):
-    """Level 1 stays for the sum of both gains: quick motion shows in level 2, hardly in the few instants of level 1. A
-    short run needs less, as it has learnt less motion."""
+    """The sum of both gains decides whether anything moves: quick motion shows in level 2, hardly in the few instants
+    of level 1. A short run needs less, as it has learnt less motion. Level 1 is not tested if level 2 suffices."""
     told, practised = iter([over_0, gain_2, gain_1]), []
     monkeypatch.setattr(levels, "gain_in", lambda *of: next(told))
     monkeypatch.setattr(levels, "MIN_PIXELS", 0)
     learner, record = trainer_of(replace(dataset, train=dataset.train * 12), 600).learner, {}
     monkeypatch.setattr(learner, "steps_in", lambda share: round(share * steps))
     levels.SelectLevels(lambda *asked: practised.append(asked)).apply(learner, record)
-    assert learner.model.level == kept and record["level_gains"] == [gain_2, gain_1][: 3 - max(kept, 1)]
+    suffices = kept == 2 and gain_2 >= levels.MIN_GAIN_1 * min(1, steps / levels.LEARNT)
+    assert learner.model.level == kept and record["level_gains"] == [gain_2, gain_1][: 1 if suffices else 2]
+    assert [row["level"] for row in record["left_out"]] == [2, 1][: 2 - kept]
     assert practised == [(1, max(75, steps // 10)), (0, max(150, steps // 10))][: len(record["level_gains"])]
 
 

@@ -26,9 +26,8 @@ from pd4dgs_codec.train.state import TrainingView, TrainState
 #: One in EVERY training views is held back until levels are selected, if these are at least MIN_VIEWS.
 EVERY = 16
 MIN_VIEWS = 4
-#: Level 1 stays if its gain and that of a removed level 2, which also shows motion, sum to MIN_GAIN_1 dB, or less in
-#: proportion in runs of fewer than LEARNT steps, which learn fast motion incompletely. Level 2 stays if it gains at
-#: least SHARE_2 of its gain over level 0, and MIN_GAIN_2 dB.
+#: Levels that move stay if their gains sum to MIN_GAIN_1 dB, or less in proportion in runs of fewer than LEARNT steps,
+#: which learn fast motion incompletely. Level 2 must also gain MIN_GAIN_2 dB and SHARE_2 of its gain over level 0.
 MIN_GAIN_1, LEARNT, SHARE_2, MIN_GAIN_2 = 1.1, 850, 0.15, 0.5
 #: A gain counts the pixels in which the level changes a colour by MIN_CONTRAST; if there are fewer than this, it is 0.
 MIN_CONTRAST, MIN_PIXELS = 0.02, 32
@@ -58,16 +57,22 @@ class SelectLevels(phases.Phase):
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
         """Removes levels from the highest down, until one stays."""
-        record["level_gains"] = gains = []
+        gains: list[float] = []
+        record["level_gains"] = gains
         while state.model.level:
             level, views = state.model.level, [state.views[index] for index in sorted(held_back_views(state))]
             above = max([0.0, *(row["gain"] for row in self.left_out)])  # also before the run was resumed
             gain, needed = self._gain(state, level, views, above)
-            gains.append(gain)
-            if gain >= needed:
+            tested, stays = {level: gain}, gain >= needed
+            if stays and level == 2 and gain < motion_gain(state):  # by chance, perhaps
+                tested[1], needed = self._gain(state, 1, views, gain)
+                stays = tested[1] >= needed
+            gains += tested.values()
+            if stays:
                 break
-            drop_level(state.model, state.optimiser, level)
-            self.left_out.append({"level": level, "gain": gain, "views": len(views)})
+            for level, gain in tested.items():
+                drop_level(state.model, state.optimiser, level)
+                self.left_out.append({"level": level, "gain": gain, "views": len(views)})
         record["left_out"] = self.left_out
 
     def _gain(self, state: TrainState, level: int, views: list[TrainingView], above: float) -> tuple[float, float]:
@@ -80,7 +85,7 @@ class SelectLevels(phases.Phase):
         def gain_over(other: int) -> float:
             return gain_in(views, acts, [images(state, view, (other,))[0] for view in views], with_it)
 
-        needed = MIN_GAIN_1 * min(1.0, state.steps_in(1.0) / LEARNT) - above
+        needed = motion_gain(state) - above
         if level == 2:
             needed = max(MIN_GAIN_2, SHARE_2 * workers.alike(lambda: gain_over(0)))
         if workers.alike(lambda: sum(int(mask.sum()) for mask in acts)) < MIN_PIXELS:
@@ -104,6 +109,11 @@ class SelectLevels(phases.Phase):
 
     def restore(self, stored: Mapping[str, Any]) -> None:
         self.left_out = list(json.loads(stored["left_out"]))
+
+
+def motion_gain(state: TrainState) -> float:
+    """The gain in dB that the levels that move need together."""
+    return MIN_GAIN_1 * min(1.0, state.steps_in(1.0) / LEARNT)
 
 
 @torch.no_grad()
