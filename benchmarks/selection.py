@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from common import QUICK, Benchmark, Row, Run, Scene, Training, number, table
 from quality import packed_levels
 
-from pd4dgs_codec.train.phases.levels import LEARNT, MIN_GAIN_1, MIN_GAIN_2, SHARE_2
+from pd4dgs_codec.train.phases.levels import MIN_GAIN_2, SHARE_2, motion_gain
 
 MOTIONS, SEEDS = ("static", "global", "local", "fast"), range(5)
 #: Half of what other tiny scenes get: twenty trainings have to end.
@@ -50,7 +50,7 @@ def text(rows: Sequence[Row]) -> str:
         f"`pd4dgs-train 'synthetic:SCENE?seed=SEED' --preset tiny --iterations {STEPS}`: the camera sweeps. "
         "*gain*: dB over the level below after its trial training, in the pixels that the level changes in views held "
         f"back from training. Level 2 needs {SHARE_2:.0%} of its gain over level 0 and {MIN_GAIN_2:g} dB. Both levels "
-        f"need gains that sum to {MIN_GAIN_1 * min(1, STEPS / LEARNT):.2g} dB; level 1 is not tested if level 2 gains "
+        f"need gains that sum to {motion_gain(STEPS):.2g} dB; level 1 is not tested if level 2 gains "
         f"as much.\n\n{table(head, cells)}"
     )
 

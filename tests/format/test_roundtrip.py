@@ -45,6 +45,9 @@ def test_everything_active_comes_back_and_encodes_to_the_same_bytes(scene, mode,
     for index, (first, last) in enumerate(pairwise((0, *decoded.rows))):
         assert (np.diff(morton_codes(decoded.anchor_q[first:last])) > 0).all(), "rows are not in Morton order"
         assert (decoded.mask[index][first:last] >= 3).all(), "a layer has rows that are not active in it"
+        if index:
+            earlier = decoded.mask[index - 1]
+            assert (decoded.mask[index][: len(earlier)] >= earlier).all(), "masks fall"
     assert encode(decoded, **options, verify=False) == data
 
 

@@ -344,7 +344,7 @@ def test_level_2_needs_a_share_of_all_motion_and_counts_for_level_1(
     learner, record = trainer_of(replace(dataset, train=dataset.train * 12), 600).learner, {}
     monkeypatch.setattr(learner, "steps_in", lambda share: round(share * steps))
     levels.SelectLevels(lambda *asked: practised.append(asked)).apply(learner, record)
-    suffices = kept == 2 and gain_2 >= levels.MIN_GAIN_1 * min(1, steps / levels.LEARNT)
+    suffices = kept == 2 and gain_2 >= levels.motion_gain(steps)
     assert learner.model.level == kept and record["level_gains"] == [gain_2, gain_1][: 1 if suffices else 2]
     assert [row["level"] for row in record["left_out"]] == [2, 1][: 2 - kept]
     assert practised == [(1, max(75, steps // 10)), (0, max(150, steps // 10))][: len(record["level_gains"])]
@@ -557,7 +557,7 @@ def test_anchors_of_a_first_slice_rank_alike_and_absent_ones_not_at_all(dataset,
 
 @pytest.mark.parametrize("fused", (True, False))
 def test_a_picture_of_some_anchors_is_that_of_a_model_without_the_others(dataset, monkeypatch, fused):
-    model = trainer_of(dataset, max_layer=0).model  # planes of TINY are not for the kernels
+    model = trainer_of(dataset).model
     if not fused:
         monkeypatch.setattr(type(model), "_fusible", lambda self: False)
     assert model._fusible() == fused

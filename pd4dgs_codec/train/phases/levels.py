@@ -64,7 +64,7 @@ class SelectLevels(phases.Phase):
             above = max([0.0, *(row["gain"] for row in self.left_out)])  # also before the run was resumed
             gain, needed = self._gain(state, level, views, above)
             tested, stays = {level: gain}, gain >= needed
-            if stays and level == 2 and gain < motion_gain(state):  # by chance, perhaps
+            if stays and level == 2 and gain < motion_gain(state.steps_in(1.0)):  # level 1 has to show the rest
                 tested[1], needed = self._gain(state, 1, views, gain)
                 stays = tested[1] >= needed
             gains += tested.values()
@@ -85,7 +85,7 @@ class SelectLevels(phases.Phase):
         def gain_over(other: int) -> float:
             return gain_in(views, acts, [images(state, view, (other,))[0] for view in views], with_it)
 
-        needed = motion_gain(state) - above
+        needed = motion_gain(state.steps_in(1.0)) - above
         if level == 2:
             needed = max(MIN_GAIN_2, SHARE_2 * workers.alike(lambda: gain_over(0)))
         if workers.alike(lambda: sum(int(mask.sum()) for mask in acts)) < MIN_PIXELS:
@@ -111,9 +111,9 @@ class SelectLevels(phases.Phase):
         self.left_out = list(json.loads(stored["left_out"]))
 
 
-def motion_gain(state: TrainState) -> float:
-    """The gain in dB that the levels that move need together."""
-    return MIN_GAIN_1 * min(1.0, state.steps_in(1.0) / LEARNT)
+def motion_gain(steps: int) -> float:
+    """The gain in dB that the levels that move need together in a run of so many steps."""
+    return MIN_GAIN_1 * min(1.0, steps / LEARNT)
 
 
 @torch.no_grad()
