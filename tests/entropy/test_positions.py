@@ -8,7 +8,7 @@ from strategies import memory_below
 
 from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
 from pd4dgs_codec.errors import DecodeError, EncodeError
-from pd4dgs_codec.morton import MAX_VOXEL, morton_order
+from pd4dgs_codec.morton import MAX_VOXEL, morton_codes, morton_order
 
 
 def ordered(cells):
@@ -31,6 +31,13 @@ def test_the_order_of_cells_takes_66_bits():
     assert max(codes).bit_length() == 66
     assert morton_order(cells).tolist() == sorted(range(64), key=lambda row: codes[row])
     assert morton_order(cells[:0]).tolist() == []
+
+
+def test_morton_codes_interleave_the_bits():
+    cells = np.array([[5, 5, 5], [6, 5, 5], [5, 6, 5], [5, 5, 6], [5 + (1 << 20), 5, 5], [8, 8, 8]])
+    assert morton_codes(cells).tolist() == [0, 1, 2, 4, 1 << 60, 0b111111]
+    assert morton_order(cells).tolist() == [0, 1, 2, 3, 5, 4]
+    assert morton_codes(np.zeros((0, 3), np.int32)).shape == (0,)
 
 
 @settings(max_examples=30)

@@ -26,8 +26,22 @@ def test_the_class_of_a_place_is_the_number_of_bounds_it_reaches(activity):
     np.testing.assert_array_equal(back, channels)
 
 
+def test_different_activities_make_classes_of_about_equal_size():
+    places = Places.by(activity_classes(np.random.default_rng(0).permutation(100)), CLASSES)
+    assert set(places.sizes) <= {12, 13}
+
+
 @given(st.lists(st.sampled_from((-K_MAX, -1, 0, 1, 7, K_MAX)), min_size=1, max_size=40), st.integers(0, 3))
 def test_relative_magnitudes_at_the_limits(symbols, channels):
     n, total = len(symbols), 1 + sum(abs(k) for k in symbols)
     found = relative_magnitude(np.array([symbols] * channels, np.int64).reshape(channels, n))
     assert found.tolist() == [channels * (abs(k) * 256 * n // total) for k in symbols]
+
+
+def test_relative_magnitudes_of_many_places_are_exact():
+    """In binary64 the first quotient would round up to 939180039."""
+    residuals = np.zeros((1, 1 << 22), np.int64)
+    residuals[0, :2] = (1 << 24) - 2, -2403768
+    total = (1 << 24) - 1 + 2403768
+    assert (((1 << 24) - 2) << 30) // total == 939180038
+    assert relative_magnitude(residuals)[:3].tolist() == [939180038, (2403768 << 30) // total, 0]

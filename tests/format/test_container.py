@@ -1,11 +1,30 @@
-"""Preamble and chunks: the flags of slices, and what the writer refuses; tests/fuzz compares their bytes."""
+"""Preamble and chunks: exact bytes, the flags of slices, and what the writer refuses."""
+
+import struct
+import zlib
 
 import pytest
 
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format import container
-from pd4dgs_codec.format.container import read_chunk, slice_flags, write_chunk, write_preamble
+from pd4dgs_codec.format.container import (
+    CHUNK_OVERHEAD,
+    FLAG_ANCILLARY,
+    read_chunk,
+    slice_flags,
+    write_chunk,
+    write_preamble,
+)
 from pd4dgs_codec.format.registry import MAX_HEADER
+
+
+def test_exact_bytes():
+    front = bytes.fromhex("89504434 0d0a1a0a 0300 0000 03000000")
+    assert write_preamble(b"abc") == front + struct.pack("<I", zlib.crc32(front + b"abc")) + b"abc"
+    body = bytes.fromhex("0500 0100 02000000 0102030405060708") + b"hi"
+    chunk = write_chunk(5, FLAG_ANCILLARY, bytes(range(1, 9)), b"hi")
+    assert chunk == body + struct.pack("<I", zlib.crc32(body)) and len(chunk) == CHUNK_OVERHEAD + 2
+    assert read_chunk(chunk, 0).ancillary
 
 
 def test_the_flags_of_slices():

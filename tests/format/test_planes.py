@@ -1,4 +1,5 @@
-"""Planes: predictors are undone exactly, the section gives back the residuals, and classes pay where cells are busy."""
+"""Planes: predictors are undone exactly and follow their definition; the section gives back the residuals, and classes
+pay where samples are large in some places."""
 
 import numpy as np
 import pytest
@@ -18,11 +19,37 @@ def random_plane(shape, seed, top):
     return np.random.default_rng(seed).integers(-top, top + 1, shape, dtype=np.int32)
 
 
+def scalar_prediction(predictor, k, i, j):
+    """The registry's definition for one sample, in Python integers."""
+    w = int(k[i, j - 1]) if j else None
+    n = int(k[i - 1, j]) if i else None
+    nw = int(k[i - 1, j - 1]) if i and j else None
+    if w is None and n is None:
+        w = n = nw = 0
+    elif i == 0:
+        n = nw = w
+    elif j == 0:
+        w = nw = n
+    return {0: n, 1: sorted((w, n, w + n - nw))[1]}[predictor]
+
+
 @given(shapes, st.integers(0, 1000), st.sampled_from((1, 50, MAX_SYMBOL // 4)))
 def test_every_predictor_is_undone_exactly(shape, seed, top):
     k = random_plane(shape, seed, top)
     for predictor in (UP, MEDIAN):
         np.testing.assert_array_equal(restore([(predictor, residual(predictor, k))])[0], k, err_msg=str(predictor))
+
+
+@given(shapes, st.integers(0, 1000))
+@settings(max_examples=30)
+def test_predictions_follow_their_definition(shape, seed):
+    k = random_plane(shape, seed, 100)
+    for predictor in (UP, MEDIAN):
+        expected = [
+            [[int(c[i, j]) - scalar_prediction(predictor, c, i, j) for j in range(shape[2])] for i in range(shape[1])]
+            for c in k
+        ]
+        np.testing.assert_array_equal(residual(predictor, k), expected, err_msg=str(predictor))
 
 
 def test_planes_restored_together_equal_planes_restored_alone():

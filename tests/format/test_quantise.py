@@ -17,6 +17,16 @@ def test_symbols_survive_their_float32_values(ks, step):
     np.testing.assert_array_equal(quantise(dequantise(k, step), step), k)
 
 
+@given(st.integers(-1000, 1000), steps)
+def test_dequantise_is_one_rounding_of_the_exact_product(k, step):
+    from fractions import Fraction
+
+    exact = Fraction(k) * Fraction(step)
+    got = dequantise(np.array([k], np.int32), step)[0]
+    neighbours = [np.nextafter(got, np.float32(s)) for s in (-np.inf, np.inf)]
+    assert all(abs(Fraction(float(got)) - exact) <= abs(Fraction(float(n)) - exact) for n in neighbours)
+
+
 @given(st.lists(st.floats(0, 1, width=32), min_size=2))
 def test_mask_codes_keep_order(values):
     codes = mask_codes(np.sort(np.array(values, np.float32)))

@@ -99,6 +99,17 @@ def test_mpsnr_by_hand():
     assert mpsnr(a, b) == pytest.approx(-10 * np.log10(0.04 / 12))
 
 
+def test_mask_hides_errors_anywhere():
+    a, b = random_pair()
+    m = np.random.default_rng(2).uniform(size=a.shape[:2]) < 0.5
+    c = b.copy()
+    c[~m] = 0
+    assert mpsnr(a, b, m) == mpsnr(a, c, m)
+    a2 = a.copy()
+    a2[~m] = 255
+    assert mssim(a, b, m) == mssim(a2, c, m)
+
+
 def test_eight_bits_first():
     target = np.full((12, 12, 3), 100, np.uint8)
     assert mpsnr(np.full((12, 12, 3), 100.4 / 255, np.float32), target) == float("inf")
