@@ -186,7 +186,7 @@ class TrainConfig:
         False, help="keep layers even if they gain little on training views held back for this decision"
     )
     prune: float = option(
-        0.14,
+        0.3,
         help="prune anchors halfway through the run, adding at most this fraction to the squared error; 0: none",
         least=0,
         most=1,
