@@ -31,9 +31,9 @@ def start(device: str, views: int) -> None:
         # The module stores the default process group at import. Imported once the group exists, it would keep the
         # group's threads beyond stop(), which sometimes aborts the process at exit.
         import_module("torch.distributed.nn.functional")
-        if device == "cuda":
-            torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
         with _met():
+            if device == "cuda":
+                torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
             distributed.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo")
 
 
@@ -59,6 +59,8 @@ def _met() -> Iterator[None]:
     failed says why itself."""
     try:
         yield
+    except KeyError as missing:
+        raise TrainError(f"cannot reach the other workers: {missing.args[0]} expected, but not set") from None
     except (RuntimeError, ValueError) as error:
         raise TrainError(f"cannot reach the other workers, or one has ended: {error}") from None
 

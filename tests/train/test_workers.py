@@ -121,11 +121,12 @@ def test_a_worker_that_ends_is_missed_in_one_line():
     assert nothing == ""
 
 
-def test_a_variable_of_torchrun_that_is_missing_is_named(monkeypatch):
+@pytest.mark.parametrize(("device", "missing"), [("cpu", "RANK"), ("cuda", "LOCAL_RANK")])
+def test_a_variable_of_torchrun_that_is_missing_is_named(device, missing, monkeypatch):
     monkeypatch.setenv("WORLD_SIZE", "2")
-    monkeypatch.delenv("RANK", raising=False)
-    with pytest.raises(TrainError, match="cannot reach the other workers.* RANK expected"):
-        workers.start("cpu", 2)
+    monkeypatch.delenv(missing, raising=False)
+    with pytest.raises(TrainError, match=f"cannot reach the other workers.* {missing} expected"):
+        workers.start(device, 2)
 
 
 def test_workers_that_cannot_share_the_views_evenly_are_named(monkeypatch):
