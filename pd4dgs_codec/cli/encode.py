@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from pd4dgs_codec.scene import Scene, SceneInfo
 
 DETAILS = f"""\
-A .pd4 file holds layer 0 (static scene), layer 1 (global motion) and layer 2 (local motion) in this order; every prefix
-that ends with a layer can be shown. Parts without visible effect are omitted and listed with reasons in the report.
+A .pd4 file holds layer 0 (the scene at one instant), layer 1 (its motion) and layer 2 (motion finer in time) in this
+order; every prefix that ends with a layer or a slice can be shown. Parts without visible effect are omitted and listed
+with reasons in the report.
 
 --target-size fits layers to a link with the least loss of quality: 425k for layer 0 takes 1.7 s at 2 Mbps. Fitting
 takes a minute or more, on renderings from --data or else the file's own camera, and longer with --slices.
@@ -46,7 +47,7 @@ FIRST_FRAME_RATE = 2e6
 HELP = {
     "mode": "entropy coder; the player supports ans only",
     "priors": "candidate distributions of each channel",
-    "layers": "highest layer to keep; auto omits layers without visible effect",
+    "layers": "highest layer to keep; auto omits layers without effect and, with --data, of little gain",
     "effort": "compression effort, from 1 (fastest) to 9 (smallest file)",
     "omit": "omit plane cells that no anchor reads, or nothing",
 }
@@ -68,7 +69,7 @@ def parser() -> options.Parser:
     what = "factor on all quantisation steps; above 1, smaller and coarser files (default: %(default)g)"
     add("--step-scale", type=options.positive_float, default=DEFAULTS.step_scale, metavar="X", help=what)
     add("--no-verify", dest="verify", action="store_false", help="do not decode the result to verify it")
-    what = "cut layers into slices: the first of SIZE bytes, later ones of two thirds at most (default: no slices)"
+    what = "cut layers into slices: the first of at most SIZE bytes, later ones of two thirds (default: no slices)"
     add("--slices", type=options.size, default=DEFAULTS.slices, metavar="SIZE", help=what)
     what = "byte limits of layers (layer 0 with the header), met by coarser steps and fewer anchors"
     add("--target-size", type=options.layer_sizes, default={}, metavar="L0=425k,...", help=what)

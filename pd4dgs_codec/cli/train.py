@@ -27,6 +27,9 @@ a minute).
 --quality sets the weights of the bitrate, pruning and quantisation steps together; --rate-scale, --prune and --grading
 override single ones.
 
+At two thirds of a run, layers that gain too little on held-back views are dropped; runs of fewer than 500 steps, timed
+runs of fewer than 1,000 and --keep-layers keep all.
+
 With --rollout key, level 0 is the scene at --key-instant, layer 1 moves it from there, and most steps train the highest
 level. The other values are the paper's, with the mean over time as level 0: adaptive samples higher levels more often
 the more the layers differ; uniform samples all levels equally; fixed samples them with probabilities 0.15, 0.30 and
@@ -41,10 +44,10 @@ first worker writes the files. Their number must divide V and may change when a 
 {options.SOURCES}
 
 examples:
-  torchrun --nproc-per-node=2 -m -- pd4dgs_codec train synthetic:local -o local.pt --views-per-step 2
   pd4dgs-train synthetic:local -o local.pt --preset tiny --max-seconds 300
   pd4dgs-train recordings/kitchen -o kitchen.pt --downscale 2 --iterations 10000
-  pd4dgs-train recordings/kitchen -o kitchen.pt --resume kitchen.pt"""
+  pd4dgs-train recordings/kitchen -o kitchen.pt --resume kitchen.pt
+  torchrun --nproc-per-node=2 -m -- pd4dgs_codec train synthetic:local -o local.pt --views-per-step 2"""
 
 VIEW_PORT = 8080
 
@@ -320,8 +323,8 @@ def _text(result: dict[str, Any]) -> str:
     if result["skipped"]:
         lines.append(f"{result['skipped']} steps skipped for non-finite gradients")
     for row in result["left_out"]:
-        gain = f"{row['gain']:+.2f} dB over level {row['level'] - 1} on {row['views']} held-back views"
-        lines.append(f"level {row['level']} left out: {gain}")
+        gain = f"{row['gain']:+.2f} dB over level {row['level'] - 1} in the pixels that it changes"
+        lines.append(f"level {row['level']} left out: {gain}, on {row['views']} held-back views")
     if result["levels"]:
         split = "held-out" if result["split"] == "test" else "training-view"
         rows = zip(result["levels"], result["active_anchors"], strict=False)

@@ -127,6 +127,10 @@ class PlaneWeights:
     time_l1: float
 
 
+#: The steps of each preset, for the help.
+_STEPS = ", ".join(f"{name} {size.iterations:,}" for name, size in PRESETS.items())
+
+
 @dataclass(frozen=True)
 class TrainConfig:
     """The configuration of a run, without its data. Raises TrainError for a value out of its option's range."""
@@ -144,7 +148,7 @@ class TrainConfig:
     background: tuple[float, float, float] | None = option(None, least=0, most=1, count=3)
     #: None: the preset's default, or as many as `max_seconds` allows
     iterations: int | None = option(
-        None, help="training steps (default: by preset, unless --max-seconds is given)", metavar="N", least=1
+        None, help=f"training steps (default: {_STEPS}; as many as --max-seconds allows)", metavar="N", least=1
     )
     #: without `iterations`, the schedule is spread over this time; with `iterations`, the limit stops the run early
     max_seconds: float | None = option(
@@ -180,7 +184,7 @@ class TrainConfig:
     key_instant: float = option(
         0.5, help="normalised time that level 0 shows with --rollout key", metavar="T", least=0, most=1
     )
-    #: 0 is a static scaffold, 1 a scaffold with its global deformation
+    #: 0 is the scene at one instant, 1 has its motion
     max_layer: int = option(2, help="highest layer to train", choices=(0, 1, 2))
     keep_layers: bool = option(
         False, help="keep layers even if they gain little on training views held back for this decision"
