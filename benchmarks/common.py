@@ -84,6 +84,7 @@ SCENES = {
         Scene("local", f"synthetic:local?{JUMP}", "large objects and small parts move, 160 x 120"),
         Scene("fast", f"synthetic:fast?{JUMP}", "quick motion, 160 x 120"),
         Scene("flyby", "synthetic:flyby", "a ball flies past a cube, on white, 100 x 100"),
+        Scene("dart", "synthetic:dart", "a small ball flies fast, on white, 100 x 100"),
         Scene("rods", "synthetic:rods", "thin rods move, on white, 100 x 100"),
         Scene("bend", "synthetic:bend", "a column bends, on white, 100 x 100"),
         Scene("mutant-200", MUTANT, "D-NeRF, 200 x 200", 4, "small", 8_000, "3dgs"),

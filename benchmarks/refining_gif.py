@@ -1,6 +1,6 @@
-"""A GIF of a scene that becomes better as its bytes arrive, while its time runs.
+"""A GIF of a scene that becomes better as its bytes arrive, while its time runs and the cameras of its dataset move.
 
-    python benchmarks/refining_gif.py scene.pd4 -o docs/img/refining.gif
+    python benchmarks/refining_gif.py scene.pd4 SOURCE -o docs/img/refining.gif
 
 Best with a file in slices (`pd4dgs-encode --slices 50k --data SOURCE`). The first picture is that of the first slice;
 then follow the other slices of layer 0, and the layers above it.
@@ -16,38 +16,42 @@ from typing import Any
 
 import numpy as np
 
+from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.io import whole_file
-from pd4dgs_codec.quality.frames import own_frames
 from pd4dgs_codec.quality.image import to_uint8
 from pd4dgs_codec.quality.levels import load_levels
 from pd4dgs_codec.scene import Camera
 
 #: Bytes of the GIF at most, and what is tried in turn to stay below: (colours, pictures a second).
-LIMIT, TRIED = 1_500_000, ((192, 10), (96, 10), (64, 8), (32, 6), (16, 4))
-WIDTH = 480
+LIMIT, TRIED = 1_500_000, ((192, 10), (96, 8), (64, 6), (64, 5), (48, 5), (32, 5), (16, 4))
+WIDTH = 320
 #: Seconds that each prefix is shown, and the whole file.
 PREFIX_SECONDS, LAST_SECONDS = 0.9, 3.0
-#: Seconds in which the scene's time runs from its start to its end; then it runs back.
-PERIOD = 2.5
+#: Seconds in which the recording runs from its start to its end; then it runs back.
+PERIOD = 4.0
 BAR = 26
 #: Thresholds of ordered dithering, -0.5 to 0.5, and their weight in levels of 8 bits. Unlike diffused errors they are
 #: the same in every picture, so that what stands still stays equal.
 BAYER = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]]) / 16 - 15 / 32
-DITHER = 8
+DITHER = 3
+#: The layer that the last bytes belong to, in words.
+SHOWN = "one instant", "its motion", "motion finer in time"
 
 
-def draw(data: bytes, path: Path) -> None:
-    """Writes the GIF of the file `data`. Raises Pd4Error if the file has no camera."""
+def draw(data: bytes, source: str, path: Path) -> None:
+    """Writes the GIF of the file `data`, from the cameras of the dataset `source` in the order of their times."""
+    dataset = load(source)
+    views = sorted((*dataset.train, *dataset.test), key=lambda view: view.time)
     ends = [(row["layer"], part["end"]) for row in info(data)["layers"] for part in row["slices"]]
     shown = [load_levels(data, max_bytes=end, last_only=True)[-1] for _, end in ends]
-    camera = widened(own_frames(shown[-1].model.info, 1)[0].camera, WIDTH)
     for colours, rate in TRIED:
         pictures, second = [], 0.0
         for (layer, end), level in zip(ends, shown, strict=True):
             stays = LAST_SECONDS if end == ends[-1][1] else PREFIX_SECONDS
             for _ in range(round(stays * rate)):
-                picture = level.picture(camera, 1 - abs(1 - second / PERIOD % 2))
+                view = views[round((1 - abs(1 - second / PERIOD % 2)) * (len(views) - 1))]
+                picture = level.picture(widened(view.camera, WIDTH), view.time)
                 pictures.append(labelled(dithered(picture), layer, end, len(data)))
                 second += 1 / rate
         with whole_file(path, overwrite=True) as temporary:
@@ -79,7 +83,7 @@ def labelled(picture: np.ndarray, layer: int, end: int, size: int) -> np.ndarray
     sheet.paste(Image.fromarray(picture))
     pen = ImageDraw.Draw(sheet)
     pen.rectangle((0, height, width * end // size, height + BAR), fill=(190, 214, 240))
-    words = f"{end / 1000:,.0f} kB of {size / 1000:,.0f} kB: {('static', 'global motion', 'local motion')[layer]}"
+    words = f"{end / 1000:,.0f} kB of {size / 1000:,.0f} kB: {SHOWN[layer]}"
     pen.text((6, height + 4), words, fill=(0, 0, 0), font=ImageFont.load_default(15))
     return np.asarray(sheet)
 
@@ -99,10 +103,11 @@ def write(pictures: Sequence[np.ndarray], path: Path, colours: int, rate: float)
 def main() -> None:
     """The GIF of the file that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("file", type=Path, help="a .pd4 file with a camera of its own")
+    parser.add_argument("file", type=Path, help="a .pd4 file")
+    parser.add_argument("source", metavar="SOURCE", help="the dataset whose cameras draw it")
     parser.add_argument("-o", "--output", type=Path, required=True)
     args = parser.parse_args()
-    draw(args.file.read_bytes(), args.output)
+    draw(args.file.read_bytes(), args.source, args.output)
     print(f"{args.output}: {args.output.stat().st_size:,} bytes")
 
 

@@ -152,9 +152,10 @@ def main(argv: Sequence[str] | None = None) -> int:
                 kept[benchmark.name] = section(benchmark, run, scenes, made)
                 write(docs, ALL, kept)
                 if benchmark is delivery.SLICES:
-                    file = run.folder(QUICK if args.quick else SCENES[ANIMATED]) / "slices.pd4"
+                    scene = QUICK if args.quick else SCENES[ANIMATED]
+                    file = run.folder(scene) / "slices.pd4"
                     if file.is_file():
-                        refining_gif.draw(file.read_bytes(), run.images / "refining.gif")
+                        refining_gif.draw(file.read_bytes(), scene.source, run.images / "refining.gif")
         if args.render:
             write(docs, ALL, kept)
     except (Pd4Error, OSError, KeyboardInterrupt) as error:

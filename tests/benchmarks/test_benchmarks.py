@@ -97,7 +97,7 @@ def test_the_share_of_bytes_is_the_median_over_qualities():
 def test_the_animation_has_a_picture_for_every_prefix(made):
     movie = Image.open(made / "docs" / "img" / "refining.gif")
     assert movie.n_frames >= len(sections(made / "docs")["slices"]["rows"])
-    assert movie.width == 480 and (made / "docs" / "img" / "refining.gif").stat().st_size <= LIMIT
+    assert movie.width == 320 and (made / "docs" / "img" / "refining.gif").stat().st_size <= LIMIT
 
 
 def test_the_page_is_made_from_its_figures_alone(made, tmp_path):
