@@ -24,7 +24,7 @@ from pd4dgs_codec.quality.levels import load_levels
 from pd4dgs_codec.scene import Camera
 
 #: Bytes of the GIF at most, and what is tried in turn to stay below: (colours, pictures a second).
-LIMIT, TRIED = 1_500_000, ((192, 10), (96, 8), (64, 6), (64, 5), (48, 5), (32, 5), (16, 4))
+LIMIT, TRIED = 1_500_000, ((192, 10), (96, 8), (64, 6), (64, 5), (16, 4))
 WIDTH = 320
 #: Seconds that each prefix is shown, and the whole file.
 PREFIX_SECONDS, LAST_SECONDS = 0.9, 3.0

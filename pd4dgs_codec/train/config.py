@@ -148,7 +148,7 @@ class TrainConfig:
     background: tuple[float, float, float] | None = option(None, least=0, most=1, count=3)
     #: None: the preset's default, or as many as `max_seconds` allows
     iterations: int | None = option(
-        None, help=f"training steps (default: {_STEPS}; as many as --max-seconds allows)", metavar="N", least=1
+        None, help=f"training steps (default: {_STEPS}; with --max-seconds as many as fit)", metavar="N", least=1
     )
     #: without `iterations`, the schedule is spread over this time; with `iterations`, the limit stops the run early
     max_seconds: float | None = option(

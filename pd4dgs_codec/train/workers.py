@@ -33,8 +33,15 @@ def start(device: str, views: int) -> None:
         import_module("torch.distributed.nn.functional")
         with _met():
             if device == "cuda":
-                torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
+                torch.cuda.set_device(_local_rank())
             distributed.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo")
+
+
+def _local_rank() -> int:
+    """The index of this worker on its machine. Raises ValueError, as torch does for torchrun's other variables."""
+    if "LOCAL_RANK" not in os.environ:
+        raise ValueError("environment variable LOCAL_RANK expected, but not set")
+    return int(os.environ["LOCAL_RANK"])
 
 
 def stop() -> None:
@@ -59,8 +66,6 @@ def _met() -> Iterator[None]:
     failed says why itself."""
     try:
         yield
-    except KeyError as missing:
-        raise TrainError(f"cannot reach the other workers: {missing.args[0]} expected, but not set") from None
     except (RuntimeError, ValueError) as error:
         raise TrainError(f"cannot reach the other workers, or one has ended: {error}") from None
 
