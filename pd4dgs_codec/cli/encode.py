@@ -11,7 +11,6 @@ from pd4dgs_codec.cli import common, options
 from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError, number, progress_bar, say, shown_name, table
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.options import CHOICES, DEFAULTS, EncodeOptions
-from pd4dgs_codec.quality import ENCODE_MIN_DB_PER_MEGABYTE
 
 if TYPE_CHECKING:
     from pd4dgs_codec.format.metadata import Metadata
@@ -47,7 +46,7 @@ FIRST_FRAME_RATE = 2e6
 HELP = {
     "mode": "entropy coder; the player supports ans only",
     "priors": "candidate distributions of each channel",
-    "layers": "highest layer to keep; auto omits layers without effect and, with --data, of little gain",
+    "layers": "highest layer to keep; auto omits layers without effect",
     "effort": "compression effort, from 1 (fastest) to 9 (smallest file)",
     "omit": "omit plane cells that no anchor reads, or nothing",
 }
@@ -77,14 +76,11 @@ def parser() -> options.Parser:
     for name, what in (("title", "title of the scene"), ("source", "origin of the scene"), ("licence", "terms of use")):
         about.add_argument(f"--{name}", type=options.line, metavar="TEXT", help=what)
     views = p.add_argument_group("rendered quality")
-    what = "dataset, see below: training views fit the sizes, held-out views decide which layers are kept"
+    what = "dataset, see below: training views for the sizes and slices, held-out views for the reported quality"
     views.add_argument("--data", metavar="SOURCE", help=what)
     options.add_reading(views, unset=options.READING)
     what = "use about N views of each split, evenly spread (default: 16)"
     views.add_argument("--views", type=options.positive_int, metavar="N", help=what)
-    what = "with --data, omit layers that gain less than DB dB mPSNR per megabyte"
-    what = f"{what} (default: {ENCODE_MIN_DB_PER_MEGABYTE:g}; 0: keep all)"
-    views.add_argument("--min-gain", type=options.non_negative_float, metavar="DB", help=what)
     p.add_common()
     return p
 
@@ -101,13 +97,10 @@ def check_usage(args: argparse.Namespace) -> None:
         raise UsageError(f"--target-size L{gone[0]} has no effect with --layers {args.layers}")
     if args.mode == "lzma" and args.priors != DEFAULTS.priors:
         raise UsageError("--priors has no effect with --mode lzma")
-    fits, gains = args.slices or args.target_size, args.layers == "auto"
-    options.conditional(args, fits or gains, "needs --layers auto, --slices or --target-size", data=None)
     downscale, holdout = options.READING["downscale"], options.READING["holdout"]
-    options.conditional(args, args.data or fits, "needs --data, --slices or --target-size", downscale=downscale)
+    fits = args.slices or args.target_size
+    options.conditional(args, fits, "needs --slices or --target-size", data=None, downscale=downscale)
     options.conditional(args, args.data, "needs --data SOURCE", holdout=holdout, views=16)
-    needs = "needs --data SOURCE and --layers auto"
-    options.conditional(args, args.data and gains, needs, min_gain=ENCODE_MIN_DB_PER_MEGABYTE)
     try:
         args.options = EncodeOptions(**{field.name: getattr(args, field.name) for field in fields(EncodeOptions)})
     except EncodeError as error:
@@ -127,7 +120,6 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
         args.options,
         target_sizes=args.target_size,
         views=_views(args, scene.info, console),
-        min_gain=args.min_gain,
         downscale=args.downscale,
         metadata=metadata,
         progress=lambda what: progress_bar(None, "pictures", what),
@@ -175,7 +167,7 @@ def _views(args: argparse.Namespace, info: SceneInfo, console: Console) -> Views
     views = Views.of(dataset, args.data, args.views)
     console.detail(f"{args.data}: {len(views.fitting)} training views, {len(views.held_out)} held out")
     if not dataset.test:
-        say("no held-out views: gains are measured on training views")
+        say("no held-out views: quality is measured on training views")
     return views
 
 

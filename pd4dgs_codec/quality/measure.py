@@ -1,16 +1,15 @@
-"""Measures scenes by their pictures for packing: errors, the gain of layers, and the order of anchors in slices."""
+"""Measures scenes by their pictures for packing: errors, and the order of anchors in slices."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 
 import numpy as np
 import torch
 
 from pd4dgs_codec.data.view import View
-from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
-from pd4dgs_codec.format.plan import LeftOut, in_file_order, passed, plan, tensor_bytes
+from pd4dgs_codec.format.options import EncodeOptions
+from pd4dgs_codec.format.plan import in_file_order, passed, tensor_bytes
 from pd4dgs_codec.format.registry import LAYER_KINDS
 from pd4dgs_codec.format.symbols import layer_symbols
 from pd4dgs_codec.model.model import Model, from_scene
@@ -98,58 +97,6 @@ class RenderedLoss:
             met |= near.numpy()
             self.step()
         return np.where(met, total, np.inf)
-
-
-# -- the gain of layers ------------------------------------------------------------------------------------------------
-
-
-def leave_out_low_gain(
-    scene: Scene,
-    views: Sequence[View],
-    *,
-    min_gain: float,
-    options: EncodeOptions = DEFAULTS,
-    step: Callable[[], None] = lambda: None,
-) -> tuple[Scene, list[LeftOut]]:
-    """Leaves out deformations that gain less than min_gain dB per megabyte. Returns the scene and the parts left out.
-
-    From the highest layer down until one is kept (its trunk reads the planes below), the scene is quantised with and
-    without the layer's deformation. A layer's gain is the increase of the mean mPSNR over `views` at its level. Only
-    the deformation's own bytes count: its anchors pass to a lower layer. `plan` drops layers without a deformation.
-    The steps of `scene` are binary32.
-    """
-    left_out: list[LeftOut] = []
-    present = None  #: (highest level, its PSNR) of the scene
-    for kind in reversed(LAYER_KINDS[1:]):
-        deformation = scene.deformation(kind.layer)
-        if deformation is None:
-            continue
-        if present is None:
-            present = _highest_psnr(scene, views, options, step)
-        level, psnr = present
-        if level != kind.layer:  # without effect: the plan leaves it out and reports why
-            continue
-        rest = scene.with_tensors(kind.layer, None)
-        remaining = _highest_psnr(rest, views, options, step)
-        gain = psnr - remaining[1]
-        size = tensor_bytes(deformation, kind, scene.steps, options)
-        if gain * 1e6 >= min_gain * size:
-            break
-        why = (
-            f"level {kind.layer} gains {gain:.3f} dB for {size:,} bytes on {len(views)} views: "
-            f"{gain * 1e6 / size:.2f} dB per MB, expected at least {min_gain:,g}"
-        )
-        left_out.append(LeftOut(kind.name, why, kind, deformation))
-        scene, present = rest, remaining
-    return scene, left_out
-
-
-def _highest_psnr(
-    scene: Scene, views: Sequence[View], options: EncodeOptions, step: Callable[[], None]
-) -> tuple[int, float]:
-    """Returns the highest level of the scene once it is quantised and planned, and its mPSNR over the views, dB."""
-    packed = plan(scene, replace(options, layers="auto", omit="nothing")).symbols.scene()
-    return packed.level, level_psnr(from_scene(packed), packed.level, views, step)
 
 
 # -- the order of anchors in a sliced file -----------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""Packs a scene into a `.pd4` file: leaves out layers of too little gain, fits target sizes, encodes the rest."""
+"""Packs a scene into a `.pd4` file: fits target sizes, orders slices, encodes the rest."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from pd4dgs_codec.format.encoder import Report, encode_with_report, with_metadat
 from pd4dgs_codec.format.metadata import Metadata
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.plan import LeftOut, plan
-from pd4dgs_codec.quality import ENCODE_MIN_DB_PER_MEGABYTE
 from pd4dgs_codec.quality.frames import own_frames
 from pd4dgs_codec.scene import Camera, Scene
 
@@ -33,7 +32,7 @@ Progress = Callable[[str], AbstractContextManager[Callable[[], None]]]
 @dataclass(frozen=True)
 class Views:
     """The views that packing uses. source: their dataset, for the report. fitting: for target sizes and the order of
-    slices. held_out: for mPSNR, such as the gain of layers, which would be too high on the views of the fit."""
+    slices. held_out: for the mPSNR that is reported, and decide nothing."""
 
     source: str
     fitting: Sequence[View]
@@ -79,21 +78,18 @@ def pack(
     *,
     target_sizes: Mapping[int, int] | None = None,
     views: Views | None = None,
-    min_gain: float = ENCODE_MIN_DB_PER_MEGABYTE,
     downscale: int = 1,
     metadata: Metadata | None = None,
     progress: Progress = lambda _: nullcontext(lambda: None),
 ) -> Packed:
     """Packs a scene or a trained model into a file.
 
-    target_sizes: the most bytes that each layer may add to the file, by layer. views: for target sizes, the order of
-    slices and the gain of layers. Without views the pictures are of the file's own camera, 1/downscale as wide and
-    high, and layers are kept whatever their gain. min_gain: dB of mPSNR per megabyte below which a layer is left out,
-    if options.layers is "auto"; 0 keeps all. metadata: stored in the file. With options.slices anchors are ordered by
-    the pictures' gain per byte, and without target sizes some pass to later layers, see `measure.in_order`. Without
-    views or a camera the largest anchors come first.
+    target_sizes: the most bytes that each layer may add to the file, by layer. views: for target sizes and the order
+    of slices. Without views the pictures are of the file's own camera, 1/downscale as wide and high. metadata: stored
+    in the file. With options.slices anchors are ordered by the pictures' gain per byte, and without target sizes some
+    pass to later layers, see `measure.in_order`. Without views or a camera the largest anchors come first.
 
-    Only views, target sizes and slices need torch. Raises EncodeError, RenderError for target sizes without a camera.
+    Only target sizes and slices need torch. Raises EncodeError, RenderError for target sizes without a camera.
     """
     if not isinstance(source, Scene):
         from pd4dgs_codec.model.model import to_scene
@@ -101,18 +97,10 @@ def pack(
         source = to_scene(source)
     scene, options = options.apply_scale(source)
     pictures = _Pictures(views, downscale, progress)
-    left_out: list[LeftOut] = []
-    if pictures.held_out and options.layers == "auto" and min_gain:
-        from pd4dgs_codec.quality.measure import leave_out_low_gain
-
-        with progress("measuring layers") as step:
-            scene, left_out = leave_out_low_gain(
-                scene, pictures.held_out, min_gain=min_gain, options=options, step=step
-            )
-    if not target_sizes:
-        data, report, slices = pictures.write(scene, options, left_out, metadata, passing=True)
-        return Packed(data, scene, report, None, slices)
-    return pictures.fit(scene, options, target_sizes, left_out, metadata)
+    if target_sizes:
+        return pictures.fit(scene, options, target_sizes, metadata)
+    data, report, slices = pictures.write(scene, options, [], metadata, passing=True)
+    return Packed(data, scene, report, None, slices)
 
 
 @dataclass(frozen=True)
@@ -142,7 +130,6 @@ class _Pictures:
         scene: Scene,
         options: EncodeOptions,
         target_sizes: Mapping[int, int],
-        left_out: list[LeftOut],
         metadata: Metadata | None,
     ) -> Packed:
         """Returns the file whose layers meet the sizes."""
@@ -150,7 +137,7 @@ class _Pictures:
         from pd4dgs_codec.quality.target import Fitter
 
         planned = plan(scene, options)
-        scene, left_out = planned.scene, left_out + planned.left_out
+        scene, left_out = planned.scene, planned.left_out
         viewpoints = self.viewpoints(scene)
         with self.progress("fitting sizes") as step:
             loss = RenderedLoss(scene, viewpoints, step)

@@ -6,15 +6,11 @@ import numpy as np
 import pytest
 
 from pd4dgs_codec.data.view import View
-from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.model import sensitivity
-from pd4dgs_codec.model.model import from_scene
-from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.quality import packing, target
 from pd4dgs_codec.quality.frames import own_frames
-from pd4dgs_codec.quality.image import to_uint8
-from pd4dgs_codec.quality.measure import RenderedLoss, leave_out_low_gain, true_psnr
+from pd4dgs_codec.quality.measure import RenderedLoss, true_psnr
 
 #: Fitting the priors of mode ans takes ten times as long.
 FAST = ("--mode", "lzma", "--effort", 1, "--json", "-f")
@@ -43,31 +39,6 @@ def test_a_target_is_met_and_its_loss_is_reported(cli, model_pt, tmp_path):
     assert row["bytes"] == first_layer(cli, output) and row["target"] == most
     assert target["cameras"] == "the file's own camera" and [level["level"] for level in target["levels"]] == [0, 1, 2]
     assert all(10 < level["error_psnr"] < 100 for level in target["levels"])
-
-
-def test_layers_with_too_little_gain_are_left_out_with_their_figures(cli, model_pt, shared_dataset, tmp_path):
-    judged = ("encode", model_pt, "-o", tmp_path / "s.pd4", "--data", shared_dataset, "--holdout", 3, *FAST)
-    costly = cli(*judged, "--min-gain", 1e5).json
-    assert [row["layer"] for row in costly["layers"]] == [0]
-    assert costly["layers"][0]["anchors"] == 60, "the anchors of layers left out stay"
-    gone = {row["what"]: row for row in costly["left_out"]}
-    for layer, what in ((1, "global_deformation"), (2, "local_deformation")):
-        assert (
-            f"level {layer} gains" in gone[what]["why"] and "dB per MB, expected at least 100,000" in gone[what]["why"]
-        )
-        assert f"for {gone[what]['bytes']:,} bytes on 2 views" in gone[what]["why"]
-    kept = cli(*judged, "--min-gain", 0).json
-    assert [row["layer"] for row in kept["layers"]] == [0, 1, 2]
-
-
-def test_a_layer_that_explains_the_pictures_is_kept(scene):
-    camera, model = scene.info.camera, from_scene(plan(scene).symbols.scene())
-    views = []
-    for time in (0.2, 0.9):
-        picture = render_image(model, 1, time, camera)
-        views.append(View(camera.viewmat, camera.K, camera.width, camera.height, time, to_uint8(picture), None, "", 0))
-    kept, (gone,) = leave_out_low_gain(scene, views, min_gain=0.5, options=EncodeOptions(mode="lzma", effort=1))
-    assert gone.what == "local_deformation" and kept.global_deformation is not None
 
 
 def test_a_picture_that_equals_its_image_does_not_decide_a_mean(scene, monkeypatch):

@@ -90,7 +90,7 @@ def test_slices_meet_target_sizes_even_if_they_take_more_than_measured(scene, mo
 def test_views_held_out_are_scored_after_each_slice(scene):
     picture = np.full((16, 24, 3), 90, np.uint8)
     view = View(CAMERA.viewmat, CAMERA.K, 24, 16, 0.5, picture, None, "one", 0)
-    packed = pack(scene, SLICED, views=Views("made up", (view,), (view,)), min_gain=0)
+    packed = pack(scene, SLICED, views=Views("made up", (view,), (view,)))
     slices = sum(len(row["slices"]) for row in info(packed.data)["layers"])
     assert slices > 3 and len(packed.slices["psnr"]) == slices
     np.testing.assert_allclose(metadata_of(packed.data).slices, packed.slices["psnr"], rtol=1e-6)
