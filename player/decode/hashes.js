@@ -3,7 +3,7 @@
 import { hex, sha256 } from "./digests.js";
 import { channelCount } from "./header.js";
 import { readAll } from "./reader.js";
-import { mortonOrder } from "./slices.js";
+import { mortonOrder } from "./voxels.js";
 /** @import { LayerSymbols } from "./layer.js" */
 /** @import { Scene } from "./scene.js" */
 

@@ -1,13 +1,18 @@
-// Clauses 6.4, 11 and 12.1: one slice's payload to symbols, and symbols to float32 values.
+// Clauses 6.4, 8.5, 11 and 12.1: one slice's payload to symbols, and symbols to float32 values.
 
-import { decodeAttributes } from "./attributes.js";
-import { decodeChannels } from "./channels.js";
+import { ByteReader } from "./bytes.js";
+import { channelsOf, decodeChannels, decodeSplit, groupByClass } from "./channels.js";
 import { malformed } from "./errors.js";
+import { channelCount } from "./header.js";
 import { MAX_SYMBOL } from "./limits.js";
 import { readParameters } from "./parameters.js";
 import { decodePlanes } from "./planes.js";
 import { decodePositions } from "./positions.js";
+/** @import { Prior } from "./channels.js" */
 /** @import { Declared, LayerKind, NetworkShape, Parameters } from "./parameters.js" */
+
+/** What later slices of a layer may refer to (8): the priors of each section, in their order.
+ * @typedef {Record<"positions" | "masks" | "attributes", Prior[]>} Continuation */
 
 /**
  * The symbols of a slice with n rows of its own.
@@ -24,6 +29,7 @@ import { decodePositions } from "./positions.js";
  * @property {Int32Array[]} weights weight, bias, weight, bias and so on, network by network
  */
 
+const STEP_CLASSES = 7;
 const LEAST_OWN_CODE = 3;
 export const MOST_CODE = 255;
 
@@ -32,7 +38,7 @@ export const MOST_CODE = 255;
  *
  * @param {Uint8Array} payload @param {LayerKind} kind
  * @param {Declared} before by the slices before
- * @param {import("./slices.js").Continuation} continuation what the slices of the layer before left
+ * @param {Continuation} continuation what the slices of the layer before left
  * @param {boolean} later whether there are such
  * @returns {LayerSymbols}
  */
@@ -60,6 +66,37 @@ export function decodeLayer(payload, kind, before, continuation, later) {
     planes: planes ? decodePlanes(planes, scales.flat()) : [],
     weights: weights ? decodeWeights(weights, networks) : [],
   };
+}
+
+/**
+ * @param {Uint8Array} bytes the section @param {number} rows at least 1
+ * @param {LayerKind} kind
+ * @param {Prior[]} known see decodeChannels
+ * @returns {{stepClasses: Int32Array, attributes: Int32Array}} [rows], empty without step classes; [D + 6 + 3·G, rows]
+ */
+function decodeAttributes(bytes, rows, kind, known) {
+  const count = channelCount(kind.widths);
+  if (!kind.stepClasses) {
+    const attributes = decodeChannels(bytes, new Array(count).fill(rows), known);
+    return { stepClasses: new Int32Array(0), attributes };
+  }
+  const attributes = new Int32Array(count * rows);
+  const reader = new ByteReader(bytes);
+  const stepClasses = readStepClasses(reader, rows);
+  const groups = groupByClass(stepClasses, STEP_CLASSES);
+  const channels = channelsOf(attributes, count);
+  decodeSplit(reader.rest(), channels, channels.map(() => groups), known);
+  return { stepClasses, attributes };
+}
+
+/** The step class of each row. Later slices do not use its priors. @param {ByteReader} reader @param {number} rows */
+function readStepClasses(reader, rows) {
+  const length = reader.varint(reader.remaining, "the length of the step classes");
+  const classes = decodeChannels(reader.take(length, "the end of the step classes"), [rows]);
+  for (const c of classes) {
+    if (c < 0 || c >= STEP_CLASSES) throw malformed(`a step class of ${c}, expected 0..${STEP_CLASSES - 1}`);
+  }
+  return classes;
 }
 
 /** @param {Uint8Array} bytes @param {NetworkShape[]} networks */

@@ -1,7 +1,7 @@
 // Clauses 8.6, 8.7 and 11.3: the planes section, and samples from its residuals.
 
 import { ByteReader } from "./bytes.js";
-import { channelsOf, decodeSplit, groupByClass } from "./classes.js";
+import { channelsOf, decodeSplit, groupByClass } from "./channels.js";
 import { malformed } from "./errors.js";
 import { MAX_SYMBOL } from "./limits.js";
 /** @import { PlaneShape } from "./parameters.js" */

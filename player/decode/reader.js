@@ -6,13 +6,11 @@ import { DecodeError, limitExceeded, malformed, unsupported } from "./errors.js"
 import { LAYER_TYPES, readHeader } from "./header.js";
 import { MOST_CODE, decodeLayer, dequantise, transposed } from "./layer.js";
 import { layerKind } from "./parameters.js";
-import { mortonOrder } from "./slices.js";
-import { VoxelTable } from "./voxels.js";
+import { VoxelTable, mortonOrder } from "./voxels.js";
 /** @import { Header } from "./header.js" */
-/** @import { LayerSymbols } from "./layer.js" */
+/** @import { Continuation, LayerSymbols } from "./layer.js" */
 /** @import { Declared, NetworkShape, PlaneShape } from "./parameters.js" */
 /** @import { Deformation, Network, Scale, Scene, Steps } from "./scene.js" */
-/** @import { Continuation } from "./slices.js" */
 
 /**
  * Reads a whole file, or its layers up to maxLayer; of a cut file, if allowPartial, the slices that are there, at least

@@ -1,4 +1,4 @@
-// Clause 12.1: a hash table of voxels that hold an anchor.
+// Clauses 10.1, 12.1 and 12.2: the order of voxels, and a hash table of those that hold an anchor.
 
 /** Random, so that no file can be made whose voxels all collide. */
 const SEEDS = Int32Array.from({ length: 3 }, () => (Math.random() * 2 ** 32) | 1);
@@ -48,4 +48,33 @@ export class VoxelTable {
       this._slots[this._slot(x, y, z)] = i;
     }
   }
+}
+
+/** Whether the highest bit of a is lower than that of b, both below 2^31. @param {number} a @param {number} b */
+const isLower = (a, b) => a < b && a < (a ^ b);
+
+/**
+ * The rows in the order of the codes (10.1) of their voxels.
+ *
+ * @param {Int32Array} voxels [n, 3]
+ * @returns {Uint32Array} [n]
+ */
+export function mortonOrder(voxels) {
+  const n = voxels.length / 3;
+  const least = [Infinity, Infinity, Infinity];
+  for (let i = 0; i < voxels.length; i++) if (voxels[i] < least[i % 3]) least[i % 3] = voxels[i];
+  const offsets = voxels.map((v, i) => v - least[i % 3]);
+  return Uint32Array.from({ length: n }, (_, i) => i).sort((a, b) => {
+    // Codes differ first in the highest bit in which a coordinate does; of equally high ones, z's is the highest.
+    let axis = 2;
+    let highest = offsets[3 * a + 2] ^ offsets[3 * b + 2];
+    for (let k = 1; k >= 0; k--) {
+      const difference = offsets[3 * a + k] ^ offsets[3 * b + k];
+      if (isLower(highest, difference)) {
+        axis = k;
+        highest = difference;
+      }
+    }
+    return offsets[3 * a + axis] - offsets[3 * b + axis];
+  });
 }
