@@ -26,9 +26,9 @@ export function asInteger(value, least, limit, where) {
  * @param {Value | undefined} value @param {number} count @param {string} where
  */
 export function asRegistered(value, count, where) {
-  if (typeof value !== "number") throw malformed(`${where}: ${nameOf(value)}, expected an integer`);
-  if (value < 0 || value >= count) throw unsupported(`${where}: ${value}, expected 0..${count - 1}`);
-  return value;
+  const number = asInteger(value, -Infinity, Infinity, where);
+  if (number < 0 || number >= count) throw unsupported(`${where}: ${number}, expected 0..${count - 1}`);
+  return number;
 }
 
 /**
@@ -51,11 +51,10 @@ function asReal(value, where) {
   return value.value;
 }
 
-/** Bytes, so many of them. @param {Value | undefined} value @param {number} size @param {string} where */
-export function asBytes(value, size, where) {
+/** Raises if these are not `size` bytes. @param {Value | undefined} value @param {number} size @param {string} where */
+export function checkBytes(value, size, where) {
   if (!(value instanceof Uint8Array)) throw malformed(`${where}: ${nameOf(value)}, expected bytes`);
   if (value.length !== size) throw malformed(`${where}: ${value.length} bytes, expected ${size}`);
-  return value;
 }
 
 /** @param {number} step @param {string} where */

@@ -2,7 +2,7 @@
 
 import { sceneIdOf } from "./container.js";
 import { malformed, unsupported } from "./errors.js";
-import { Fields, asBytes, asInteger, asList, asRegistered, checkStep } from "./fields.js";
+import { Fields, asInteger, asList, asRegistered, checkBytes, checkStep } from "./fields.js";
 import { MAX_CHUNKS, MAX_FEATURE, MAX_PAYLOAD, MAX_SLOTS, MAX_SYMBOL } from "./limits.js";
 import { unpack } from "./msgpack.js";
 /** @import { Value } from "./msgpack.js" */
@@ -62,7 +62,7 @@ export function readHeader(bytes) {
   if (unit < 0) throw malformed(`header: unit ${unit}, expected 0 or more`);
   const camera = fields.has(12) ? readCamera(fields.get(12)) : null;
   const bounds = readBounds(fields.get(13));
-  asBytes(fields.get(14), DIGEST_SIZE, "header: digest"); // of all layers, so that a decoder of some cannot check it
+  checkBytes(fields.get(14), DIGEST_SIZE, "header: digest"); // of all layers, so that a decoder of some cannot check it
   const [width, count, views] = asList(fields.get(15), "header: widths", 3);
   const widths = {
     feature: asInteger(width, 1, MAX_FEATURE, "header: feature width"),

@@ -83,10 +83,8 @@ export function readParameters(payload, kind, before, later) {
   const planes = scales.flat();
   const sections = cutSections(payload, 4 + length, lengths, where);
   const cells = planes.reduce((sum, { channels, height, width }) => sum + channels * height * width, 0);
-  const weights = networks.reduce(
-    (sum, { layers }) => layers.reduce((all, { inputs, outputs }) => all + (inputs + 1) * outputs, sum),
-    0,
-  );
+  const linears = networks.flatMap(({ layers }) => layers);
+  const weights = linears.reduce((sum, { inputs, outputs }) => sum + (inputs + 1) * outputs, 0);
   const perRow = channelCount(kind.widths) + (kind.stepClasses ? 1 : 0);
   if (cells > MAX_PLANE_CELLS) throw limitExceeded(`${where}: ${cells} plane cells, limit ${MAX_PLANE_CELLS}`);
   const declared = {

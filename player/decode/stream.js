@@ -90,7 +90,11 @@ export class Stream {
     try {
       return this._reader.next(this._buffer.subarray(this._start, this._filled)) !== null;
     } finally {
-      this._drop(this._reader.offset - before);
+      this._start += this._reader.offset - before;
+      if (this._start === this._filled) {
+        this._start = this._filled = 0;
+        this._buffer = new Uint8Array(0);
+      }
     }
   }
 
@@ -110,14 +114,5 @@ export class Stream {
     }
     this._buffer.set(bytes, this._filled);
     this._filled += bytes.length;
-  }
-
-  /** Forgets the first `count` bytes. @param {number} count */
-  _drop(count) {
-    this._start += count;
-    if (this._start === this._filled) {
-      this._start = this._filled = 0;
-      this._buffer = new Uint8Array(0);
-    }
   }
 }
