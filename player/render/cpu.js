@@ -13,9 +13,9 @@ import { WORKERS } from "./workers.js";
  * @typedef {{count: number, data: Float32Array, width: number, height: number}} Packed
  */
 
-export class CpuEvaluator {
+export class CpuEvaluator extends Remote {
   constructor() {
-    this._remote = new Remote(WORKERS.evaluate);
+    super(WORKERS.evaluate);
     /** What the worker has. @type {Scene | null} */
     this._scene = null;
   }
@@ -24,10 +24,6 @@ export class CpuEvaluator {
   evaluate({ scene, level, t, eye }) {
     const next = scene === this._scene ? null : scene;
     this._scene = scene;
-    return this._remote.call("evaluate", [level, t, eye, next]);
-  }
-
-  close() {
-    this._remote.close();
+    return this.call("evaluate", [level, t, eye, next]);
   }
 }

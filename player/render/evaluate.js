@@ -2,9 +2,9 @@
 // machines whose GPU is missing or slow, and the reference of the evaluator on the GPU.
 
 import { Column } from "../decode/columns.js";
-import { anchorColumns, columnsOf, headsOf } from "../decode/heads.js";
+import { anchorColumns } from "../decode/heads.js";
 import { Arena } from "./kernel.js";
-import { cellsOf, deformationUnit, eachAttribute, GAUSSIAN_COLUMNS as COLUMNS, levelOf } from "./level.js";
+import { cellsOf, eachAttribute, GAUSSIAN_COLUMNS as COLUMNS, headsIn, levelOf } from "./level.js";
 import { MIN_OPACITY, SPATIAL, sliceAt } from "./level.js";
 /** @import { Deformation, Network, Scale, Scene } from "../decode/scene.js" */
 
@@ -119,17 +119,11 @@ class Field {
     this._channels = deformation.planes[0].xy.channels;
     this._width = this._channels * this._spatial.length;
     this._features = arena.take(BATCH * this._width);
-    const { networks } = deformation;
-    this._trunk = new Chain(arena, networks.trunk, true);
-    const unit = deformationUnit(scene);
+    this._trunk = new Chain(arena, deformation.networks.trunk, true);
     this._stride = anchorColumns(scene.widths);
-    this._heads = headsOf(scene.widths)
-      .filter(({ name }) => networks[name])
-      .map((head) => ({
-        chain: new Chain(arena, networks[head.name]),
-        columns: Int32Array.from(columnsOf(head)),
-        unit: head.length ? unit : 1,
-      }));
+    this._heads = headsIn(deformation, scene).map(({ network, columns, unit }) => {
+      return { chain: new Chain(arena, network), columns: Int32Array.from(columns), unit };
+    });
   }
 
   /** @param {number} t 0..1 */

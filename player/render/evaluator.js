@@ -44,7 +44,7 @@ class Scaffold {
   constructor(gpu, network, features, firstBlock) {
     if (network.length !== 2) throw new TooLarge(`a network of ${network.length} layers, expected 2`);
     const [first, last] = network;
-    this.features = inputsOf(first, features);
+    this.first = first;
     this.firstBlock = firstBlock;
     this.blocks = blocksOf(first.outputs);
     /** Inputs that are the view direction: 3 or 0. */
@@ -73,23 +73,19 @@ class Scaffold {
   }
 }
 
-/** The layer for the first of its inputs. @param {Network[number]} layer @param {number} count */
-function inputsOf({ weight, bias, inputs, outputs }, count) {
-  const out = new Float32Array(outputs * count);
-  for (let o = 0; o < outputs; o++) out.set(weight.subarray(o * inputs, o * inputs + count), o * count);
-  return { weight: out, bias, inputs: count, outputs };
-}
-
-/** Layers of the same inputs as one, each padded to whole blocks. @param {Network[number][]} layers */
-function stack(layers) {
+/** Layers, for the first of their inputs, as one; each is padded to whole blocks.
+ * @param {Network[number][]} layers @param {number} inputs how many */
+function stack(layers, inputs) {
   const outputs = layers.reduce((sum, layer) => sum + 4 * blocksOf(layer.outputs), 0);
-  const { inputs } = layers[0];
   const weight = new Float32Array(inputs * outputs);
   const bias = new Float32Array(outputs);
   let at = 0;
   for (const layer of layers) {
-    weight.set(layer.weight, at * inputs);
     bias.set(layer.bias, at);
+    for (let o = 0; o < layer.outputs; o++) {
+      const from = o * layer.inputs;
+      weight.set(layer.weight.subarray(from, from + inputs), (at + o) * inputs);
+    }
     at += 4 * blocksOf(layer.outputs);
   }
   return { weight, bias, inputs, outputs };
@@ -133,7 +129,7 @@ export class GpuEvaluator {
     this._covariance = scaffold(covariance);
     this._color = scaffold(color);
     const scaffolds = [this._opacity, this._covariance, this._color];
-    this._first = new Linear(gpu, stack(scaffolds.map(({ features }) => features)));
+    this._first = new Linear(gpu, stack(scaffolds.map(({ first }) => first), feature));
     if (this._first.paddedBlocks > gpu.maxLayers) throw new TooLarge("the networks' first layers");
     const tables = levelOf(scene, 2).motion ? 3 : 1; // anchors, residuals, and anchors without those at the key instant
     const blocks = this._blocks * tables + this._first.paddedBlocks + blocksOf(slots);
@@ -264,7 +260,7 @@ void main() {
     let gaussiansMoved = anchorsMoved;
     if (anchorsMoved || (eyeMoved && this._opacity.views)) {
       this._runOpacities(eye, lines);
-      const opacities = await gpu.read(this._opacities, 0, blocksOf(this._slots), lines);
+      const opacities = await gpu.read(this._opacities, blocksOf(this._slots), lines);
       const previous = anchorsMoved ? null : this._listed;
       const list = await lister(opacities, this._slots, lines * this._width, previous);
       if (list) this._setList(list);
@@ -273,7 +269,7 @@ void main() {
     if (gaussiansMoved) this._shape = {};
     const splats = this._runShapes(eye, into);
     this._held = { level: number, t, eye };
-    return { splats, means: gaussiansMoved ? await gpu.read(splats.field, 0, 1, this._listed.rows) : null };
+    return { splats, means: gaussiansMoved ? await gpu.read(splats.field, 1, this._listed.rows) : null };
   }
 
   /** First layers. @param {number} lines */
@@ -451,4 +447,3 @@ ${repeat(L, (k) => `w += w4[${k}] * c${k};`)}
     this._gpu.free(...[this._opacity, this._covariance, this._color].map(({ direction }) => direction));
   }
 }
-

@@ -1,10 +1,28 @@
 // A deformation on the GPU: planes, trunk and heads at points that lie in a texture.
 
-import { anchorColumns, columnsOf, headsOf } from "../decode/heads.js";
+import { anchorColumns } from "../decode/heads.js";
 import { blocksOf, Linear, repeat, targets, TooLarge } from "./layers.js";
-import { cellsOf, deformationUnit, sliceAt, SPATIAL } from "./level.js";
+import { cellsOf, headsIn, sliceAt, SPATIAL } from "./level.js";
 /** @import { Deformation, Network, Scale, Scene } from "../decode/scene.js" */
 /** @import { Field, Gpu } from "./gl.js" */
+
+/** Source of the functions that sample planes. */
+const SAMPLER = `uniform sampler2DArray points, planes, rows;
+uniform vec3 low, high, cells;
+uniform int firstRow, shift, block;
+vec3 place(vec3 p) {
+  vec3 u = (p - low) / (high - low);
+  return vec3(p.x > low.x ? p.x >= high.x ? 1. : u.x : 0., p.y > low.y ? p.y >= high.y ? 1. : u.y : 0.,
+    p.z > low.z ? p.z >= high.z ? 1. : u.z : 0.);
+}
+vec4 plane(int z, ivec2 a, ivec2 b, vec2 f) {
+  return mix(mix(texelFetch(planes, ivec3(a, z), 0), texelFetch(planes, ivec3(b.x, a.y, z), 0), f.x),
+    mix(texelFetch(planes, ivec3(a.x, b.y, z), 0), texelFetch(planes, ivec3(b, z), 0), f.x), f.y);
+}
+vec4 row(int y, int a, int b, float f, int z) {
+  return mix(texelFetch(rows, ivec3(a, y, z), 0), texelFetch(rows, ivec3(b, y, z), 0), f);
+}
+`;
 
 export class FieldPass {
   /** @param {Gpu} gpu @param {Deformation} deformation @param {Scene} scene */
@@ -18,7 +36,7 @@ export class FieldPass {
     const { trunk } = deformation.networks;
     // a scale's channels are padded to whole blocks; so are the columns that take them
     const first = padInputs(trunk[0], channels, this._scales);
-    const layers = [first, ...trunk.slice(1), joinHeads(deformation.networks, scene)];
+    const layers = [first, ...trunk.slice(1), joinHeads(deformation, scene)];
     this._linears = layers.map((layer) => new Linear(gpu, layer));
     this._scratchBlocks = Math.max(
       this._scales * this._channelBlocks,
@@ -95,7 +113,7 @@ export class FieldPass {
     const some = Math.min(B, gpu.maxTargets);
     const program = gpu.program(
       targets(some) +
-        this._sampler() +
+        SAMPLER +
         `void main() {
 vec3 u = place(texelFetch(points, ivec3(gl_FragCoord.xy, 0) + ivec3(0, shift, 0), 0).xyz);
 ${this._sample(some)}
@@ -129,26 +147,6 @@ ${repeat(some, (i) => `out${i} = h${i};`)}}`,
     if (had && had.width === width && had.height >= rows) return had;
     this._gpu.free(had);
     return (this._scratch[i] = this._gpu.field(width, rows, this._scratchBlocks));
-  }
-
-  /** Source of the functions that sample planes. */
-  _sampler() {
-    return `uniform sampler2DArray points, planes, rows;
-uniform vec3 low, high, cells;
-uniform int firstRow, shift, block;
-vec3 place(vec3 p) {
-  vec3 u = (p - low) / (high - low);
-  return vec3(p.x > low.x ? p.x >= high.x ? 1. : u.x : 0., p.y > low.y ? p.y >= high.y ? 1. : u.y : 0.,
-    p.z > low.z ? p.z >= high.z ? 1. : u.z : 0.);
-}
-vec4 plane(int z, ivec2 a, ivec2 b, vec2 f) {
-  return mix(mix(texelFetch(planes, ivec3(a, z), 0), texelFetch(planes, ivec3(b.x, a.y, z), 0), f.x),
-    mix(texelFetch(planes, ivec3(a.x, b.y, z), 0), texelFetch(planes, ivec3(b, z), 0), f.x), f.y);
-}
-vec4 row(int y, int a, int b, float f, int z) {
-  return mix(texelFetch(rows, ivec3(a, y, z), 0), texelFetch(rows, ivec3(b, y, z), 0), f);
-}
-`;
   }
 
   /** Source that samples the planes of a scale at u. @param {number} blocks of channels, from `block` on */
@@ -217,23 +215,20 @@ function padInputs(layer, channels, scales) {
 /**
  * All heads as one layer, whose outputs are the columns of an anchor's record.
  *
- * @param {Record<string, Network>} networks @param {Scene} scene
+ * @param {Deformation} deformation @param {Scene} scene
  * @returns {Network[number]}
  */
-function joinHeads(networks, scene) {
-  const present = headsOf(scene.widths).filter(({ name }) => networks[name]);
+function joinHeads(deformation, scene) {
+  const heads = headsIn(deformation, scene);
   const outputs = anchorColumns(scene.widths);
-  const unit = deformationUnit(scene);
-  const { inputs } = networks[present[0].name][0];
+  const { inputs } = heads[0].network[0];
   const weight = new Float32Array(inputs * outputs);
   const bias = new Float32Array(outputs);
-  for (const head of present) {
-    const [layer, second] = networks[head.name];
+  for (const { network: [layer, second], columns, unit } of heads) {
     if (second) throw new TooLarge("a head of several layers");
-    const factor = head.length ? unit : 1;
-    columnsOf(head).forEach((to, o) => {
-      bias[to] = factor * layer.bias[o];
-      for (let i = 0; i < inputs; i++) weight[to * inputs + i] = factor * layer.weight[o * inputs + i];
+    columns.forEach((to, o) => {
+      bias[to] = unit * layer.bias[o];
+      for (let i = 0; i < inputs; i++) weight[to * inputs + i] = unit * layer.weight[o * inputs + i];
     });
   }
   return { weight, bias, inputs, outputs };

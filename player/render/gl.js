@@ -244,19 +244,19 @@ export class Gpu {
   }
 
   /**
-   * The first `rows` rows of blocks of a field, [count, rows, width, 4], once the GPU has them.
+   * The first `rows` rows of the first `count` blocks of a field, [count, rows, width, 4], once the GPU has them.
    *
-   * @param {Field} field @param {number} first @param {number} count @param {number} rows
+   * @param {Field} field @param {number} count @param {number} rows
    * @returns {Promise<Float32Array>}
    */
-  async read(field, first, count, rows) {
+  async read(field, count, rows) {
     const { gl } = this;
     const floats = 4 * field.width * rows;
     const buffer = gl.createBuffer();
     gl.bindBuffer(gl.PIXEL_PACK_BUFFER, buffer);
     gl.bufferData(gl.PIXEL_PACK_BUFFER, 4 * floats * count, gl.STREAM_READ);
     for (let i = 0; i < count; i++) {
-      this.bindTarget(field, first + i, 1);
+      this.bindTarget(field, i, 1);
       gl.readPixels(0, 0, field.width, rows, gl.RGBA, gl.FLOAT, 4 * floats * i);
     }
     gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);

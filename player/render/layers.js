@@ -19,12 +19,12 @@ export class Linear {
   constructor(gpu, layer) {
     this._gpu = gpu;
     this.inputBlocks = blocksOf(layer.inputs);
-    this.outputBlocks = blocksOf(layer.outputs);
+    const blocks = blocksOf(layer.outputs);
     const fitting = Math.floor(gpu.maxUniformBytes / (this.inputBlocks * MATRIX_BYTES + VECTOR_BYTES));
     const most = Math.min(gpu.maxTargets, fitting, Math.max(1, Math.floor(MAX_MATRICES / this.inputBlocks)));
     if (most < 1 || this.inputBlocks > MAX_MATRICES) throw new TooLarge(`a network of ${layer.inputs} inputs`);
-    this.chunks = Math.ceil(this.outputBlocks / most);
-    this.chunkBlocks = Math.ceil(this.outputBlocks / this.chunks);
+    this.chunks = Math.ceil(blocks / most);
+    this.chunkBlocks = Math.ceil(blocks / this.chunks);
     this._bytes = this.chunkBlocks * (VECTOR_BYTES + this.inputBlocks * MATRIX_BYTES);
     this._stride = Math.ceil(this._bytes / gpu.uniformAlignment) * gpu.uniformAlignment;
     const data = new Float32Array((this._stride * this.chunks) / 4);

@@ -42,6 +42,16 @@ export function deformationUnit({ info: { box } }) {
   return 0.25 * Math.max(...[0, 1, 2].map((k) => box[1][k] - box[0][k]));
 }
 
+/** The heads that a deformation has, with the columns of an anchor's record that they add to, and the unit of their
+ * outputs. @param {Deformation} deformation @param {Scene} scene */
+export function headsIn({ networks }, scene) {
+  const unit = deformationUnit(scene);
+  const heads = headsOf(scene.widths).filter(({ name }) => networks[name]);
+  return heads.map((head) => {
+    return { network: networks[head.name], columns: columnsOf(head), unit: head.length ? unit : 1 };
+  });
+}
+
 /**
  * Calls `put` for each attribute of the anchors.
  *
@@ -103,7 +113,9 @@ const EYE_TOLERANCE = 1e-5;
  */
 export function stateOf(scene, level, seconds, eye) {
   const { number, motion } = levelOf(scene, level);
-  return { scene, level: number, t: motion ? normalisedTime(scene.info, seconds) : 0, eye };
+  const [start, end] = scene.info.timeRange;
+  const t = (seconds - start) / (end - start); // clause 13.1; no number where the range is empty
+  return { scene, level: number, t: motion && t > 0 ? Math.min(t, 1) : 0, eye };
 }
 
 /** @param {State} a @param {State} b */
@@ -111,10 +123,4 @@ export function sameState(a, b) {
   const tolerance = EYE_TOLERANCE * deformationUnit(a.scene);
   const eyes = () => [0, 1, 2].every((k) => Math.abs(a.eye[k] - b.eye[k]) <= tolerance);
   return a.scene === b.scene && a.level === b.level && a.t === b.t && eyes();
-}
-
-/** Normalised time of `seconds` (clause 13.1). @param {Scene["info"]} info @param {number} seconds */
-function normalisedTime({ timeRange: [start, end] }, seconds) {
-  const t = (seconds - start) / (end - start);
-  return t > 0 ? Math.min(t, 1) : 0; // also where the range is empty
 }

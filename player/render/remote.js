@@ -75,8 +75,7 @@ export function serve(functions) {
   addEventListener("message", async ({ data: { call, name, args } }) => {
     try {
       const value = /** @type {any} */ (await functions[name](...args));
-      const transfers = value && typeof value === "object" && "transfer" in value;
-      tell({ call, result: transfers ? value.result : value }, transfers ? value.transfer : []);
+      tell({ call, result: value?.transfer ? value.result : value }, value?.transfer);
     } catch (error) {
       const { message, name: kind, ...rest } = /** @type {Error} */ (error);
       tell({ call, error: { ...rest, message: String(message), name: kind } });

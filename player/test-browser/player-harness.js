@@ -33,32 +33,31 @@ async function compare(url, cases, bandPoints) {
     ({ splats } = evaluated);
     const { entries, rows, width } = evaluator._listed;
     const n = rows * width;
-    const texels = n ? await gpu.read(splats.field, 0, 4, rows) : new Float32Array(0);
-    const { count, slot: slots, records } = evaluate(scene, level, t, eye);
-    /** @type {Map<number, number>} texels by their slot */
-    const at = new Map();
+    const texels = n ? await gpu.read(splats.field, 4, rows) : new Float32Array(0);
+    const { count, slot, records } = evaluate(scene, level, t, eye);
+    /** Records by their slot, of either evaluator. @type {Map<number, ArrayLike<number>>[]} */
+    const [plain, shaded] = [new Map(), new Map()];
+    slot.forEach((number, i) => plain.set(number, records.subarray(16 * i, 16 * i + 16)));
     entries.subarray(0, n).forEach((entry, i) => {
+      const record = Float32Array.from({ length: 16 }, (_, k) => texels[4 * ((k >> 2) * n + i) + (k & 3)]);
       const anchor = entry & (2 ** ANCHOR_BITS - 1);
-      if (entry !== NO_ENTRY) at.set(anchor * scene.widths.slots + (entry >>> ANCHOR_BITS), i);
+      if (entry !== NO_ENTRY) shaded.set(anchor * scene.widths.slots + (entry >>> ANCHOR_BITS), record);
     });
-    /** @param {number} i @param {number} g @param {number} k */
-    const difference = (i, g, k) => Math.abs(records[16 * i + k] - texels[4 * ((k >> 2) * n + g) + (k & 3)]);
     const worst = Object.entries(QUANTITIES).map(([name, columns]) => {
       let [size, most] = [1e-30, 0];
-      slots.forEach((slot, i) => {
-        const g = at.get(slot);
+      for (const [number, record] of plain) {
+        const other = shaded.get(number) ?? record;
         for (const k of columns) {
-          size = Math.max(size, Math.abs(records[16 * i + k]));
-          if (g !== undefined && !(difference(i, g, k) <= most)) most = difference(i, g, k);
+          size = Math.max(size, Math.abs(record[k]));
+          if (!(Math.abs(record[k] - other[k]) <= most)) most = Math.abs(record[k] - other[k]);
         }
-      });
+      }
       return [name, most / size];
     });
-    const clear = 1.01 / 255;
-    const known = new Set(slots);
     let lonely = 0;
-    slots.forEach((slot, i) => (lonely += Number(records[16 * i + 3] > clear && !at.has(slot))));
-    for (const [slot, g] of at) lonely += Number(texels[4 * g + 3] > clear && !known.has(slot));
+    for (const [own, others] of [[plain, shaded], [shaded, plain]]) {
+      for (const [number, record] of own) lonely += Number(record[3] > 1.01 / 255 && !others.has(number));
+    }
     out.push({ worst: Object.fromEntries(worst), lonely, count, moved: evaluated.means !== null });
   }
   const error = gl.getError();
