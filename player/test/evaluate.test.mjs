@@ -1,14 +1,15 @@
-// Drawing without a GPU: the evaluator's kernel in WebAssembly against plain JavaScript, lists, order, pace.
+// Drawing without a GPU: the evaluator's kernel in WebAssembly against plain JavaScript, lists, order, pace, cameras.
 
 import assert from "node:assert/strict";
-import { readFileSync } from "node:fs";
 import { test } from "node:test";
 
 import { decode } from "../decode/index.js";
+import { fitted } from "../render/camera.js";
 import { evaluate } from "../render/evaluate.js";
 import { Arena } from "../render/kernel.js";
 import { Pace, SCALES } from "../render/pace.js";
 import { DepthSort, listGaussians } from "../render/sort.js";
+import { readVector } from "../testing/vectors.mjs";
 
 /** Numbers in -1..1 that are the same in every run. @param {number} count */
 function numbers(count) {
@@ -61,7 +62,7 @@ test("a value that is no number stays none", () => {
 });
 
 test("both evaluate a scene alike, at every level", () => {
-  const scene = decode(readFileSync(new URL("../../spec/vectors/valid/layers-0-1-2.pd4", import.meta.url)));
+  const scene = decode(readVector("valid/layers-0-1-2"));
   for (const level of scene.layers) {
     const [fast, plain] = [true, false].map((wasm) => evaluate(scene, level, 0.4, [0, 0, -3], new Arena(wasm)));
     assert.ok(fast.count > 0);
@@ -73,7 +74,7 @@ test("both evaluate a scene alike, at every level", () => {
 
 for (const [name, key] of /** @type {[string, number][]} */ ([["least", 0], ["largest", 1]])) {
   test(`layer 1 changes nothing at its key instant, the ${name}`, () => {
-    const file = decode(readFileSync(new URL(`../../spec/vectors/uncommon/key-instant-${name}.pd4`, import.meta.url)));
+    const file = decode(readVector(`uncommon/key-instant-${name}`));
     const rows = file.rows.map(() => file.anchor.length / 3); // the levels have the same anchors
     const scene = { ...file, rows, mask: rows.map((count) => new Uint8Array(count).fill(255)) };
     for (const { data } of scene.globalDeformation?.planes.flatMap((planes) => Object.values(planes)) ?? []) {
@@ -140,3 +141,22 @@ test("the pace slows down where the machine is slow, and recovers", () => {
   assert.deepEqual([levels[0], levels[levels.length - 1]], [2, 2]);
   assert.ok(levels.includes(1) && levels.includes(0));
 });
+
+/** @param {number} width @param {number} height */
+const camera = (width, height) => ({
+  viewmat: new Float32Array(16), K: new Float32Array([500, 0, width / 2, 0, 500, height / 2, 0, 0, 1]), width, height,
+});
+
+for (const [name, capture, window, seen] of /** @type {[string, number[], number[], number[]][]} */ ([
+  ["a wide one shows all of a wide capture", [640, 360], [1200, 600], [720, 360]],
+  ["a squarer one shows all of it", [640, 360], [400, 300], [640, 480]],
+  ["an upright one shows nothing above and below a wide capture", [640, 360], [360, 720], [180, 360]],
+  ["an upright one shows nothing beside an upright capture", [360, 640], [500, 600], [360, 432]],
+  ["one of the capture's shape shows the capture", [360, 640], [180, 320], [360, 640]],
+])) {
+  test(`windows: ${name}`, () => {
+    const { K } = fitted(camera(capture[0], capture[1]), window[0], window[1]);
+    [0, 1].forEach((axis) => assert.ok(Math.abs((500 / K[4 * axis]) * window[axis] - seen[axis]) < 1e-3));
+    assert.deepEqual([K[2], K[5]], window.map((side) => side / 2));
+  });
+}

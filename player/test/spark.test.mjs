@@ -13,15 +13,12 @@ const BYTES = readVector("valid/layers-0-1-2");
 const ADDRESS = addressOf(BYTES);
 
 class Vector {
-  x = 0;
-  y = 0;
-  z = 0;
   applyMatrix4 = () => this;
 
   /** @param {ArrayLike<number>} array @param {number} at */
   fromArray(array, at) {
-    [this.x, this.y, this.z] = Array.from(array).slice(at, at + 3);
-    return Object.assign(this, { r: this.x, g: this.y, b: this.z });
+    const [x, y, z] = Array.from(array).slice(at, at + 3);
+    return Object.assign(this, { x, y, z, r: x, g: y, b: z });
   }
 
   /** @param {number} x @param {number} y @param {number} z @param {number} w */
@@ -29,9 +26,9 @@ class Vector {
     Object.assign(this, { x, y, z, w });
   }
 
-  setFromMatrixPosition({ eye = [0, 0, 0] }) {
-    [this.x, this.y, this.z] = eye;
-    return this;
+  /** @param {{eye: number[]}} matrix */
+  setFromMatrixPosition({ eye }) {
+    return this.fromArray(eye, 0);
   }
 
   /** @param {any[]} values */

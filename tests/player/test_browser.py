@@ -14,7 +14,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -711,18 +711,14 @@ def test_every_control_has_a_name_and_is_reached_by_key(page, server):
     assert status.endswith(" · no GPU: drawn by the CPU, with fewer pixels in motion")
 
 
-#: The headset of test-browser/headset.js: turn (radians to the left) and place (metres) of the head; of each eye its
-#: place (metres to the right) and the tangents of the sides of its picture.
-TURN, PLACE = 0.2, (0.1, 0.05, -0.3)
-EYES = ((-0.03, -0.7, 0.5, -0.4, 0.5), (0.03, -0.5, 0.7, -0.4, 0.5))
-
-
-def eye_camera(scene: Scene, eye: tuple[float, ...]) -> Camera:
-    """What an eye of the headset sees, whose head was at the scene's camera when it came on."""
+def eye_camera(scene: Scene, pose: dict[str, Any], eye: Sequence[float]) -> Camera:
+    """What an eye of the headset sees, whose head was at the scene's camera when it came on. pose, eye: as in
+    test-browser/headset.js."""
     right, left_side, right_side, low, high = eye
+    cosine, sine = np.cos(pose["turn"]), np.sin(pose["turn"])
     head = np.eye(4)
-    head[:3, :3] = [[np.cos(TURN), 0, np.sin(TURN)], [0, 1, 0], [-np.sin(TURN), 0, np.cos(TURN)]]
-    head[:3, 3] = PLACE
+    head[:3, :3] = [[cosine, 0, sine], [0, 1, 0], [-sine, 0, cosine]]
+    head[:3, 3] = pose["place"]
     moved = np.eye(4)
     moved[0, 3] = right
     axes, metres = np.diag([1.0, -1, -1, 1]), np.diag([*3 * [scene.info.unit], 1])
@@ -743,8 +739,9 @@ def test_a_headset_shows_each_eye_its_picture(page, server, folder):
     wait_for_level(page, 2)
     before = page.evaluate(f"[...{ELEMENT}.camera.viewmat]")
     eyes = np.split(eyes_of_headset(page, 2 * WIDTH, HEIGHT) / 255, 2, axis=1)
-    for eye, picture in zip(EYES, eyes, strict=True):
-        expected = Rasterised(decode(data)).picture(eye_camera(scene, eye), 0.5)
+    pose, seen = page.evaluate("[headset.pose, Object.values(headset.eyes)]")
+    for eye, picture in zip(seen, eyes, strict=True):
+        expected = Rasterised(decode(data)).picture(eye_camera(scene, pose, eye), 0.5)
         assert decibels(picture, expected) > LEAST_DB
     assert decibels(*eyes) < 40
     on_canvas = page.evaluate(f"{ELEMENT}.player.counts.drawn")
