@@ -35,9 +35,9 @@ def parser() -> options.Parser:
 
 def _import(args: argparse.Namespace, console: Console) -> int:
     check_output(args.output, args.overwrite)
-    from pd4dgs_codec.interchange.scaffold_gs import Choices, read_scaffold_gs
+    from pd4dgs_codec.interchange.scaffold_gs import read_scaffold_gs
 
-    scene = read_scaffold_gs(Path(args.input), Choices(args.appearance, args.voxel_size, args.iteration))
+    scene = read_scaffold_gs(Path(args.input), args.appearance, args.voxel_size, args.iteration)
     write_checkpoint(args.output, scene, args.overwrite)
     result = {
         "input": args.input,

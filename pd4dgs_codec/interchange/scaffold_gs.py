@@ -9,7 +9,6 @@ and `cameras.json` give voxel size, background and cameras; both are parsed as t
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -44,23 +43,16 @@ LAYERS = {
 }
 
 
-@dataclass(frozen=True)
-class Choices:
-    """Options of the import.
-
-    appearance: index of the picture whose embedding is used, or None. voxel_size: scene units, None to derive it.
-    iteration: None for the last.
-    """
-
-    appearance: int | None = None
-    voxel_size: float | None = None
-    iteration: int | None = None
-
-
-def read_scaffold_gs(folder: Path, choices: Choices) -> Scene:
+def read_scaffold_gs(
+    folder: Path, appearance: int | None = None, voxel_size: float | None = None, number: int | None = None
+) -> Scene:
     """Reads a scene with anchors in voxels, whitened features and all else as it is. Raises DataError for unsupported
-    models."""
-    place = _iteration(folder, choices.iteration)
+    models.
+
+    appearance: index of the picture whose embedding is used. voxel_size: scene units, None to derive it. number: of
+    the iteration, None for the last.
+    """
+    place = _iteration(folder, number)
     run = run_of(place)
     config = Config.of(run)
     ply = place / PLY
@@ -68,12 +60,12 @@ def read_scaffold_gs(folder: Path, choices: Choices) -> Scene:
     decoders, embedding = _decoders(place)
     widths = Widths(table["feature"].shape[1], table["offset"].shape[1])
     networks = {
-        name: _network(name, decoder, place / f"{DECODERS[name]}.pt", widths, embedding, choices)
+        name: _network(name, decoder, place / f"{DECODERS[name]}.pt", widths, embedding, appearance)
         for name, decoder in decoders.items()
     }
     feature, networks = _whitened(table["feature"], networks)
     anchor = table["anchor"]
-    voxel = choices.voxel_size or _voxel_size(config)
+    voxel = voxel_size or _voxel_size(config)
     with np.errstate(over="ignore"):
         voxel = float(np.float32(voxel if voxel > 0 else _grid(anchor, ply)))
     camera, up = None, UP
@@ -190,7 +182,7 @@ def _tensors(content: Any) -> dict[str, np.ndarray]:
 
 
 def _network(
-    name: str, decoder: Any, path: Path, widths: Widths, embedding: np.ndarray | None, choices: Choices
+    name: str, decoder: Any, path: Path, widths: Widths, embedding: np.ndarray | None, appearance: int | None
 ) -> Network:
     """Reads a decoder's two linear layers and adds the embedding of the chosen picture to the first bias."""
     if isinstance(decoder, Module):  # state dicts do not name the kinds of layers
@@ -212,10 +204,10 @@ def _network(
         expects = f"{usual + taken}: {widths.feature} features and a direction"
         raise DataError(f"{path}: takes {found}, expected {expects}")
     if embedding is not None and taken:
-        if choices.appearance is None or not 0 <= choices.appearance < len(embedding):
+        if appearance is None or not 0 <= appearance < len(embedding):
             how = f"choose one of {len(embedding)} pictures with --appearance 0..{len(embedding) - 1}"
             raise DataError(f"{path.parent}: colours depend on the picture; {how}")
-        w1, b1 = w1[:, :usual], b1 + w1[:, usual:] @ embedding[choices.appearance]
+        w1, b1 = w1[:, :usual], b1 + w1[:, usual:] @ embedding[appearance]
     return (w1.astype(np.float32), b1.astype(np.float32)), (w2, b2)
 
 

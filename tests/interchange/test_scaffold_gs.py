@@ -12,7 +12,7 @@ from torch import nn
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
-from pd4dgs_codec.interchange.scaffold_gs import Choices, read_scaffold_gs
+from pd4dgs_codec.interchange.scaffold_gs import read_scaffold_gs
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.model import from_scene, to_scene
 
@@ -129,7 +129,7 @@ def test_imported_gaussians_follow_the_published_formulas(tmp_path, cli, script,
 
 def test_imported_scene_encodes_and_keeps_its_anchors(tmp_path):
     theirs = Checkpoint(1)
-    scene = read_scaffold_gs(theirs.write(tmp_path), Choices())
+    scene = read_scaffold_gs(theirs.write(tmp_path))
     back = decode(encode(to_scene(from_scene(scene)), layers=0, effort=1))
     assert back.layers == (0,)
     order = np.lexsort(back.anchor.T), np.lexsort(theirs.anchor.T)
@@ -147,7 +147,7 @@ def test_features_are_whitened(tmp_path, silent):
     if silent:
         for module in (theirs.opacity, theirs.cov, theirs.color):
             torch.nn.init.zeros_(module[0].weight)
-    scene = read_scaffold_gs(theirs.write(tmp_path), Choices())
+    scene = read_scaffold_gs(theirs.write(tmp_path))
     if silent:
         np.testing.assert_array_equal(np.sort(scene.feature, axis=0), np.sort(theirs.feature, axis=0))
         return
@@ -166,7 +166,7 @@ def test_run_files_give_voxel_background_and_camera(tmp_path):
     turn = [[1, 0, 0], [0, 0, 1], [0, -1, 0]]
     row = {"id": 0, "position": [1, 2, 3], "rotation": turn, "width": 64, "height": 48, "fx": 50.0, "fy": 51.0}
     (tmp_path / "cameras.json").write_text(json.dumps([row]))
-    info = read_scaffold_gs(tmp_path, Choices()).info
+    info = read_scaffold_gs(tmp_path).info
     assert info.voxel_size == np.float32(0.005) and info.background == (1.0, 1.0, 1.0) and info.near == np.float32(0.2)
     assert info.up == (0.0, 0.0, 1.0)  # minus the second column of the camera's rotation
     viewmat = info.camera.viewmat.astype(float)
@@ -175,7 +175,7 @@ def test_run_files_give_voxel_background_and_camera(tmp_path):
     assert (info.camera.width, info.camera.height, info.camera.K[1, 1]) == (64, 48, 51)
     upside_down = row | {"rotation": [[1, 0, 0], [0, 0, -1], [0, 1, 0]]}
     (tmp_path / "cameras.json").write_text(json.dumps([row, upside_down]))
-    assert np.linalg.norm(read_scaffold_gs(tmp_path, Choices()).info.up) == pytest.approx(1)
+    assert np.linalg.norm(read_scaffold_gs(tmp_path).info.up) == pytest.approx(1)
     for content, message in (
         ("[]", "expected a list of cameras with position"),
         ("[3]", "expected a list of cameras"),
@@ -187,12 +187,12 @@ def test_run_files_give_voxel_background_and_camera(tmp_path):
     ):
         (tmp_path / "cameras.json").write_text(content)
         with pytest.raises(DataError, match=f"cameras.json: {message}"):
-            read_scaffold_gs(tmp_path, Choices())
+            read_scaffold_gs(tmp_path)
 
 
 @pytest.mark.parametrize("voxel", [0.001, 0.37, 1 / 3])
 def test_the_grid_is_found_in_the_anchors(tmp_path, voxel):
-    assert read_scaffold_gs(Checkpoint(voxel=voxel).write(tmp_path), Choices()).info.voxel_size == pytest.approx(voxel)
+    assert read_scaffold_gs(Checkpoint(voxel=voxel).write(tmp_path)).info.voxel_size == pytest.approx(voxel)
 
 
 def _fails(tmp_path: Path, cli, *options: object) -> str:
@@ -247,7 +247,7 @@ def test_broken_folders(tmp_path, cli):
     place = Checkpoint().write(tmp_path / "run")
     assert "has no iteration_7" in _fails(tmp_path, cli, "--iteration", 7)
     with pytest.raises(DataError, match="has no iteration_7"):
-        read_scaffold_gs(place, Choices(iteration=7))
+        read_scaffold_gs(place, number=7)
     (place / "cov_mlp.pt").unlink()
     assert "cov_mlp.pt: cannot be read" in _fails(tmp_path, cli)
     (place / "cov_mlp.pt").write_bytes(b"no archive")
