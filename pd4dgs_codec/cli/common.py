@@ -162,7 +162,13 @@ class TrainingProgress:
     def update(self, trainer: Trainer, record: dict[str, Any]) -> None:
         psnr = "/".join(f"{value:.2f}" for value in trainer.curve[-1]["psnr"]) if trainer.curve else ""
         if self.stream.isatty():
-            self._bar(trainer).set_postfix_str(f"{record['anchors']} anchors {psnr} dB" if psnr else "", refresh=False)
+            if self.bar is None:
+                from tqdm import tqdm
+
+                total, unit = (trainer.config.max_seconds, "s") if trainer.timed else (trainer.total, "step")
+                initial = int(trainer.seconds) if trainer.timed else trainer.iteration - 1
+                self.bar = tqdm(total=total, initial=initial, unit=unit, file=self.stream, leave=False)
+            self.bar.set_postfix_str(f"{record['anchors']} anchors {psnr} dB" if psnr else "", refresh=False)
             self.bar.update((int(trainer.seconds) if trainer.timed else trainer.iteration) - self.bar.n)
         elif "held_out_psnr" in record:
             steps = f"step {trainer.iteration}" if trainer.timed else f"step {trainer.iteration}/{trainer.total}"
@@ -176,15 +182,6 @@ class TrainingProgress:
     def close(self) -> None:
         if self.bar is not None:
             self.bar.close()
-
-    def _bar(self, trainer: Trainer) -> Any:
-        if self.bar is None:
-            from tqdm import tqdm
-
-            total, unit = (trainer.config.max_seconds, "s") if trainer.timed else (trainer.total, "step")
-            initial = int(trainer.seconds) if trainer.timed else trainer.iteration - 1
-            self.bar = tqdm(total=total, initial=initial, unit=unit, file=self.stream, leave=False)
-        return self.bar
 
 
 # -- inputs and outputs ------------------------------------------------------------------------------------------------

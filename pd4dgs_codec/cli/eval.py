@@ -3,19 +3,8 @@
 import argparse
 from typing import Any
 
-from pd4dgs_codec.cli import options
-from pd4dgs_codec.cli.common import (
-    NONE_HELD_OUT,
-    OK,
-    Console,
-    command,
-    named_input,
-    number,
-    progress_bar,
-    read_dataset,
-    say,
-    table,
-)
+from pd4dgs_codec.cli import common, options
+from pd4dgs_codec.cli.common import OK, Console, number, progress_bar, say, table
 
 DETAILS = f"""\
 Decodes each level of a .pd4 file from its own prefix and compares its renderings with the held-out views.
@@ -54,12 +43,12 @@ def _evaluate(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.quality.levels import load_levels
     from pd4dgs_codec.quality.perceptual import PERCEPTUAL, VGG, load_perceptual
 
-    file = named_input(args.input)
+    file = common.named_input(args.input)
     levels = load_levels(file, args.max_layer, max_bytes=args.max_bytes, background=args.background)
-    dataset = read_dataset(args.source, args, levels[-1].model.info)
+    dataset = common.read_dataset(args.source, args, levels[-1].model.info)
     console.detail(f"{args.source}: {len(dataset.train)} training views, {len(dataset.test)} held out")
     if not dataset.test:
-        say(NONE_HELD_OUT)
+        say(common.NONE_HELD_OUT)
     distances = (*(PERCEPTUAL if args.perceptual else ()), *([VGG] if args.protocol == "3dgs" else []))
     perceptual = load_perceptual(distances) if distances else None
     for name, why in (perceptual.absent if perceptual else {}).items():
@@ -71,7 +60,7 @@ def _evaluate(args: argparse.Namespace, console: Console) -> int:
     return OK
 
 
-main = command(parser, _evaluate)
+main = common.command(parser, _evaluate)
 
 
 def _text(result: dict[str, Any]) -> str:
