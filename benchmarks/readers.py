@@ -27,7 +27,7 @@ from PIL import Image
 
 from pd4dgs_codec import decode
 from pd4dgs_codec.archives import read_tensors
-from pd4dgs_codec.batch.job import OPS, Manifest
+from pd4dgs_codec.batch.job import OPS, read_manifest
 from pd4dgs_codec.data import colmap
 from pd4dgs_codec.data.captures import _panoptic_points
 from pd4dgs_codec.data.dataset import load
@@ -244,7 +244,7 @@ CASES: dict[str, tuple[str, Callable[[], bytes], Callable[[Path], object]]] = {
     "manifest: broken lines": (
         "m.jsonl",
         lambda: b"{}\n" * (MEGABYTE // 12),
-        lambda path: Manifest(str(path), OPS["encode"], lambda source, options: None),
+        lambda path: read_manifest(str(path), OPS["encode"], lambda source, options: None),
     ),
 }  # fmt: skip
 

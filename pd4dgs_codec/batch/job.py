@@ -67,32 +67,27 @@ class Line:
     options: dict[str, Any] = field(default_factory=dict)
 
 
-class Manifest:
-    """Reads the valid lines of a manifest, and the faults of the others as (number, message). Raises OSError or
-    DataError if it cannot be read or is empty.
-
-    check: raises DataError for a source and options that the command does not take.
-    """
-
-    def __init__(self, place: str, op: Op, check: Check):
-        self.lines: list[Line] = []
-        self.faults: list[tuple[int, str]] = []
-        first: dict[str, int] = {}
-        with store.opened(place) as stream:
-            for number, raw in enumerate(stream, 1):
-                if not raw.strip():
-                    continue
-                try:
-                    line = _line(number, raw, op, check)
-                    if first.setdefault(line.output, number) != number:
-                        raise DataError(f"found output {line.output!r} of line {first[line.output]}, expected another")
-                    self.lines.append(line)
-                except DataError as error:
-                    self.faults.append((number, str(error)))
-                except Exception as error:  # an error that no check foresaw fails this line only
-                    self.faults.append((number, one_line(f"{type(error).__name__}: {error}")))
-        if not (self.lines or self.faults):
-            raise DataError(f"{place}: is empty, expected one JSON object per scene")
+def read_manifest(place: str, op: Op, check: Check) -> tuple[list[Line], list[tuple[int, str]]]:
+    """Returns the valid lines of a manifest, and the faults of the others as (number, message). Raises OSError or
+    DataError if it cannot be read or is empty. check: raises DataError for a source and options that the command does
+    not take."""
+    lines, faults, first = list[Line](), list[tuple[int, str]](), dict[str, int]()
+    with store.opened(place) as stream:
+        for number, raw in enumerate(stream, 1):
+            if not raw.strip():
+                continue
+            try:
+                line = _line(number, raw, op, check)
+                if first.setdefault(line.output, number) != number:
+                    raise DataError(f"found output {line.output!r} of line {first[line.output]}, expected another")
+                lines.append(line)
+            except DataError as error:
+                faults.append((number, str(error)))
+            except Exception as error:  # an error that no check foresaw fails this line only
+                faults.append((number, one_line(f"{type(error).__name__}: {error}")))
+    if not (lines or faults):
+        raise DataError(f"{place}: is empty, expected one JSON object per scene")
+    return lines, faults
 
 
 def _line(number: int, raw: bytes, op: Op, check: Check) -> Line:

@@ -12,13 +12,14 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from pd4dgs_codec.batch.job import OPS, Job, Manifest, Outcome, arguments, scan
+from pd4dgs_codec.batch.job import OPS, Job, Outcome, arguments, read_manifest, scan
 from pd4dgs_codec.cli import common, options
 from pd4dgs_codec.cli.common import FAILED, OK, STDIO, Console, UsageError, progress_bar, say
 from pd4dgs_codec.errors import DataError, printable
 from pd4dgs_codec.threads import available
 
 ENGINES = ("local", "ray", "slurm")
+PARAMETER = options.checked(lambda text: text.split("=", 1), lambda pair: len(pair) == 2 and pair[0] != "", "KEY=VALUE")
 
 DETAILS = """\
 MANIFEST has one JSON object per line:
@@ -69,7 +70,7 @@ def parser() -> options.Parser:
     what = "address of the Ray cluster (default: RAY_ADDRESS, else a new local cluster)"
     add("--address", metavar="A", help=what)
     what = "parameter of submitit, such as slurm_partition=gpu; cluster=local runs on this machine"
-    add("--slurm", type=_parameter, action="append", metavar="KEY=VALUE", help=what)
+    add("--slurm", type=PARAMETER, action="append", metavar="KEY=VALUE", help=what)
     p.add_common()
     return p
 
@@ -81,13 +82,6 @@ def scan_parser() -> options.Parser:
     p.add_argument("-o", "--output", default=STDIO, metavar="FILE", help="manifest to write (default: stdout)")
     p.add_common()
     return p
-
-
-def _parameter(text: str) -> tuple[str, str]:
-    key, equals, value = text.partition("=")
-    if not (key and equals):
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected KEY=VALUE")
-    return key, value
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -135,16 +129,16 @@ def _batch(args: argparse.Namespace, console: Console) -> int:
         except UsageError as error:
             raise DataError(str(error)) from None
 
-    manifest = Manifest(args.input, OPS[args.op], check)
+    lines, faults = read_manifest(args.input, OPS[args.op], check)
     output = store.absolute(args.output)
-    if manifest.lines:  # the check makes the output folder
+    if lines:  # the check makes the output folder
         store.Root(output).check()
-    failures = [_failed(args.input, number, None, message) for number, message in manifest.faults]
-    jobs = (Job(line, args.op, output, threads, args.overwrite) for line in manifest.lines)
+    failures = [_failed(args.input, number, None, message) for number, message in faults]
+    jobs = (Job(line, args.op, output, threads, args.overwrite) for line in lines)
     settings = Settings(
         workers, threads, args.gpus, args.timeout or None, args.address, Path(args.logs), dict(args.slurm)
     )
-    with progress_bar(len(manifest.lines), "scenes", args.op) as step:
+    with progress_bar(len(lines), "scenes", args.op) as step:
 
         def told(job: Job, outcome: Outcome, tries: int) -> None:
             if outcome.state == "failed":

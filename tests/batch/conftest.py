@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from standin import upper
 
-from pd4dgs_codec.batch.job import OPS, Job, Manifest, Outcome
+from pd4dgs_codec.batch.job import OPS, Job, Line, Outcome, read_manifest
 from pd4dgs_codec.batch.run import Settings, run
 
 
@@ -26,18 +26,18 @@ class Library:
         (self.folder / "in" / name).write_text(text)
         self.lines.append(json.dumps({"source": str(self.folder / "in" / name)} | fields))
 
-    def manifest(self) -> Manifest:
+    def manifest(self) -> tuple[list[Line], list[tuple[int, str]]]:
         """The lines so far."""
         path = self.folder / "m.jsonl"
         path.write_text("\n".join(self.lines) + "\n")
-        return Manifest(str(path), OPS["encode"], lambda source, options: None)
+        return read_manifest(str(path), OPS["encode"], lambda source, options: None)
 
     def run(
         self, on: str = "local", root: str | None = None, retries: int = 2, overwrite: bool = False, **settings: Any
     ) -> dict[str, Any]:
         """One batch over the lines so far; `outcomes` has the last outcome and the tries by output."""
         more = {"version": settings.pop("version")} if "version" in settings else {}
-        jobs = (Job(line, "encode", root or str(self.out), 1, overwrite, **more) for line in self.manifest().lines)
+        jobs = (Job(line, "encode", root or str(self.out), 1, overwrite, **more) for line in self.manifest()[0])
 
         def report(job: Job, outcome: Outcome, tries: int) -> None:
             self.outcomes[job.line.output] = outcome, tries

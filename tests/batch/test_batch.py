@@ -8,7 +8,7 @@ import pytest
 
 from pd4dgs_codec import __version__
 from pd4dgs_codec.batch import store
-from pd4dgs_codec.batch.job import OPS, Job, Line, Manifest, arguments, default_output, run_job, scan
+from pd4dgs_codec.batch.job import OPS, Job, Line, arguments, default_output, read_manifest, run_job, scan
 from pd4dgs_codec.errors import DataError
 
 
@@ -112,7 +112,7 @@ LINES = [
 def test_a_broken_line_is_named_and_the_others_go_on(library, line, what):
     library.lines.append(line)
     library.add("b.pt", "fine")
-    ((number, message),) = library.manifest().faults
+    _, ((number, message),) = library.manifest()
     assert number == 1 and what in message
     assert library.run()["done"] == 1
 
@@ -127,7 +127,7 @@ def test_a_place_that_no_store_has_is_a_failure_of_its_line_alone(library, place
     if key == "source":
         library.lines[0] = json.dumps({"source": place, "output": "a.pd4"})
     library.add("b.pt", "fine")
-    faults = library.manifest().faults
+    _, faults = library.manifest()
     assert library.run(retries=0)["done"] == 1 and (library.out / "b.pd4").read_text() == "FINE"
     said = faults[0][1] if faults else library.outcomes["a.pd4"][0].message
     assert said.isprintable() and said
@@ -136,7 +136,7 @@ def test_a_place_that_no_store_has_is_a_failure_of_its_line_alone(library, place
 @pytest.mark.parametrize("place", STORES)
 def test_a_place_that_no_store_has_holds_no_manifest(place):
     with pytest.raises((DataError, OSError)):
-        Manifest(place, OPS["encode"], lambda source, options: None)
+        read_manifest(place, OPS["encode"], lambda source, options: None)
 
 
 @pytest.mark.parametrize(
@@ -160,14 +160,14 @@ def test_what_no_check_foresaw_is_a_failure_of_its_line_alone(library):
     library.add("a.pt", "first", options={"effort": 1})
     library.add("b.pt", "fine")
     library.manifest()
-    found = Manifest(str(library.folder / "m.jsonl"), OPS["encode"], check)
-    assert found.faults == [(1, "ZeroDivisionError: never \\x1b[2J")] and [line.number for line in found.lines] == [2]
+    lines, faults = read_manifest(str(library.folder / "m.jsonl"), OPS["encode"], check)
+    assert faults == [(1, "ZeroDivisionError: never \\x1b[2J")] and [line.number for line in lines] == [2]
 
 
 def test_two_lines_with_one_output_are_named(library):
     library.add("a.pt", "first", output="x.pd4")
     library.add("b.pt", "second", output="x.pd4")
-    ((number, message),) = library.manifest().faults
+    _, ((number, message),) = library.manifest()
     assert number == 2 and "'x.pd4'" in message and "line 1" in message
     assert library.run()["done"] == 1 and (library.out / "x.pd4").read_text() == "FIRST"
 
@@ -193,7 +193,7 @@ def test_a_source_that_is_not_there_or_for_which_a_reader_would_wait_is_named(li
 
 def test_a_manifest_for_which_a_reader_would_wait_is_named():
     with pytest.raises(DataError, match="is a device"):
-        Manifest("/dev/zero", OPS["encode"], lambda source, options: None)
+        read_manifest("/dev/zero", OPS["encode"], lambda source, options: None)
 
 
 @pytest.mark.parametrize("options", [{"output": "x"}, {"threads": 3}, {"-o": "x"}, {"a b": 1}, {"effort": {"a": 1}}])
