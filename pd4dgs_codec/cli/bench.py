@@ -33,11 +33,6 @@ class Outcome(NamedTuple):
     failures: Sequence[str] = ()
 
 
-def _given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """Returns the options among `names` that were given."""
-    return {name: getattr(args, name) for name in names if getattr(args, name) is not None}
-
-
 #: Why an option is refused for a file that is not rendered.
 CHECKPOINT = "needs a checkpoint, not a .pd4 file"
 
@@ -111,7 +106,7 @@ def _codec(args: argparse.Namespace) -> Outcome:
     from pd4dgs_codec.bench import report, runtime
 
     machine = report.machine()
-    scales, modes, efforts, repeats = (SWEEP | (QUICK if args.quick else {}) | _given(args, *SWEEP)).values()
+    scales, modes, efforts, repeats = (SWEEP | (QUICK if args.quick else {}) | options.given(args, *SWEEP)).values()
     if is_pd4(data):
         points, panels = [runtime.file_point(data, repeats)], []
     else:
@@ -201,7 +196,7 @@ def _train_options(p: options.Parser) -> None:
 
 
 def _train(args: argparse.Namespace) -> Outcome:
-    if args.runs and (args.source or _given(args, "presets", "seconds", *TRAIN_FIELDS)):
+    if args.runs and (args.source or options.given(args, "presets", "seconds", *TRAIN_FIELDS)):
         raise UsageError("--from reports finished runs, expected no SOURCE and no training options")
     if not args.runs and not args.source:
         raise UsageError("found no SOURCE, expected a dataset to train on or --from FILE")
@@ -225,7 +220,7 @@ def _trained(args: argparse.Namespace) -> list[Point]:
     limit = None if args.iterations else args.seconds or 120.0
     runs = []
     for preset in dict.fromkeys(args.presets or ("tiny", "small")):
-        config = TrainConfig(preset=preset, source=args.source, max_seconds=limit, **_given(args, *TRAIN_FIELDS))
+        config = TrainConfig(preset=preset, source=args.source, max_seconds=limit, **options.given(args, *TRAIN_FIELDS))
         trainer = Trainer(config, load_source(args.source, downscale=config.downscale, holdout=config.holdout))
         say(f"training {preset} on {len(trainer.dataset.train)} views")
         if not trainer.dataset.test:

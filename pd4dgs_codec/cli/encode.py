@@ -150,7 +150,7 @@ def _metadata(args: argparse.Namespace, had: Metadata | None) -> Metadata | None
     given as options."""
     if had:
         had = replace(had, quality={}, slices=())
-    given = {name: vars(args)[name] for name in ("title", "source", "licence") if vars(args)[name] is not None}
+    given = options.given(args, "title", "source", "licence")
     if not given:
         return had
     from pd4dgs_codec.format.metadata import Metadata

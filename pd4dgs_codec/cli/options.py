@@ -102,6 +102,11 @@ def conditional(args: argparse.Namespace, condition: object, otherwise: str, **d
             raise UsageError(f"--{name.replace('_', '-')} {otherwise}")
 
 
+def given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """Returns the options among `names` that were given."""
+    return {name: value for name in names if (value := getattr(args, name)) is not None}
+
+
 def add_background(options: argparse._ActionsContainer, default: str) -> None:
     """Adds --background. default: the default in words."""
     what = f"colour behind the scene and images with alpha: black, white or R,G,B in 0..1 (default: {default})"
@@ -174,9 +179,7 @@ def background(text: str) -> tuple[float, float, float]:
     """Reads a colour as RGB in 0..1, see `dataset.color`."""
     from pd4dgs_codec.data.dataset import color
 
-    with contextlib.suppress(ValueError):
-        return color(text)
-    raise argparse.ArgumentTypeError(f"found {text!r}, expected black, white or R,G,B in 0..1")
+    return checked(color, lambda value: True, "black, white or R,G,B in 0..1")(text)
 
 
 def rate(text: str) -> float:

@@ -160,8 +160,8 @@ def _ablated(args: argparse.Namespace) -> dict[str, Any]:
 
 def _fresh_config(args: argparse.Namespace) -> TrainConfig:
     dial = {} if args.quality is None else at_quality(args.quality)
-    named = dial | {name: getattr(args, name) for name in (*FIXED, "max_seconds") if getattr(args, name) is not None}
-    return TrainConfig(source=args.source, **named | _ablated(args))
+    named = dial | options.given(args, *FIXED, "max_seconds") | _ablated(args)
+    return TrainConfig(source=args.source, **named)
 
 
 def _stored_config(args: argparse.Namespace) -> TrainConfig:
