@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import io
 import time
-from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -67,7 +66,7 @@ def _decode(args: argparse.Namespace, console: Console) -> int:
         np.savez(stream, **to_npz_dict(scene, args.symbols))  # type: ignore[arg-type]
         common.write_bytes(args.output, stream.getvalue(), args.overwrite)
     if not complete:
-        say(f"pd4dgs-decode: warning: the input is truncated; decoded layers: {_listed(scene.layers)}")
+        say(f"pd4dgs-decode: warning: the input is truncated; decoded layers: {', '.join(map(str, scene.layers))}")
     result = _summary(scene, data, complete, seconds, args)
     console.result(result, _text(result), on_stdout=not args.output)
     return OK if complete else PARTIAL
@@ -115,10 +114,6 @@ def _summary(scene: Scene, data: bytes, complete: bool, seconds: float, args: ar
     }
 
 
-def _listed(layers: Iterable[int]) -> str:
-    return ", ".join(map(str, layers))
-
-
 def _text(result: dict[str, Any]) -> str:
     layers = result["layers"]
     if not result["complete"]:
@@ -126,7 +121,7 @@ def _text(result: dict[str, Any]) -> str:
     elif result["max_bytes"] is not None:
         state = f"first {layers[-1]['end']:,} bytes valid"
     elif result["max_layer"] is not None:  # nothing is known about the bytes behind the prefix
-        state = f"layers {_listed(row['layer'] for row in layers)} valid"
+        state = f"layers {', '.join(str(row['layer']) for row in layers)} valid"
     else:
         state = "complete and valid"
     cells = [(row["layer"], *(number(row[k], 0) for k in ("bytes", "end", "anchors", "active"))) for row in layers]

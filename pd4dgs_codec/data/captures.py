@@ -132,9 +132,8 @@ def _points(folder: Path, center: np.ndarray, scale: float) -> np.ndarray | None
     return points.astype(np.float32) if len(points) else None
 
 
-def read_cameras(folder: str | Path) -> CameraFiles:
+def read_cameras(folder: Path) -> CameraFiles:
     """Reads every camera of both splits; images need not exist."""
-    folder = Path(folder)
     scene, (extra, factor) = read_json(folder / "scene.json"), _extra(folder)
     center = array(scene.get("center", [0.0] * 3), (3,), f"{folder / 'scene.json'}: center")
     scale = number(scene.get("scale", 1.0), f"{folder / 'scene.json'}: scale", positive=True)
