@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tiny import camera_ahead, disc, sighted
+from tiny import camera_ahead, disc, sighted, trained_like_scene
 
 from pd4dgs_codec.draw.player import Player
+from pd4dgs_codec.format.decoder import decode
+from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.interchange.export import (
     Export,
     _fitted,
@@ -19,7 +21,24 @@ from pd4dgs_codec.interchange.export import (
 )
 from pd4dgs_codec.interchange.splats import harmonics, picture, unit
 from pd4dgs_codec.quality.frames import turned
-from pd4dgs_codec.scene import Camera
+from pd4dgs_codec.scene import Camera, Scene
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    """A scene to export, as a file gives it."""
+    return decode(encode(trained_like_scene(), layers=2, effort=1))
+
+
+@pytest.fixture
+def player(scene) -> Player:
+    return Player(scene)
+
+
+@pytest.fixture
+def blind_player(scene) -> Player:
+    """Of the scene with networks that do not see the view direction: its Gaussians are the same from everywhere."""
+    return Player(sighted(scene))
 
 
 def _cameras(count: int = 12) -> list[Camera]:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 from teachers import Deformable, FourD
-from test_formats import gsplat_state, make_splats
+from test_splats import gsplat_state, make_splats
 
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.runs import read_cameras, read_torch

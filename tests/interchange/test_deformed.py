@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 from teachers import Deformable, FourD, ball, fit
-from test_formats import make_splats
+from test_splats import make_splats
 from tiny import TINY
 from torch import nn
 

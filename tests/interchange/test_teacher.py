@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 from common import SHARED
-from test_formats import gsplat_state, make_splats
+from test_splats import gsplat_state, make_splats
 from tiny import write_views
 
 from pd4dgs_codec.data.dataset import load
