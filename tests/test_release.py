@@ -82,3 +82,10 @@ def test_the_npm_package_has_all_that_it_exports(tmp_path):
     workers = text("render/workers.js", package)
     assert "import.meta" not in workers and workers.count("addEventListener") >= 3
     assert not list(package.rglob("test*"))
+
+
+def test_the_wheel_gets_every_package_and_what_the_page_needs():
+    listed = set(re.findall(r'^    "(pd4dgs_codec[\w.]*)",$', text("pyproject.toml"), flags=re.MULTILINE))
+    rooms = {str(p.parent.relative_to(ROOT)).replace("/", ".") for p in (ROOT / "pd4dgs_codec").rglob("__init__.py")}
+    player = {".".join(["pd4dgs_codec", "player", *Path(part).with_suffix("").parts]) for part in ("decode", "render")}
+    assert listed == rooms | player | {"pd4dgs_codec.player"}

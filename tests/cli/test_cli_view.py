@@ -1,20 +1,16 @@
 """`pd4dgs-view`: a page, the player and the scene from one address, until a signal comes."""
 
-import re
 import signal
 import subprocess
 import sys
 import urllib.error
 import urllib.request
-from pathlib import Path
 from typing import IO
 
 import pytest
 
 from pd4dgs_codec import decode, show
 from pd4dgs_codec.web.page import page as whole_page
-
-ROOT = Path(__file__).parents[2]
 
 #: How a browser asks to go on as a web socket.
 SOCKET = {"Upgrade": "websocket", "Connection": "Upgrade", "Sec-WebSocket-Version": "13", "Sec-WebSocket-Key": "AA=="}
@@ -58,10 +54,3 @@ def test_one_html_file_instead_of_a_server(cli, scene_pd4, tmp_path):
     output = tmp_path / "scene.html"
     assert cli("view", scene_pd4, "-o", output).code == 0
     assert output.read_text() == show(scene_pd4).page
-
-
-def test_the_wheel_gets_every_package_and_what_the_page_needs():
-    listed = set(re.findall(r'^    "(pd4dgs_codec[\w.]*)",$', (ROOT / "pyproject.toml").read_text(), flags=re.M))
-    rooms = {str(p.parent.relative_to(ROOT)).replace("/", ".") for p in (ROOT / "pd4dgs_codec").rglob("__init__.py")}
-    player = {".".join(["pd4dgs_codec", "player", *Path(part).with_suffix("").parts]) for part in ("decode", "render")}
-    assert listed == rooms | player | {"pd4dgs_codec.player"}
