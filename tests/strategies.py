@@ -15,7 +15,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from pd4dgs_codec import encode
-from pd4dgs_codec.entropy.tables import norm_cdf28_of_each, tables_of_each
+from pd4dgs_codec.entropy.priors import norm_cdf28_of_each, tables_of_each
 from pd4dgs_codec.format.info import info as info_of
 from pd4dgs_codec.format.quantise import NO_CLASSES, Grid, attribute_rows, dequantise
 from pd4dgs_codec.scene import (

@@ -3,7 +3,7 @@
 import numpy as np
 import torch
 
-from pd4dgs_codec.entropy.tables import entropy_bits
+from pd4dgs_codec.entropy.fitting import entropy_bits
 from pd4dgs_codec.format.deformation import decorrelate
 from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.format.quantise import classes_of

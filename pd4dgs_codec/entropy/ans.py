@@ -17,9 +17,9 @@ from typing import TypeAlias
 import constriction
 import numpy as np
 
-from pd4dgs_codec.entropy.tables import TOTAL
 from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
 
+TOTAL = 1 << 24  #: of the frequencies of a table
 MAX_COUNT = 1 << 26  #: symbols in one channel; decoding allocates four bytes for each
 _U32 = np.dtype("<u4")
 _INVALID = f"a frequency table does not ascend from 0 to {TOTAL}"

@@ -29,10 +29,39 @@ from pd4dgs_codec.entropy.priors import (
     Prior,
     Window,
 )
-from pd4dgs_codec.entropy.tables import BIT, order0_bits, symbol_counts
 
 BLOCK = 256  #: channels planned together; keeps the cost matrix small
 WIDE = 1024  #: most distinct symbols of a channel that takes part in sharing; beyond, a prior's few bytes do not matter
+
+
+# -- costs and counts --------------------------------------------------------------------------------------------------
+
+BIT = 1 << 20  #: one bit in integer costs, whose sums do not depend on their order
+#: log2(1 + i / 4096) in these units, the last one twice. Linear interpolation is off by less than 2e-8 bits.
+LOG2 = np.rint(np.log2(1 + np.minimum(np.arange(4098), 4096) / 4096) * BIT).astype(np.int64)
+
+
+def frequency_costs(frequencies: np.ndarray) -> np.ndarray:
+    """Returns the costs 24 - log2(f), int64 [...] in units of 2^-20 bits, of frequencies f int64 [...], 1 .. 2^24."""
+    bits = frequencies.astype(np.float64).view(np.int64)  # exponent and mantissa, IEEE 754
+    i, f = (bits >> 40) & 4095, (bits >> 28) & 4095
+    log2: np.ndarray = (((bits >> 52) - 1023) * BIT) + LOG2[i] + (((LOG2[i + 1] - LOG2[i]) * f) >> 12)
+    return 24 * BIT - log2
+
+
+def order0_bits(counts: np.ndarray) -> float:
+    """Order-0 entropy of symbols that occur counts [U] times, all positive, in bits for all symbols together."""
+    each = counts.astype(np.float64)
+    total = each.sum()
+    return float(total * np.log2(total) - (each * np.log2(each)).sum())
+
+
+def entropy_bits(symbols: np.ndarray) -> float:
+    """Order-0 entropy of integer symbols, in bits for all symbols together."""
+    return order0_bits(histogram(symbols).counts) if symbols.size else 0.0
+
+
+# -- fits --------------------------------------------------------------------------------------------------------------
 
 
 @cache
@@ -67,15 +96,21 @@ class Fitted:
     own: int
 
 
-def histogram(symbols: np.ndarray) -> Histogram:
-    """The histogram of a non-empty channel."""
-    return Histogram(*symbol_counts(symbols))
+def histogram(symbols: np.ndarray, times: np.ndarray | None = None) -> Histogram:
+    """The histogram of a non-empty channel. times: int [N], how often each symbol counts; once if None."""
+    low, high = int(symbols.min()), int(symbols.max())
+    if high - low > 4 * symbols.size + 1024:  # too wide for an array of counts, which is faster than sorting
+        values, index = np.unique(symbols, return_inverse=True)
+        return Histogram(values.astype(np.int64), np.bincount(index, weights=times).astype(np.int64))
+    counts = np.bincount(symbols.astype(np.int64) - low, weights=times).astype(np.int64)
+    present = np.flatnonzero(counts)
+    return Histogram(present + low, counts[present])
 
 
 def pool(histograms: Sequence[Histogram]) -> Histogram:
     """The histogram of several channels together."""
     values, counts = ([getattr(h, name) for h in histograms] for name in ("values", "counts"))
-    return Histogram(*symbol_counts(np.concatenate(values), np.concatenate(counts)))
+    return histogram(np.concatenate(values), np.concatenate(counts))
 
 
 def costs_of(histograms: Sequence[Histogram], priors: Sequence[Fitted]) -> np.ndarray:

@@ -2,12 +2,17 @@
 
 A prior covers a window of symbols kmin .. kmin + n - 1. Symbols outside it are exceptions, listed beside the prior.
 
+A table is ``cum`` int64 [n + 1], strictly increasing from 0 to 2**24; symbol q owns the interval [cum[q], cum[q + 1]).
+Tables are the only probabilities in the format. Their rules use integers below 2**53 only, so Python, C and JavaScript
+build the same table on every machine.
+
 A new prior needs a subclass of `_Tabled` with an id, `cum`, `write` and `read`, and its name in `Prior`. `make_models`
 only saves time: a family that it does not list makes its tables one by one.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,8 +20,7 @@ from typing import Any, ClassVar, TypeVar, get_args
 
 import numpy as np
 
-from pd4dgs_codec.entropy.ans import Model, model_of, models_of_each
-from pd4dgs_codec.entropy.tables import SI_MAX, SI_MIN, norm_cdf28_of_each, tables_of_each
+from pd4dgs_codec.entropy.ans import TOTAL, Model, model_of, models_of_each
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
 from pd4dgs_codec.errors import Malformed, UnsupportedFeature
 
@@ -26,8 +30,7 @@ MAX_WINDOW = 1 << 14
 #: memory: eight bytes can define a table of 2**14 entries, 128 KiB, in each section of each slice.
 FREE_ENTRIES, MORE_ENTRIES = 1 << 18, 1 << 10
 MU8_MAX = 1 << 31
-
-CONST, GAUSS, GMM2 = 0, 1, 2
+SI_MIN, SI_MAX = -640, 1280  #: sigma = Q * 2 ** (si / 64)
 FIRST_REUSE = 8  #: family codes from here on refer to an earlier prior
 
 
@@ -88,7 +91,7 @@ class _Tabled:
 class Const(_Tabled):
     """Every symbol is kmin; costs nothing per symbol."""
 
-    id: ClassVar[int] = CONST
+    id: ClassVar[int] = 0
     window: Window
 
     def write(self, out: bytearray) -> None:
@@ -103,7 +106,7 @@ class Const(_Tabled):
 class Gauss(_Tabled):
     """A quantised Gaussian, the model of R(a)."""
 
-    id: ClassVar[int] = GAUSS
+    id: ClassVar[int] = 1
     window: Window
     normal: Normal
 
@@ -121,7 +124,7 @@ class Gauss(_Tabled):
 class Mixture(_Tabled):
     """Two quantised Gaussians; `weight` 1..255 is the second one's share in 1/256."""
 
-    id: ClassVar[int] = GMM2
+    id: ClassVar[int] = 2
     window: Window
     first: Normal
     second: Normal
@@ -207,3 +210,56 @@ def read_prior(reader: ByteReader, family: int) -> Prior:
     if family not in _FAMILIES:
         raise UnsupportedFeature(f"prior family {family}, expected one of {sorted(_FAMILIES)}", offset=reader.offset)
     return _FAMILIES[family].read(reader)
+
+
+# -- integer frequency tables ------------------------------------------------------------------------------------------
+
+FLOOR = 16  #: least frequency: 16 / 2**24 is the clip of R(a), and keeps outliers from steering a fit
+
+# The two constants of NormTable v1. Computing them in float64 is safe: no entry comes closer than 1e-4 to a rounding
+# boundary (a test checks that), while float64 is off by less than 1e-6 whatever the C library.
+_T = [round(2**27 * math.erf(i / (32 * math.sqrt(2)))) for i in range(257)]
+NORMAL = np.array([*_T, _T[-1]], dtype=np.int64)  #: T[i] = round(2**28 (Phi(i / 32) - 1/2)), T[257] = T[256]
+OCTAVE = np.array([round(2.0 ** (31 - j / 64)) for j in range(64)], dtype=np.int64)  #: M[j]
+
+
+def _mass(t: np.ndarray, si: np.ndarray) -> np.ndarray:
+    """Returns a Gaussian's mass up to t / 256 from its mean, in units of 2**-28; si broadcasts against t."""
+    e, nb = si >> 6, np.maximum(0, (si >> 6) - 8)
+    a = np.minimum(np.abs(t) >> nb, (1 << 21) - 1)
+    z = np.minimum((a * OCTAVE[si & 63]) >> (23 + e - nb), 8 << 16)
+    i, f = z >> 11, z & 2047
+    v = NORMAL[i] + (((NORMAL[i + 1] - NORMAL[i]) * f) >> 11)
+    mass: np.ndarray = (1 << 27) + np.where(t < 0, -v, v)
+    return mass
+
+
+def norm_cdf28_of_each(sizes: np.ndarray, mu8: np.ndarray, si: np.ndarray) -> np.ndarray:
+    """Returns C(k), the mass up to k + 1/2 in units of 2**-28, for k = -1 .. n - 1 of many Gaussians, concatenated.
+
+    sizes, mu8, si: int64 [m], the n of each Gaussian, 256 * (mean - kmin) in symbols, and 64 * log2(sigma / Q). A table
+    uses neither the first nor the last value. Calling numpy for each short table would take longer than decoding it.
+    """
+    lengths = sizes + 1
+    return _mass(_counted(lengths) * 256 - np.repeat(128 + mu8, lengths), np.repeat(si, lengths))
+
+
+def tables_of_each(cdf: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """NormTable v1: returns the concatenated tables of a result of norm_cdf28_of_each. sizes: int64 [m].
+
+    Each symbol gets FLOOR plus its share of the rest; the first also gets the mass below the window, the last the
+    mass above it. The caller has checked the limits of clause 8.2: sizes 1 .. 2**14, si within SI_MIN .. SI_MAX, |mu8|
+    < 2**40.
+    """
+    lengths = sizes + 1
+    ends = np.cumsum(lengths)
+    cum: np.ndarray = (cdf * np.repeat(TOTAL - sizes * FLOOR, lengths)) >> 28
+    cum += FLOOR * _counted(lengths)
+    cum[ends - lengths], cum[ends - 1] = 0, TOTAL
+    return cum
+
+
+def _counted(lengths: np.ndarray) -> np.ndarray:
+    """Returns 0 .. length - 1 for each of `lengths`, concatenated."""
+    counted: np.ndarray = np.arange(int(lengths.sum())) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    return counted

@@ -12,9 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pd4dgs_codec.entropy.channels import decode_channels, decode_joined, encode_channels
-from pd4dgs_codec.entropy.fitting import Fitted
+from pd4dgs_codec.entropy.fitting import Fitted, entropy_bits
 from pd4dgs_codec.entropy.priors import Prior
-from pd4dgs_codec.entropy.tables import entropy_bits
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.format.quantise import NO_CLASSES

@@ -12,11 +12,10 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
-from pd4dgs_codec.entropy.fitting import Fitted, histogram
+from pd4dgs_codec.entropy.fitting import Fitted, entropy_bits, histogram
 from pd4dgs_codec.entropy.lzma_mode import decode_channels_lzma, encode_channels_lzma
 from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
 from pd4dgs_codec.entropy.priors import Prior
-from pd4dgs_codec.entropy.tables import entropy_bits
 from pd4dgs_codec.errors import LimitExceeded, Malformed
 from pd4dgs_codec.format import canonical, deformation
 from pd4dgs_codec.format.canonical import Fields

@@ -11,8 +11,7 @@ from itertools import accumulate
 import numpy as np
 
 from pd4dgs_codec.entropy.channels import decode_joined, encode_channels
-from pd4dgs_codec.entropy.fitting import histogram
-from pd4dgs_codec.entropy.tables import BIT, frequency_costs, symbol_counts
+from pd4dgs_codec.entropy.fitting import BIT, frequency_costs, histogram
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.format.classes import CLASSES, Places, activity_classes, relative_magnitude
@@ -143,7 +142,7 @@ def _estimated_bits(residuals: Array) -> float:
     distinct value for its distribution. Entropies are sums of integers, so every machine makes the same choice."""
     costs, distinct, size = 0, 0, residuals[0].size
     for channel in residuals.reshape(len(residuals), -1):
-        _, counts = symbol_counts(channel)
+        counts = histogram(channel).counts
         costs += int(counts @ frequency_costs(counts)) - size * int(frequency_costs(np.array(size)))
         distinct += len(counts) - 1
     return costs / BIT + 0.5 * distinct * float(np.log2(size))

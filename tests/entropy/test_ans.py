@@ -7,8 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import norm_table
 
-from pd4dgs_codec.entropy.ans import MAX_COUNT, AnsDecoder, ans_encode, model_of, models_of_each
-from pd4dgs_codec.entropy.tables import TOTAL
+from pd4dgs_codec.entropy.ans import MAX_COUNT, TOTAL, AnsDecoder, ans_encode, model_of, models_of_each
 from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
 
 

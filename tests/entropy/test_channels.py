@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from strategies import assert_same_symbols
 
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
-from pd4dgs_codec.entropy.priors import CONST, FREE_ENTRIES, GAUSS, GMM2, K_MAX, MAX_WINDOW
+from pd4dgs_codec.entropy.priors import FREE_ENTRIES, K_MAX, MAX_WINDOW, Const, Gauss, Mixture
 from pd4dgs_codec.entropy.varint import put_varint
 from pd4dgs_codec.errors import EncodeError, LimitExceeded
 
@@ -42,7 +42,7 @@ def test_round_trip_and_best_is_never_a_word_larger(channels, effort):
         coded = encode_channels(channels, priors=priors, effort=effort)
         assert_same_symbols(decode_channels(coded.payload, counts), channels)
         assert coded.payload_bits == 8 * len(coded.payload)
-        assert priors == "best" or prior_ids(coded) <= {CONST, GAUSS}
+        assert priors == "best" or prior_ids(coded) <= {Const.id, Gauss.id}
         sizes.append(len(coded.payload))
     assert sizes[1] < sizes[0] + 4  # it costs fewer bits, but the stream has whole words of four bytes
 
@@ -76,7 +76,7 @@ def test_gaussian_data_costs_its_model_rate():
 def test_mixed_data_costs_less_than_its_model_rate():
     coded = encode_channels(mixed_channels())
     assert coded.payload_bits <= 0.96 * coded.rate_bits
-    assert GMM2 in prior_ids(coded)
+    assert Mixture.id in prior_ids(coded)
 
 
 def test_small_similar_channels_share_a_prior():

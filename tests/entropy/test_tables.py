@@ -11,8 +11,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import norm_table
 
-from pd4dgs_codec.entropy.priors import Const, Gauss, Mixture, Normal, Window, _Tabled, make_models, normal_tables
-from pd4dgs_codec.entropy.tables import NORMAL, OCTAVE, SI_MAX, SI_MIN, TOTAL
+from pd4dgs_codec.entropy.ans import TOTAL
+from pd4dgs_codec.entropy.priors import (
+    NORMAL,
+    OCTAVE,
+    SI_MAX,
+    SI_MIN,
+    Const,
+    Gauss,
+    Mixture,
+    Normal,
+    Window,
+    _Tabled,
+    make_models,
+    normal_tables,
+)
 
 
 def is_table(cum: np.ndarray, n: int) -> bool:

@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from strategies import busy, make_scene, scenes, small_file
 
 from pd4dgs_codec.entropy.positions import position_channels
-from pd4dgs_codec.entropy.priors import K_MAX
-from pd4dgs_codec.entropy.tables import NORMAL, OCTAVE
+from pd4dgs_codec.entropy.priors import K_MAX, NORMAL, OCTAVE
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.info import hashes
