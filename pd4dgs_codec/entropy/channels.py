@@ -7,7 +7,9 @@ definitions of earlier payloads count if the caller passes them on.
 The ANS words of each channel's symbols follow.
 """
 
-from collections.abc import Sequence
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import accumulate
 
@@ -222,3 +224,49 @@ def _take_channel(stream: AnsDecoder, prior: Prior, exceptions: _Exceptions | No
     listed = np.zeros(len(out), dtype=bool)
     listed[exceptions.positions] = True
     out[listed], out[~listed] = exceptions.values, inside + np.int32(kmin)
+
+
+# -- classes of places (clauses 8.5 to 8.7) ----------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """The places of a channel's symbols, anchors or cells of a plane, in coding order: by class, then ascending. Each
+    class of a channel is coded as a channel, with a prior of its own.
+
+    order: int64 [n], or slice(None) for the order as it is. sizes: number of places in each class.
+    """
+
+    order: np.ndarray | slice
+    sizes: tuple[int, ...]
+
+    @staticmethod
+    def whole(n: int) -> Places:
+        """Returns all n places in one class."""
+        return Places(slice(None), (n,))
+
+    @staticmethod
+    def by(classes: np.ndarray, count: int) -> Places:
+        """Returns places by classes int [n] in 0..count-1, with count below 256; classes may be empty."""
+        classes = classes.astype(np.uint8, copy=False)  # numpy sorts bytes by counting
+        sizes = tuple(np.bincount(classes, minlength=count).tolist())
+        return Places(np.argsort(classes, kind="stable"), sizes)
+
+    def parts(self, channels: np.ndarray) -> Iterator[np.ndarray]:
+        """Yields the coded parts of channels [m, n]: for each channel in turn, each class."""
+        for channel in channels:
+            ordered, end = channel[self.order], 0
+            for size in self.sizes:
+                yield ordered[end : end + size]
+                end += size
+
+    def put(self, coded: np.ndarray, channels: np.ndarray) -> None:
+        """Writes the concatenated `parts` back into channels [m, n]."""
+        rows = coded.reshape(len(channels), -1)
+        if isinstance(self.order, slice):
+            channels[:, self.order] = rows
+            return
+        rank = np.empty(channels.shape[1], np.int64)  # gathering by rank beats scattering by order
+        rank[self.order] = np.arange(len(self.order))
+        for symbols, channel in zip(rows, channels, strict=True):
+            channel[:] = symbols.take(rank)

@@ -10,11 +10,10 @@ from itertools import accumulate
 
 import numpy as np
 
-from pd4dgs_codec.entropy.channels import decode_joined, encode_channels
+from pd4dgs_codec.entropy.channels import Places, decode_joined, encode_channels
 from pd4dgs_codec.entropy.fitting import BIT, frequency_costs, histogram
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import Malformed
-from pd4dgs_codec.format.classes import CLASSES, Places, activity_classes, relative_magnitude
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, magnitude
 
 PlaneShape = tuple[int, int, int]  #: of a plane: channels, rows, columns
@@ -22,6 +21,8 @@ Array = np.ndarray
 
 #: Largest difference in cells between the positions of two renderers, which round coordinates differently.
 CELL_SLACK = 0.02
+CLASSES = 8  #: of a plane's cells by their activity
+EXACT = 1 << 53  #: binary64 holds every integer up to here
 
 
 #: Predictors by their id in the bitstream: N (on time planes, the previous instant), or the median of W, N and
@@ -199,6 +200,9 @@ def _filled(k: Array, given: Array, predictor: int) -> Array:
 
 # -- the planes section of mode ans (clauses 8.6 and 8.7) --------------------------------------------------------------
 
+# The residuals of one cell tend to be large together, so the channels of a plane are split by the *activity* of the
+# channels before. All arithmetic is on integers.
+
 
 def write_planes(residuals: Sequence[Array], priors: str, effort: int) -> tuple[bytes, float]:
     """Writes residuals int32 [C, H, W] per plane: (section bytes, sum of R(a) of all channels)."""
@@ -273,3 +277,29 @@ def _of_three(cells: np.ndarray) -> np.ndarray:
     sums[:, 0] += cells[:, 0]
     sums[:, -1] += cells[:, -1]
     return sums
+
+
+def relative_magnitude(residuals: np.ndarray) -> np.ndarray:
+    """Returns, at each of n places, the sum over channels int [m, n] of the magnitudes relative to their channel's
+    mean, in units of 1/256: integers below 2^8 m n in float64 [n]."""
+    total, unit = np.zeros(residuals.shape[1]), residuals.shape[1] << 8
+    for channel in residuals:
+        shares = np.abs(channel.astype(np.float64))
+        divisor = shares.sum() + 1  # below 2^53
+        if int(shares.max(initial=0)) * unit < EXACT:
+            # for integers below 2^53 the rounded quotient has the right floor, and floats divide faster
+            shares *= unit
+            shares /= divisor
+            total += np.floor(shares, out=shares)
+        else:
+            total += shares.astype(np.int64) * unit // int(divisor)
+    return total
+
+
+def activity_classes(activity: np.ndarray) -> np.ndarray:
+    """Returns classes uint8 [n], 0..CLASSES-1, of about equal size of places by their activity [n]."""
+    at = np.arange(1, CLASSES) * len(activity) // CLASSES
+    classes = np.zeros(len(activity), np.uint8)
+    for bound in np.sort(activity)[at]:  # sort takes a tenth of the time of np.partition; a search of 7, several times
+        classes += (activity >= bound).view(np.uint8)
+    return classes

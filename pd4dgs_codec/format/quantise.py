@@ -178,7 +178,7 @@ class Grid:
             if self.widths.graded:
                 at = self.centre[:, None] + at.astype(np.int64) * self._spacing(classes[rows])
             for name, own in attribute_rows(at, self.widths):
-                most[name] = max(most[name], int(own.max(initial=0)), -int(own.min(initial=0)))
+                most[name] = max(most[name], magnitude(own))
         return most
 
     def quantise(self, values: dict[str, np.ndarray], classes: np.ndarray) -> np.ndarray:

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pd4dgs_codec.format.classes import read_attributes, write_attributes
+from pd4dgs_codec.format.payload import read_attributes, write_attributes
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, NO_CLASSES
 from pd4dgs_codec.scene import Widths
 
