@@ -15,7 +15,6 @@ from torch import Tensor, nn
 
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.train.config import LearningRates
-from pd4dgs_codec.train.schedule import learning_rate
 
 #: Parameters with one row per anchor.
 PER_ANCHOR = ("feature", "scaling_log", "offset", "mask_logits")
@@ -151,3 +150,11 @@ class Optimiser:
             if shapes != [(), tuple(p.shape), tuple(p.shape)]:
                 raise ValueError(f"step and moments have shapes {shapes}, the parameter {tuple(p.shape)}")
             self.moments[p] = {name: value.to(p.device, torch.float32) for name, value in moments.items()}
+
+
+def learning_rate(bounds: tuple[float, float], progress: float, cooldown: float = 0.0) -> float:
+    """The rate at progress 0..1: log-linear between the bounds, times a factor that falls from 1 to 0 over the last
+    `cooldown` of the run."""
+    start, end = bounds
+    left = min((1 - progress) / cooldown, 1.0) if cooldown else 1.0
+    return start * math.pow(end / start, progress) * left

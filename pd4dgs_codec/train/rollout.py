@@ -17,12 +17,20 @@ import torch
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
-from pd4dgs_codec.train.phases.levels import held_back_views
+from pd4dgs_codec.train.phases.levels import other_views
 from pd4dgs_codec.train.phases.opening import window, within
-from pd4dgs_codec.train.schedule import CAPACITY_WEIGHTED, LOWEST, TOP, UNIFORM, Probabilities, rollout_probabilities
 from pd4dgs_codec.train.ssim import REACH
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
+Probabilities = tuple[float, float, float]  #: of levels 0, 1, 2
+
+#: Probabilities of the levels 0, 1, 2.
+UNIFORM: Probabilities = (1 / 3, 1 / 3, 1 / 3)
+CAPACITY_WEIGHTED: Probabilities = (0.15, 0.30, 0.55)
+TOP: Probabilities = (0.0, 0.0, 1.0)
+LOWEST: Probabilities = (1.0, 0.0, 0.0)
+#: Weight of the past in the moving average rho.
+RHO_DECAY = 0.95
 #: Share of the steps after the coarse phase that train level 0, and the share of these near the key instant.
 STILL_ODDS, NEAR_ODDS = 0.15, 1 / 3
 #: The views near the key instant: a share of all, and the fewest.
@@ -53,6 +61,18 @@ def draw_levels(state: TrainState) -> tuple[tuple[int, ...], Probabilities]:
     return (min(level, top),), probabilities
 
 
+def rollout_probabilities(rho: float) -> Probabilities:
+    """pi(rho) = (1 - rho) (1/3, 1/3, 1/3) + rho (.15, .30, .55), of the levels 0, 1, 2."""
+    low, mid, high = ((1 - rho) * u + rho * c for u, c in zip(UNIFORM, CAPACITY_WEIGHTED, strict=True))
+    return low, mid, high
+
+
+def updated_rho(rho: float, mask_0: Tensor, mask_2: Tensor) -> float:
+    """0.95 rho + 0.05 mean(m^(2) - m^(0)) of two tensors of masks, within [0, 1]."""
+    sample = float((mask_2 - mask_0).mean()) if len(mask_0) else 0.0
+    return min(max(RHO_DECAY * rho + (1 - RHO_DECAY) * sample, 0.0), 1.0)
+
+
 def next_view(state: TrainState, level: int) -> int:
     """Draws the training view of the next picture at `level`: a random one near the key instant where `_near` lists
     them, otherwise each in turn, in random order."""
@@ -60,9 +80,8 @@ def next_view(state: TrainState, level: int) -> int:
     if near:
         return near[int(torch.randint(len(near), (), generator=state.generator))]
     if not state.order:
-        held_back = _held_back(state)
-        drawn = torch.randperm(len(state.views), generator=state.generator).tolist()
-        state.order = [index for index in drawn if index not in held_back]
+        shown, drawn = set(_shown(state)), torch.randperm(len(state.views), generator=state.generator).tolist()
+        state.order = [index for index in drawn if index in shown]
     return state.order.pop()
 
 
@@ -70,8 +89,7 @@ def _near(state: TrainState, level: int) -> list[int]:
     """The views near the key instant from which the next one is drawn; none if any view may be drawn."""
     if level > 0 and window(state) >= 1:
         return []
-    held_back = _held_back(state)
-    among = [index for index in range(len(state.views)) if index not in held_back]
+    among = _shown(state)
     if level > 0:
         views = within(state, among)
         return [] if len(views) == len(among) or len(views) < NEAR_VIEWS else views
@@ -82,11 +100,11 @@ def _near(state: TrainState, level: int) -> list[int]:
     return near_key(state, among) if drawn else []
 
 
-def _held_back(state: TrainState) -> set[int]:
-    """The training views that are held back until levels are selected. A timed run may select them a few positions
-    behind `Schedule.rounding`, so its trial holds them back too."""
+def _shown(state: TrainState) -> list[int]:
+    """The training views that steps draw: all once levels are selected, before that those that are not held back for
+    it. A timed run may select levels a few positions behind `Schedule.rounding`, so its trial shows none of these."""
     selected = state.position > state.schedule.rounding and not state.practising
-    return set() if selected else held_back_views(state)
+    return list(range(len(state.views))) if selected else other_views(state)
 
 
 def near_key(state: TrainState, among: list[int]) -> list[int]:

@@ -17,10 +17,9 @@ from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.networks import EXACT, Noise, Rounding
 from pd4dgs_codec.quality.measure import level_psnr
 from pd4dgs_codec.scene import MASK_THRESHOLD, instant
-from pd4dgs_codec.train.config import TrainConfig
+from pd4dgs_codec.train.config import GUIDED_SHARE, Schedule, TrainConfig
 from pd4dgs_codec.train.initialise import fresh_model
 from pd4dgs_codec.train.optimiser import PER_ANCHOR, Optimiser
-from pd4dgs_codec.train.schedule import GUIDED_SHARE, Schedule, reduction
 from pd4dgs_codec.train.ssim import Part, pixel_weights, within_reach
 
 #: Bytes of images on the device, weights included, beyond which the least recently used are dropped.
@@ -190,8 +189,7 @@ class TrainState:
 
     def picture(self, index: int) -> TrainingView:
         """Training view `index` as the steps at this position see it: reduced at first if large."""
-        progress = self.schedule.progress(self.position)
-        return self.views.reduced(index, reduction(progress, self.config.small_pictures))
+        return self.views.reduced(index, self.schedule.reduction(self.position, self.config.small_pictures))
 
     def measured_levels(self) -> list[int]:
         """The levels in which phases measure errors, ascending: level 0, if the run trains it, and the highest. Level 1

@@ -10,8 +10,7 @@ from runs import trainer_of
 from pd4dgs_codec.model.picture import render
 from pd4dgs_codec.train import rollout
 from pd4dgs_codec.train.learner import Learner
-from pd4dgs_codec.train.rollout import draw_levels, near_key, next_view, without_motion
-from pd4dgs_codec.train.schedule import LOWEST
+from pd4dgs_codec.train.rollout import LOWEST, draw_levels, near_key, next_view, without_motion
 from pd4dgs_codec.train.ssim import REACH
 
 
