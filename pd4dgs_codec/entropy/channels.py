@@ -10,7 +10,7 @@ The ANS words of each channel's symbols follow.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import accumulate
 
 import numpy as np
@@ -36,7 +36,6 @@ from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
 class CodedChannels:
     payload: bytes
     rate_bits: float  #: the sum of R(a), which does not depend on the priors
-    defined: list[Fitted] = field(default_factory=list)  #: the new priors, in the order of definition
 
     @property
     def payload_bits(self) -> int:
@@ -66,38 +65,29 @@ def check_channels(channels: Sequence[np.ndarray]) -> list[np.ndarray]:
 
 
 def encode_channels(
-    channels: Sequence[np.ndarray], *, priors: str = "best", effort: int = 5, known: Sequence[Fitted] = ()
+    channels: Sequence[np.ndarray], *, priors: str = "best", effort: int = 5, known: list[Fitted] | None = None
 ) -> CodedChannels:
     """Encodes int32 channels (1-D, any lengths, |k| <= 2**24) into one payload.
 
     priors: "gauss" allows only const and gauss, the model of R(a). "best" allows every prior.
-    effort: 1..9, time spent on fitting. known: priors of earlier payloads, in order; a decoder must have them too.
-    Raises EncodeError.
+    effort: 1..9, time spent on fitting. known: priors of earlier payloads, in order; a decoder must have them too. The
+    new ones are appended. Raises EncodeError.
     """
     if priors not in PRIORS or effort not in EFFORTS:
         raise EncodeError(f"expected priors best or gauss and effort 1..9, found {priors!r} and {effort}")
     arrays = check_channels(channels)
     histograms = [histogram(a) for a in arrays if len(a)]
     fit: Fit = (lambda h: fit_best(h, effort)) if priors == "best" and effort > 1 else fit_gauss
-    payload, defined = _encode(arrays, plan_priors(histograms, fit, effort > 2, known), known)
-    return CodedChannels(payload, sum(h.rate_bits for h in histograms), defined)
-
-
-def _encode(
-    arrays: Sequence[np.ndarray], plan: Sequence[Fitted], known: Sequence[Fitted]
-) -> tuple[bytes, list[Fitted]]:
-    """Returns (payload, new priors)."""
-    out = bytearray()
-    defined, fresh = [fitted.prior for fitted in known], list[Fitted]()
-    symbols, cums = list[np.ndarray](), list[np.ndarray]()
+    known = [] if known is None else known
+    plan = plan_priors(histograms, fit, effort > 2, known)
+    out, symbols, cums = bytearray(), list[np.ndarray](), list[np.ndarray]()
     for array, fitted in zip(filter(len, arrays), plan, strict=True):
-        prior = fitted.prior
-        inside, exceptions = _split(array, prior.window)
-        if _write_channel(out, prior, exceptions, defined):
-            fresh.append(fitted)
-        symbols.append(inside - prior.window.kmin)
-        cums.append(prior.cum)
-    return bytes(out) + ans_encode(symbols, cums), fresh
+        window = fitted.prior.window
+        inside, exceptions = _split(array, window)
+        _write_channel(out, fitted, exceptions, known)
+        symbols.append(inside - window.kmin)
+        cums.append(fitted.prior.cum)
+    return CodedChannels(bytes(out) + ans_encode(symbols, cums), sum(h.rate_bits for h in histograms))
 
 
 def _split(array: np.ndarray, window: Window) -> tuple[np.ndarray, _Exceptions]:
@@ -109,14 +99,15 @@ def _split(array: np.ndarray, window: Window) -> tuple[np.ndarray, _Exceptions]:
     return array[~out], _Exceptions(positions, array[positions])
 
 
-def _write_channel(out: bytearray, prior: Prior, exceptions: _Exceptions, defined: list[Prior]) -> bool:
-    """Writes a channel's record. Returns whether it defines its prior, which is then appended to `defined`."""
-    back = next((i for i, known in enumerate(reversed(defined)) if known is prior), None)
+def _write_channel(out: bytearray, fitted: Fitted, exceptions: _Exceptions, known: list[Fitted]) -> None:
+    """Writes a channel's record. If it defines its prior, this is appended to `known`."""
+    prior = fitted.prior
+    back = next((i for i, other in enumerate(reversed(known)) if other.prior is prior), None)
     family = prior.id if back is None else FIRST_REUSE + back
     put_varint(out, 2 * family + (len(exceptions.positions) > 0))
     if back is None:
         prior.write(out)
-        defined.append(prior)
+        known.append(fitted)
     if len(exceptions.positions):
         put_varint(out, len(exceptions.positions) - 1)
         kmin, end = prior.window.kmin, prior.window.end
@@ -124,7 +115,6 @@ def _write_channel(out: bytearray, prior: Prior, exceptions: _Exceptions, define
         for gap, value in zip(gaps.tolist(), exceptions.values.tolist(), strict=True):
             put_varint(out, gap)
             put_varint(out, 2 * (kmin - 1 - value) + 1 if value < kmin else 2 * (value - end))
-    return back is None
 
 
 def _read_exceptions(reader: ByteReader, count: int, window: Window) -> _Exceptions:

@@ -47,10 +47,7 @@ def encode_positions(cells: np.ndarray, effort: int = 5, known: list[Fitted] | N
     head, channels = position_channels(cells)
     if not head:
         return b""
-    coded = encode_channels(channels, effort=max(effort, LEAST_EFFORT), known=known or ())
-    if known is not None:
-        known += coded.defined
-    return head + coded.payload
+    return head + encode_channels(channels, effort=max(effort, LEAST_EFFORT), known=known).payload
 
 
 def position_channels(cells: np.ndarray) -> tuple[bytes, list[np.ndarray]]:

@@ -199,7 +199,6 @@ def _write_ans(
     masks = [symbols.mask_increase, symbols.mask_own]
     if any(channel.size for channel in masks):
         found = encode_channels(masks, priors=options.priors, effort=options.effort, known=past.masks)
-        past.masks += found.defined
         sections[Section.MASKS] = found.payload, found.rate_bits
     if symbols.attributes.size:
         sections[Section.ATTRIBUTES] = write_attributes(
@@ -324,7 +323,6 @@ def write_attributes(
     which those of this one are added.
     """
     coded = encode_channels(list(by_class(attributes, classes)), priors=priors, effort=effort, known=known)
-    known += coded.defined
     if not classes.size:
         return coded.payload, coded.rate_bits
     out, graded = bytearray(), encode_channels([classes], effort=effort).payload

@@ -94,7 +94,7 @@ def test_the_cost_of_exceptions_is_that_of_their_bytes(number, value):
     known, symbols = fit_best(histogram(inside), 5), inside.copy()
     symbols[: 10 * number : 10] = value
     out, (kept, exceptions) = bytearray(), channels._split(symbols, known.prior.window)
-    channels._write_channel(out, known.prior, exceptions, [known.prior])
+    channels._write_channel(out, known, exceptions, [known])
     cost = known.costs[kept].sum() + 8 * BIT * (len(out) - 1)  # without the token of the prior
     assert fitting.costs_of([histogram(symbols)], [known]) == cost
 
