@@ -245,10 +245,6 @@ class Grading:
     classes: np.ndarray
     centre: np.ndarray
 
-    def take(self, rows: np.ndarray | slice) -> Grading:
-        """Returns the step classes of the anchors `rows`, in this order."""
-        return replace(self, classes=self.classes[rows])
-
 
 @dataclass(frozen=True, eq=False)
 class Scene:
@@ -310,7 +306,7 @@ class Scene:
 
     def of_anchors(self, rows: np.ndarray | slice) -> dict[str, Any]:
         """Returns the fields of the anchors `rows`, without masks, as arguments of `dataclasses.replace`."""
-        grading = None if self.grading is None else self.grading.take(rows)
+        grading = self.grading and replace(self.grading, classes=self.grading.classes[rows])
         attributes = {name: values[rows] for name, values in self.attributes.items()}
         return {"anchor_q": self.anchor_q[rows], **attributes, "grading": grading}
 

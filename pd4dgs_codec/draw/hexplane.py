@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.draw.layers import Layers
+from pd4dgs_codec.draw.layers import Layers, whole
 from pd4dgs_codec.draw.simd import LANES, Array, Tasks, Vector, fma, fnma, kernel, load, parallel, splat, store, total
 from pd4dgs_codec.scene import LENGTH_HEADS, PLANES, TRUNK, Deformation, Network, deformation_unit, instant, plane_sides
 
@@ -316,7 +316,7 @@ class Field:
         self._box = np.ascontiguousarray(box, np.float32)
         self._layout = PlaneLayout.build([plane_sides(scale) for scale in deformation.planes])
         channels = deformation.planes[0]["xy"].shape[0]
-        self._channels = -(-channels // LANES) * LANES  # padded channels and their products are 0
+        self._channels = whole(channels, LANES)  # padded channels and their products are 0
         self._grid = np.zeros((self._layout.n_cells, self._channels), np.float32)
         for views, scale in zip(self._layout.views(self._grid), deformation.planes, strict=True):
             for name, _, _ in PLANES:

@@ -20,6 +20,7 @@ import torch.nn.functional as F
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from pd4dgs_codec.draw.layers import whole
 from pd4dgs_codec.draw.simd import LANES, Tasks, fma, fnma, kernel, load, parallel, splat, store
 from pd4dgs_codec.quality.image import C1, C2, GAUSSIAN
 
@@ -93,15 +94,11 @@ def within_reach(differs: Tensor) -> slice:
     return slice(max(0, found[0] - 2 * REACH), found[-1] + 1 + 2 * REACH)
 
 
-def lanes(width: int) -> int:
-    """3 * width rounded up to whole vectors."""
-    return -(-3 * width // LANES) * LANES
-
-
 def pad(image: np.ndarray) -> np.ndarray:
     """[H, W, 3] -> padded image."""
     height, width = image.shape[:2]
-    out = np.zeros((height + 2 * REACH, lanes(lanes(width) // 3 + 2 * REACH + 1)), image.dtype)
+    lanes = 3 * (whole(3 * width, LANES) // 3 + 2 * REACH + 1)
+    out = np.zeros((height + 2 * REACH, whole(lanes, LANES)), image.dtype)
     out[REACH:-REACH, SIDE : SIDE + 3 * width] = image.reshape(height, -1)
     return out
 
