@@ -16,7 +16,7 @@ from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.picture import Picture, render
 from pd4dgs_codec.threads import keep_freed_memory
 from pd4dgs_codec.train import workers
-from pd4dgs_codec.train.config import PRUNING_ROUNDS, Schedule, TrainConfig
+from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.losses import ModelLoss
 from pd4dgs_codec.train.phases import Phase
 from pd4dgs_codec.train.phases.grow import Grow
@@ -27,6 +27,7 @@ from pd4dgs_codec.train.phases.prefixes import Prefixes
 from pd4dgs_codec.train.phases.prune import Prune
 from pd4dgs_codec.train.phases.quantisation import FitQuantisation
 from pd4dgs_codec.train.rollout import draw_levels, next_view, updated_rho, without_motion
+from pd4dgs_codec.train.schedule import PRUNING_ROUNDS, Schedule
 from pd4dgs_codec.train.ssim import image_loss
 from pd4dgs_codec.train.state import TrainState
 

@@ -22,8 +22,9 @@ from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.signals import stop_request
 from pd4dgs_codec.threads import one_torch_thread
 from pd4dgs_codec.train import workers
-from pd4dgs_codec.train.config import COARSE_SHARE, Schedule, TrainConfig
+from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.learner import Learner
+from pd4dgs_codec.train.schedule import COARSE_SHARE, Schedule
 
 #: A timed run estimates the N of its schedule after TIMED_STEPS steps. A slow run does so once it has spent the coarse
 #: phase's share of the limit, but not before FEWEST_TIMED_STEPS of this process, whose first steps compile kernels.

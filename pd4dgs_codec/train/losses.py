@@ -21,8 +21,9 @@ from pd4dgs_codec.model.rate import row_bits
 from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import ATTRIBUTES, MASK_THRESHOLD
 from pd4dgs_codec.threads import aside
-from pd4dgs_codec.train.config import Schedule, TrainConfig
+from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.optimiser import PER_ANCHOR
+from pd4dgs_codec.train.schedule import Schedule
 
 INSIDE = (1e-6, 1 - 1e-6)  #: masks are clamped to this inside logarithms
 Weighted = tuple[str, float, Tensor]  #: a term's name, weight and value

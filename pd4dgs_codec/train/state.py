@@ -17,9 +17,10 @@ from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.networks import EXACT, Noise, Rounding
 from pd4dgs_codec.quality.measure import level_psnr
 from pd4dgs_codec.scene import MASK_THRESHOLD, instant
-from pd4dgs_codec.train.config import GUIDED_SHARE, Schedule, TrainConfig
+from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.initialise import fresh_model
 from pd4dgs_codec.train.optimiser import PER_ANCHOR, Optimiser
+from pd4dgs_codec.train.schedule import GUIDED_SHARE, Schedule
 from pd4dgs_codec.train.ssim import Part, pixel_weights, within_reach
 
 #: Bytes of images on the device, weights included, beyond which the least recently used are dropped.

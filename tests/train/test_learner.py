@@ -10,9 +10,10 @@ import torch
 
 from pd4dgs_codec.errors import NotFinite, RenderError
 from pd4dgs_codec.train import state
-from pd4dgs_codec.train.config import ABLATIONS, Schedule, TrainConfig
+from pd4dgs_codec.train.config import ABLATIONS, TrainConfig
 from pd4dgs_codec.train.learner import Learner
 from pd4dgs_codec.train.optimiser import PER_ANCHOR
+from pd4dgs_codec.train.schedule import Schedule
 from pd4dgs_codec.train.state import TrainingView
 
 

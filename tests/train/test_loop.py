@@ -16,10 +16,11 @@ from pd4dgs_codec.errors import DataError, TrainError
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.model import to_scene
 from pd4dgs_codec.train import loop, phases
-from pd4dgs_codec.train.config import ABLATIONS, PRUNING_ROUNDS, Schedule, TrainConfig
+from pd4dgs_codec.train.config import ABLATIONS, TrainConfig
 from pd4dgs_codec.train.loop import RecordLog, Trainer
 from pd4dgs_codec.train.phases import opening
 from pd4dgs_codec.train.phases.prune import Prune
+from pd4dgs_codec.train.schedule import PRUNING_ROUNDS, Schedule
 
 
 def test_it_learns_and_logs_every_term(dataset, tmp_path):

@@ -23,7 +23,7 @@ from pd4dgs_codec.model.picture import render, render_image
 from pd4dgs_codec.model.sensitivity import rounding_error
 from pd4dgs_codec.scene import ATTRIBUTES, MASK_THRESHOLD, MAX_CLASS
 from pd4dgs_codec.train import learner, losses, rollout
-from pd4dgs_codec.train.config import PRUNING_ROUNDS, Schedule, TrainConfig
+from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.loop import Trainer
 from pd4dgs_codec.train.phases import levels, opening, prefixes, prune, quantisation
 from pd4dgs_codec.train.phases.levels import held_back_views
@@ -31,6 +31,7 @@ from pd4dgs_codec.train.phases.prefixes import draw_prefix, rank_anchors
 from pd4dgs_codec.train.phases.prune import Prune, added_error, least, round_of
 from pd4dgs_codec.train.phases.quantisation import classes_within, whiten, whitening_transform
 from pd4dgs_codec.train.rollout import next_view
+from pd4dgs_codec.train.schedule import PRUNING_ROUNDS, Schedule
 
 
 @pytest.mark.usefixtures("short_runs_have_phases")

@@ -19,9 +19,9 @@ from pd4dgs_codec.model.networks import Rounding, mask_logits
 from pd4dgs_codec.model.sensitivity import omission_error
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train import workers
-from pd4dgs_codec.train.config import PRUNING_ROUNDS
 from pd4dgs_codec.train.phases import Phase, long_enough
 from pd4dgs_codec.train.phases.levels import other_views
+from pd4dgs_codec.train.schedule import PRUNING_ROUNDS
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
 #: Training views in which an anchor is measured; each round uses others.
