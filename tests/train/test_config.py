@@ -8,18 +8,10 @@ import torch
 
 from pd4dgs_codec.errors import TrainError
 from pd4dgs_codec.scene import Steps
-from pd4dgs_codec.train.config import (
-    ABLATIONS,
-    COARSENED,
-    DIAL,
-    SHORT_RUN,
-    LearningRates,
-    Schedule,
-    TrainConfig,
-    at_quality,
-)
+from pd4dgs_codec.train.config import ABLATIONS, COARSENED, DIAL, SHORT_RUN, LearningRates, TrainConfig, at_quality
 from pd4dgs_codec.train.optimiser import learning_rate
 from pd4dgs_codec.train.rollout import rollout_probabilities, updated_rho
+from pd4dgs_codec.train.schedule import Schedule
 
 
 @pytest.mark.parametrize(
