@@ -16,8 +16,17 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.entropy.ans import TOTAL
-from pd4dgs_codec.entropy.fitting import BIT, LOG2, frequency_costs
-from pd4dgs_codec.entropy.priors import FLOOR, NORMAL, OCTAVE, SI_MAX, SI_MIN, norm_cdf28_of_each
+from pd4dgs_codec.entropy.priors import (
+    BIT,
+    FLOOR,
+    LOG2,
+    NORMAL,
+    OCTAVE,
+    SI_MAX,
+    SI_MIN,
+    frequency_costs,
+    norm_cdf28_of_each,
+)
 
 try:
     from numba import njit
@@ -41,7 +50,7 @@ P_MIN, SIGMA_MIN = 1e-6, 2.0**-10
 
 @_inlined
 def frequency_cost(frequency: int) -> Any:
-    """`fitting.frequency_costs` of one frequency."""
+    """`priors.frequency_costs` of one frequency."""
     bits = np.float64(frequency).view(np.int64)
     i, f = (bits >> 40) & 4095, (bits >> 28) & 4095
     log2 = (((bits >> 52) - 1023) * BIT) + LOG2[i] + (((LOG2[i + 1] - LOG2[i]) * f) >> 12)

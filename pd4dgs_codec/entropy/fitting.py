@@ -12,12 +12,12 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from importlib import import_module
 from types import ModuleType
 
 import numpy as np
 
 from pd4dgs_codec.entropy.priors import (
+    BIT,
     FREE_ENTRIES,
     K_MAX,
     MAX_WINDOW,
@@ -34,19 +34,7 @@ BLOCK = 256  #: channels planned together; keeps the cost matrix small
 WIDE = 1024  #: most distinct symbols of a channel that takes part in sharing; beyond, a prior's few bytes do not matter
 
 
-# -- costs and counts --------------------------------------------------------------------------------------------------
-
-BIT = 1 << 20  #: one bit in integer costs, whose sums do not depend on their order
-#: log2(1 + i / 4096) in these units, the last one twice. Linear interpolation is off by less than 2e-8 bits.
-LOG2 = np.rint(np.log2(1 + np.minimum(np.arange(4098), 4096) / 4096) * BIT).astype(np.int64)
-
-
-def frequency_costs(frequencies: np.ndarray) -> np.ndarray:
-    """Returns the costs 24 - log2(f), int64 [...] in units of 2^-20 bits, of frequencies f int64 [...], 1 .. 2^24."""
-    bits = frequencies.astype(np.float64).view(np.int64)  # exponent and mantissa, IEEE 754
-    i, f = (bits >> 40) & 4095, (bits >> 28) & 4095
-    log2: np.ndarray = (((bits >> 52) - 1023) * BIT) + LOG2[i] + (((LOG2[i + 1] - LOG2[i]) * f) >> 12)
-    return 24 * BIT - log2
+# -- entropy -----------------------------------------------------------------------------------------------------------
 
 
 def order0_bits(counts: np.ndarray) -> float:
@@ -67,7 +55,9 @@ def entropy_bits(symbols: np.ndarray) -> float:
 @cache
 def loops() -> ModuleType:
     """Imports the inner loops at the first fit: decoding imports this module too and must not load numba."""
-    return import_module("pd4dgs_codec.entropy.fit_kernels")
+    from pd4dgs_codec.entropy import fit_kernels
+
+    return fit_kernels
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,8 @@ from itertools import accumulate
 import numpy as np
 
 from pd4dgs_codec.entropy.channels import Places, decode_joined, encode_channels
-from pd4dgs_codec.entropy.fitting import BIT, frequency_costs, histogram
+from pd4dgs_codec.entropy.fitting import histogram
+from pd4dgs_codec.entropy.priors import BIT, frequency_costs
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, magnitude

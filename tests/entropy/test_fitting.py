@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from pd4dgs_codec.entropy import channels, fit_kernels, fitting
 from pd4dgs_codec.entropy.channels import encode_channels
-from pd4dgs_codec.entropy.fitting import BIT, fit_best, histogram, pool
+from pd4dgs_codec.entropy.fitting import fit_best, histogram, pool
+from pd4dgs_codec.entropy.priors import BIT
 
 
 def _channel(seed: int) -> np.ndarray:
