@@ -306,7 +306,7 @@ class Scene:
 
     def of_anchors(self, rows: np.ndarray | slice) -> dict[str, Any]:
         """Returns the fields of the anchors `rows`, without masks, as arguments of `dataclasses.replace`."""
-        grading = self.grading and replace(self.grading, classes=self.grading.classes[rows])
+        grading = None if self.grading is None else replace(self.grading, classes=self.grading.classes[rows])
         attributes = {name: values[rows] for name, values in self.attributes.items()}
         return {"anchor_q": self.anchor_q[rows], **attributes, "grading": grading}
 

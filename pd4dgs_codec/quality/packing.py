@@ -32,7 +32,7 @@ Progress = Callable[[str], AbstractContextManager[Callable[[], None]]]
 @dataclass(frozen=True)
 class Views:
     """The views that packing uses. source: their dataset, for the report. fitting: for target sizes and the order of
-    slices. held_out: for the mPSNR that is reported, and decide nothing."""
+    slices. held_out: for the reported mPSNR; they decide nothing."""
 
     source: str
     fitting: Sequence[View]

@@ -1,4 +1,4 @@
-"""encode with quality in renderings: target sizes, layers with too little gain, the effect of single anchors."""
+"""encode with quality in renderings: target sizes, the effect of single anchors."""
 
 from dataclasses import replace
 
