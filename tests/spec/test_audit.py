@@ -1,4 +1,4 @@
-"""spec/audit.md names what there is: vectors, registered numbers, and the sizes of the decoders."""
+"""spec/audit.md names what there is: vectors and registered numbers."""
 
 import json
 import re
