@@ -24,8 +24,8 @@ it stops the run early. Ctrl-C, SIGTERM or a closed terminal stops the run after
 checkpoint, from which --resume continues. A second Ctrl-C stops it at once and loses the steps since the last save (one
 a minute).
 
---quality sets the weights of the bitrate, pruning and quantisation steps together; --rate-scale, --prune and --grading
-override single ones.
+--quality sets the weights of the bitrate, growing, pruning and quantisation steps together; --rate-scale, --prune and
+--grading override single ones.
 
 At two thirds of a run, layers that gain too little on held-back views are dropped; runs of fewer than 500 steps, timed
 runs of fewer than 1,000 and --keep-layers keep all.

@@ -210,7 +210,8 @@ class TrainConfig:
     ssim: float = 0.2
     volume: float = 0.01  #: weight of the mean product of scales (Scaffold-GS)
     noise: bool = True  #: simulate quantisation: noise on attributes, rounding of planes and weights, finally of all
-    grow_threshold: float = 2e-4
+    #: anchors grow where the mean image gradient of a Gaussian exceeds this, see `phases.grow`
+    grow_threshold: float = option(2e-4, above=0, dial=2.0, fixed=False)
     #: multiplies the steps of features, log-scalings and planes
     step_scale: float = option(1.16, above=0, dial=1.6, fixed=False)
     rates: LearningRates = field(default_factory=LearningRates)
