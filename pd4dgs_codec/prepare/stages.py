@@ -15,6 +15,7 @@ import stat
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import asdict, astuple, dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -383,18 +384,33 @@ class Findings:
     features: Mapping[str, Features]
     moving: Mapping[str, np.ndarray]
 
+    @cached_property
+    def errors(self) -> dict[int, float]:
+        """Mean reprojection error of each picture's points, pixels, by the picture's number."""
+        errors = {}
+        for image in self.model.images.values():
+            seen = [point for point in image.points2D if point.has_point3D()] if image.has_pose else []
+            if not seen:
+                continue
+            world = np.array([self.model.point3D(point.point3D_id).xyz for point in seen])
+            camera, pose = self.model.camera(image.camera_id), image.cam_from_world().matrix()
+            projected = camera.img_from_cam(world @ pose[:, :3].T + pose[:, 3])
+            gaps = projected - np.array([point.xy for point in seen])
+            errors[image.image_id] = float(np.nanmean(np.hypot(gaps[:, 0], gaps[:, 1])))
+        return errors
+
 
 def numbers(findings: Findings, looks: Sequence[Look], choice: Choice, times: Mapping[str, float]) -> dict[str, Any]:
     """The report for report.json. Errors are in pixels of the written pictures."""
     model = findings.model
     registered = {image.name: image for image in model.images.values() if image.has_pose}
-    errors, camera = _errors(model), next(iter(model.cameras.values()))
+    camera = next(iter(model.cameras.values()))
     moving = {name: int(each.sum()) for name, each in findings.moving.items()}
     rows = []
     for name in sorted(times):
         row: dict[str, Any] = {"name": name, "seconds": times[name], "pose": name in registered}
         if image := registered.get(name):
-            row |= {"points": image.num_points3D, "reprojection_error": errors.get(image.image_id)}
+            row |= {"points": image.num_points3D, "reprojection_error": findings.errors.get(image.image_id)}
             row["moving_features"] = moving.get(name, 0)
         rows.append(row)
     counts = {"seen": looks, "blurred": choice.blurred, "repeated": choice.repeated, "chosen": choice.chosen}
@@ -411,21 +427,6 @@ def numbers(findings: Findings, looks: Sequence[Look], choice: Choice, times: Ma
         "moving_share": sum(moving.values()) / max(sum(map(len, findings.moving.values())), 1),
         "pictures": rows,
     }
-
-
-def _errors(model: Any) -> dict[int, float]:
-    """Mean reprojection error of each picture's points, pixels, by the picture's number."""
-    errors = {}
-    for image in model.images.values():
-        seen = [point for point in image.points2D if point.has_point3D()] if image.has_pose else []
-        if not seen:
-            continue
-        world = np.array([model.point3D(point.point3D_id).xyz for point in seen])
-        camera, pose = model.camera(image.camera_id), image.cam_from_world().matrix()
-        projected = camera.img_from_cam(world @ pose[:, :3].T + pose[:, 3])
-        gaps = projected - np.array([point.xy for point in seen])
-        errors[image.image_id] = float(np.nanmean(np.hypot(gaps[:, 0], gaps[:, 1])))
-    return errors
 
 
 def _angle(model: Any) -> float:
@@ -474,7 +475,7 @@ def draw(
     from matplotlib import pyplot
     from PIL import Image
 
-    model, errors = findings.model, _errors(findings.model)
+    model, errors = findings.model, findings.errors
     posed = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
     seconds = [times[image.name] for image in posed]
     figure = pyplot.figure(figsize=(13, 11))

@@ -49,7 +49,7 @@ async function compare(url, cases, bandPoints) {
         const other = shaded.get(number) ?? record;
         for (const k of columns) {
           size = Math.max(size, Math.abs(record[k]));
-          if (!(Math.abs(record[k] - other[k]) <= most)) most = Math.abs(record[k] - other[k]);
+          most = Math.max(most, Math.abs(record[k] - other[k]));
         }
       }
       return [name, most / size];

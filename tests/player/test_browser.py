@@ -252,7 +252,7 @@ def test_both_evaluators_agree(harness, folder, server, options):
     assert result["error"] == 0
     for case, got in zip(cases, result["cases"], strict=True):
         assert got["count"] > 50 and got["lonely"] == 0, (case, got)
-        assert max(got["worst"].values()) < 2e-4, (case, got)
+        assert all(error < 2e-4 for error in got["worst"].values()), (case, got)  # false for NaN
     if scene.widths.shapes_are_blind:  # another eye changes colours alone
         assert not any(got["moved"] for got in result["cases"][2::4])
 
