@@ -152,11 +152,32 @@ def _stored_depth(folder: Path, file: dict[str, Any]) -> tuple[float, float] | N
     return near, far
 
 
+def _listed_split(
+    path: Path, file: dict[str, Any], frames: list[UnreadView]
+) -> tuple[list[UnreadView], list[UnreadView]] | None:
+    """(training, test) frames by nerfstudio's train_filenames and test_filenames or val_filenames; None without them.
+    A frame in none of the lists is not read."""
+    parts = [("train_filenames",), ("test_filenames", "val_filenames")]
+    keys = [next((key for key in part if file.get(key)), part[0]) for part in parts]
+    if not any(file.get(key) for key in keys):
+        return None
+    named = {listed["file_path"]: frame for listed, frame in zip(file["frames"], frames, strict=True)}
+    for key in keys:
+        names = file.get(key)
+        if not isinstance(names, list) or not names or not all(isinstance(n, str) and n in named for n in names):
+            raise DataError(f"{path}: {key} is {one_line(repr(names), 60)}, expected a list of frames' file_path")
+    train, test = ([named[name] for name in dict.fromkeys(file[key])] for key in keys)
+    return train, test
+
+
 def read_transforms(folder: Path, downscale: int, holdout: int, background: Color | None) -> Dataset:
-    """Reads a folder with transforms*.json (see `dataset.load`); a test or val file overrides `holdout`."""
+    """Reads a folder with transforms*.json (see `dataset.load`); a split by files or lists overrides `holdout`."""
     train_file, test_file = _choose(folder)
     frames, file = _frames(folder, train_file)
-    train, test = held_out(frames, holdout) if test_file is None else (frames, _frames(folder, test_file)[0])
+    if test_file is not None:
+        train, test = frames, _frames(folder, test_file)[0]
+    else:
+        train, test = _listed_split(train_file, file, frames) or held_out(frames, holdout)
     named = file.get("ply_file_path")
     points = read_ply(inside(folder, named)) if isinstance(named, str) else read_only_ply(folder)
     return posed_dataset(folder, train, test, points, downscale, _stored_depth(folder, file), background)

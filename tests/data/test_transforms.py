@@ -106,6 +106,10 @@ FAULTS = {
         ("transforms.json", {"camera_model": {}}, "camera_model is {}, expected a name"),
         ("transforms.json", frame(mask_path=3), "mask_path is 3, expected the name of a picture"),
         ("transforms.json", frame(mask_path="m/0.png"), "m/0.png: image is missing"),
+        ("transforms.json", {"train_filenames": ["r_0"]}, "test_filenames is None, expected a list of frames"),
+        ("transforms.json", {"train_filenames": 3}, "train_filenames is 3, expected a list of frames"),
+        ("transforms.json", {"train_filenames": ["r_7"]}, "train_filenames is ['r_7'], expected a list of frames"),
+        ("transforms.json", {"test_filenames": [["r_0"]]}, "train_filenames is None, expected a list of frames"),
         ("transforms.json", {"ply_file_path": "../points.ply"}, "'../points.ply' is not the name of a file in"),
         ("transforms.json", {"ply_file_path": "/etc/passwd"}, "'/etc/passwd' is not the name of a file in"),
         ("transforms.json", {"ply_file_path": "p\0.ply"}, "is not the name of a file in"),
@@ -351,6 +355,19 @@ def test_masks_of_frames_are_read_and_resampled(tmp_path, name):
         dark = view.image.min(axis=2) < 60
         assert 0.1 < dark.mean() < 0.3 and not view.mask[dark].any()
         assert view.mask[seen].mean() > 0.7 and not view.mask[~seen].any()
+
+
+@pytest.mark.parametrize("held", ["test_filenames", "val_filenames"])
+def test_a_listed_split_goes_before_the_holdout(tmp_path, held):
+    """nerfstudio's lists, in their order; the fourth frame is in none of them and not read."""
+    write_blender(None, tmp_path / "scene")
+    path = tmp_path / "scene" / "transforms.json"
+    frames = [{k: v for k, v in f.items() if k != "time"} for f in (*FRAMES, FRAMES[0] | {"file_path": "r_2.png"})]
+    file = json.loads(path.read_text()) | {"frames": frames, "near_far_per_frame": None}
+    save(path, file | {"train_filenames": ["r_2", "r_0", "r_2"], "test_filenames": [], held: ["r_1"]})
+    d = load(tmp_path / "scene", holdout=2)
+    assert [view.name for view in d.train] == ["r_2", "r_0"] and [view.name for view in d.test] == ["r_1"]
+    assert [view.time for view in d.train + d.test] == pytest.approx([1, 0, 1 / 2])
 
 
 @pytest.mark.slow
