@@ -157,8 +157,8 @@ def _listed_split(
 ) -> tuple[list[UnreadView], list[UnreadView]] | None:
     """(training, test) frames by nerfstudio's train_filenames and test_filenames or val_filenames; None without them.
     A frame in none of the lists is not read."""
-    parts = [("train_filenames",), ("test_filenames", "val_filenames")]
-    keys = [next((key for key in part if file.get(key)), part[0]) for part in parts]
+    held = "test_filenames" if file.get("test_filenames") or not file.get("val_filenames") else "val_filenames"
+    keys = ("train_filenames", held)
     if not any(file.get(key) for key in keys):
         return None
     named = {listed["file_path"]: frame for listed, frame in zip(file["frames"], frames, strict=True)}
