@@ -16,6 +16,7 @@ from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model, fresh_networks
 from pd4dgs_codec.morton import MAX_VOXEL
 from pd4dgs_codec.scene import INSTANTS, SceneInfo, Steps, Widths
+from pd4dgs_codec.train.stereo import with_points
 
 #: Voxels along the longest side of the scene's box.
 GRID = 1024
@@ -41,9 +42,12 @@ def fresh_model(
 ) -> Model:
     """Returns an untrained model without the deformations of the layers above max_layer.
 
-    Anchors start at the dataset's points, with jittered copies if there are few, or else in its box. A layer's
-    start values do not depend on max_layer. key: the key instant, normalised time; None: no key instant.
+    Anchors start at the dataset's points, with jittered copies if there are few. Without points they start in its box
+    where pictures differ from a plain background, or at points found by stereo if there is none. A layer's start values
+    do not depend on max_layer. key: the key instant, normalised time; None: no key instant.
     """
+    if dataset.points is None and not on_plain_background(dataset):
+        dataset = with_points(dataset, key)
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)  # nn.Linear and HexPlane draw their start values from the global generator
     info = scene_info(dataset)
@@ -127,19 +131,31 @@ def near_box(points: Tensor, box: Tensor) -> Tensor:
     return near
 
 
+def on_plain_background(dataset: Dataset) -> bool:
+    """Whether half of the pixels at the borders of the training views show the background."""
+    edges = [line for v in dataset.train for line in (v.image[0], v.image[-1], v.image[:, 0], v.image[:, -1])]
+    return not _shown(np.concatenate(edges), dataset).mean() > 0.5
+
+
+def _shown(pixels: np.ndarray, dataset: Dataset) -> np.ndarray:
+    """bool [...]: which `pixels` (uint8 [..., 3]) differ from the background."""
+    background = np.array(dataset.background, np.float32) * 255
+    shown: np.ndarray = np.abs(pixels - background).max(-1) > CARVE_CONTRAST
+    return shown
+
+
 def carved_points(dataset: Dataset, count: int, generator: torch.Generator) -> Tensor:
     """float32 [count, 3] random points of the box, more likely where more training views show an object.
 
-    A view shows an object where its pixel differs from the constant background. Without such a background, points that
-    several views see are about equally likely. Points outside every view are rarely chosen.
+    A view shows an object where its pixel differs from the constant background. Points outside every view are rarely
+    chosen.
     """
     low, high = (torch.from_numpy(np.asarray(dataset.box[i], np.float32)) for i in (0, 1))
     points = low + (high - low) * torch.rand(CARVE_CANDIDATES * count, 3, generator=generator)
-    background = np.array(dataset.background, np.float32) * 255
     px, py, pz = points.numpy().T.copy()
     seen, hits = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
     for view in dataset.train[:: max(1, len(dataset.train) // CARVE_VIEWS)]:
-        shown = np.abs(view.image - background).max(2) > CARVE_CONTRAST
+        shown = _shown(view.image, dataset)
         line, column, inside = view.project(px, py, pz)
         seen[inside] += 1
         hits[inside] += shown[line[inside], column[inside]]

@@ -33,8 +33,9 @@ LOWEST: Probabilities = (1.0, 0.0, 0.0)
 RHO_DECAY = 0.95
 #: Share of the steps after the coarse phase that train level 0, and the share of these near the key instant.
 STILL_ODDS, NEAR_ODDS = 0.15, 1 / 3
-#: The views near the key instant: a share of all, and the fewest.
-NEAR_SHARE, NEAR_VIEWS = 1 / 12, 4
+#: The views near the key instant: a share of all, the fewest and the most. Where many cameras show each instant, more
+#: would be of instants at which what moves is elsewhere.
+NEAR_SHARE, NEAR_VIEWS, MOST_NEAR = 1 / 12, 4, 60
 #: Motion has changed a pixel if a colour differs by at least this between level 0 and the training image.
 STILL_CONTRAST = 0.15
 #: Share of the steps that train level 1 where there is a level 2.
@@ -111,7 +112,7 @@ def near_key(state: TrainState, among: list[int]) -> list[int]:
     """The training views in `among` that are nearest to the key instant, the nearest first."""
     key, views = state.key or 0.0, state.views.views
     nearest = sorted(among, key=lambda index: abs(views[index].time - key))
-    return nearest[: max(NEAR_VIEWS, round(len(among) * NEAR_SHARE))]
+    return nearest[: min(max(NEAR_VIEWS, round(len(among) * NEAR_SHARE)), MOST_NEAR)]
 
 
 def without_motion(state: TrainState, shown: TrainingView, image: Tensor) -> TrainingView:

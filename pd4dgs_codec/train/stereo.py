@@ -1,0 +1,142 @@
+"""Start points of a capture without any, by stereo between its cameras.
+
+Random points fill the space in front of the cameras. Where walls have little texture, they stay as fog that training
+views do not show and others do. Therefore points are searched for along the rays of pixels with contrast: at the right
+depth, the surroundings of a pixel look alike in its own view and in its neighbours (plane sweep: Collins, A space-sweep
+approach to true multi-image matching, 1996). Normalised cross-correlation ignores the exposure of each camera.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import grid_sample, unfold
+
+from pd4dgs_codec.data.view import Dataset, View, points_box, shrunk_view
+from pd4dgs_codec.train import workers
+
+#: Views that are searched. They are those of one instant if it has at least CAMERAS, else evenly spread over all.
+VIEWS, CAMERAS = 32, 8
+#: Pictures are searched at a size of at least this many pixels on the shorter side, if they have more.
+SIZE = 180
+#: A patch has PATCH x PATCH pixels. Of each view, at most PIXELS patches are searched whose deviation is CONTRAST.
+PATCH, PIXELS, CONTRAST = 5, 1000, 0.02
+#: Nearest and farthest depth, in distances of the cameras from the middle of the box; steps of 1/depth between them.
+DEPTHS, NEAREST, FARTHEST = 100, 0.2, 4.0
+#: Neighbours of a view: so many of the nearest cameras, and their distances from it in the same unit. Two of them have
+#: to agree, since others may not see the point.
+NEIGHBOURS, LEAST_BASE, MOST_BASE, AGREE = 4, 0.05, 1.5, 2
+#: A depth is taken if its correlation is ALIKE, and CLEAR above that of depths more than BESIDE steps away.
+ALIKE, CLEAR, BESIDE = 0.8, 0.05, 4
+#: Points are used if at least so many of the searched pixels have one.
+LEAST_FOUND = 1 / 6
+
+
+def with_points(dataset: Dataset, key: float | None) -> Dataset:
+    """The dataset with points found by stereo, and with the box and the depths that they span; without them if too few
+    are found. key: the key instant, normalised time, or None."""
+    views = _chosen(dataset.train, 0.5 if key is None else key)
+    points, depths = workers.alike(lambda: stereo_points(views, dataset.box.mean(0)))
+    if not len(points):
+        return dataset
+    near, far = np.percentile(depths, [0.5, 99.5])
+    return replace(dataset, points=points, box=points_box(points), near=float(near / 2), far=float(far * 1.5))
+
+
+def _chosen(views: Sequence[View], key: float) -> list[View]:
+    """The views to search."""
+    nearest = min(views, key=lambda view: abs(view.time - key)).time
+    together = [view for view in views if view.time == nearest]
+    chosen = together if len(together) >= CAMERAS else views
+    return list(chosen[:: -(-len(chosen) // VIEWS)])
+
+
+class Eye:
+    """A view for the search. picture: float32 [H, W], 0..1. position: [3], world. rotation: [3, 3], world to camera. K:
+    [3, 3]."""
+
+    def __init__(self, view: View):
+        small = shrunk_view(view, max(1, min(view.width, view.height) // SIZE))
+        self.picture = torch.from_numpy(small.image.astype(np.float32).mean(2) / 255)
+        viewmat, self.K = (torch.from_numpy(np.array(matrix, np.float32)) for matrix in (small.viewmat, small.K))
+        self.rotation = viewmat[:3, :3]
+        self.position = -self.rotation.T @ viewmat[:3, 3]
+
+    def patches(self) -> tuple[Tensor, Tensor]:
+        """(float32 [m, PATCH²], the surroundings of each pixel that is not too near to the border, by line; int64 [n],
+        the indices of those with contrast)."""
+        found = unfold(self.picture[None, None], PATCH)[0].T
+        return found, (found.std(1) >= CONTRAST).nonzero()[:, 0]
+
+    def rays(self, rows: Tensor, columns: Tensor) -> Tensor:
+        """[..., 3]: the rays of pixels, in world axes, of depth 1."""
+        x, y = (columns + 0.5 - self.K[0, 2]) / self.K[0, 0], (rows + 0.5 - self.K[1, 2]) / self.K[1, 1]
+        return torch.stack([x, y, torch.ones_like(x)], -1) @ self.rotation
+
+    def sample(self, places: Tensor) -> Tensor:
+        """[n, p]: the picture at places [n, p, 3]; NaN where one of the p is outside."""
+        x, y, z = ((places - self.position) @ self.rotation.T).unbind(-1)
+        height, width = self.picture.shape
+        column = (self.K[0, 0] * x / z + self.K[0, 2]) * 2 / width - 1
+        row = (self.K[1, 1] * y / z + self.K[1, 2]) * 2 / height - 1
+        inside = ((z > 0) & (column.abs() < 1) & (row.abs() < 1)).all(1)
+        found = torch.full(x.shape, torch.nan)
+        grid = torch.stack([column[inside], row[inside]], -1)[None]
+        found[inside] = grid_sample(self.picture[None, None], grid, align_corners=False)[0, 0]
+        return found
+
+
+@torch.no_grad()
+def stereo_points(views: Sequence[View], middle: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(float32 [n, 3] points, world; float32 [n] their depths in the views that found them); none if fewer than
+    LEAST_FOUND of the searched pixels have one. middle: [3], around which the cameras stand or at which they look."""
+    eyes, generator = [Eye(view) for view in views], torch.Generator().manual_seed(0)
+    at = torch.stack([eye.position for eye in eyes])
+    unit = float((at - torch.from_numpy(middle)).norm(dim=1).median())
+    apart, ahead = torch.cdist(at, at) / unit, torch.stack([eye.rotation[2] for eye in eyes])
+    depths: Tensor = unit / torch.linspace(1 / NEAREST, 1 / FARTHEST, DEPTHS)
+    found, searched = [(torch.zeros(0, 3), torch.zeros(0))], 0
+    for i, eye in enumerate(eyes):
+        near = (apart[i] >= LEAST_BASE) & (apart[i] <= MOST_BASE) & (ahead @ ahead[i] > 0)
+        neighbours = [eyes[j] for j in apart[i].argsort().tolist() if near[j]][:NEIGHBOURS]
+        patches, pixels = eye.patches()
+        pixels = pixels[torch.randperm(len(pixels), generator=generator)[:PIXELS]]
+        searched += len(pixels)
+        if len(neighbours) >= AGREE:
+            found.append(_search(eye, neighbours, patches[pixels], pixels, depths))
+    points, depth = (torch.cat(parts).numpy() for parts in zip(*found, strict=True))
+    enough = len(points) > LEAST_FOUND * searched
+    return (points, depth) if enough else (points[:0], depth[:0])
+
+
+def _search(
+    eye: Eye, neighbours: Sequence[Eye], patches: Tensor, pixels: Tensor, depths: Tensor
+) -> tuple[Tensor, Tensor]:
+    """(points [n, 3], depths [n]) of the pixels whose depth is clear. patches, pixels: from `Eye.patches`."""
+    width = eye.picture.shape[1] - PATCH + 1
+    row, column = pixels // width, pixels % width
+    offsets = torch.arange(PATCH)
+    down, across = offsets.repeat_interleave(PATCH), offsets.repeat(PATCH)
+    rays, own = eye.rays(row[:, None] + down, column[:, None] + across), _normalised(patches)
+    alike = torch.full((len(pixels), len(depths)), -1.0)
+    for i, depth in enumerate(depths):
+        places = eye.position + depth * rays
+        scores = torch.stack([(own * _normalised(other.sample(places))).sum(1) for other in neighbours])
+        alike[:, i] = scores.nan_to_num(-1.0).topk(AGREE, dim=0).values.mean(0)
+    best, k = alike.max(1)
+    beside = (torch.arange(len(depths)) - k[:, None]).abs() <= BESIDE
+    clear = (best >= ALIKE) & (best - alike.masked_fill(beside, -1).amax(1) >= CLEAR) & (k > 0) & (k < len(depths) - 1)
+    found = depths[k[clear]]
+    return eye.position + found[:, None] * rays[clear, PATCH**2 // 2], found
+
+
+def _normalised(patches: Tensor) -> Tensor:
+    """Patches [n, p] of mean 0 and norm 1; NaN without contrast."""
+    patches = patches - patches.mean(1, keepdim=True)
+    norm = patches.norm(dim=1, keepdim=True)
+    found: Tensor = patches / norm.where(norm >= CONTRAST * PATCH, torch.nan)
+    return found
