@@ -109,6 +109,7 @@ class LearningRates:
     color: tuple[float, float] = (8e-3, 1.6e-3)
     planes: tuple[float, float] = (3e-2, 8e-3)
     deformation: tuple[float, float] = (1.5e-3, 5.6e-4)
+    exposure: tuple[float, float] = (2e-3, 2e-3)
 
     def of_run(self, iterations: int | None) -> LearningRates:
         """The rates of a run of `iterations` steps. Beyond SHORT_RUN, the end rates of planes and deformation fall as

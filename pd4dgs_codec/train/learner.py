@@ -129,6 +129,7 @@ class Learner(TrainState):
         for planes, few in confined:
             planes.spread_gradients(few)
         self.optimiser.step(self.schedule.progress(self.position), self.schedule.iterations)
+        self.views.centre_exposures()
         for planes, few in confined:
             planes.confine(few)
 
@@ -202,10 +203,11 @@ class Learner(TrainState):
         picture = render(self.model, level, shown.view.time, shown.view.camera, self.rounding(), only)
         if picture.meta["means2d"].requires_grad:
             picture.meta["means2d"].retain_grad()
+        image = shown.exposed(picture.image)
         if level == 0:
-            shown = without_motion(self, shown, picture.image)
+            shown = without_motion(self, shown, image)
         part = shown.content(picture.alpha)
-        l1, dissimilarity = image_loss(picture.image, shown.pixels[part].float() / 255, shown.weights[part], part)
+        l1, dissimilarity = image_loss(image, shown.pixels[part].float() / 255, shown.weights[part], part)
         terms = {"l1": l1, "dssim": dissimilarity}
         loss = (1 - config.ssim) * l1 + config.ssim * dissimilarity
         if config.volume and len(picture.gaussians.scales):

@@ -7,7 +7,7 @@ a second.
 from __future__ import annotations
 
 import math
-from collections.abc import Set
+from collections.abc import Iterable, Set
 from typing import Any
 
 import torch
@@ -26,16 +26,17 @@ class Optimiser:
     """Adam with a parameter group per learning-rate schedule.
 
     groups: parameters by field of LearningRates. moments: for each parameter that has had a gradient, tensors by STEP,
-    MEAN and SQUARE.
+    MEAN and SQUARE. exposures: see `TrainingViews`.
     """
 
-    def __init__(self, model: Model, rates: LearningRates, cooldown: float):
+    def __init__(self, model: Model, rates: LearningRates, cooldown: float, exposures: Iterable[nn.Parameter] = ()):
         self.model, self.rates, self.cooldown = model, rates, cooldown
         groups: dict[str, list[nn.Parameter]] = {name: [getattr(model, name)] for name in PER_ANCHOR}
         groups |= {name: list(net.parameters()) for name, net in model.networks.items()}
         fields = model.deformations.values()
         groups["planes"] = [f.planes.grid for f in fields]
         groups["deformation"] = [p for f in fields for p in f.weights]
+        groups["exposure"] = list(exposures)
         self.groups = {name: params for name, params in groups.items() if params}
         self.moments: dict[Tensor, dict[str, Tensor]] = {}
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from pd4dgs_codec.data.view import Dataset, View, shrunk_view
 from pd4dgs_codec.model.config import PRESETS, ModelConfig
@@ -35,7 +35,8 @@ class TrainingView:
     """A view of the dataset on the device.
 
     pixels: uint8 [H, W, 3]. weights: float32 [H, W], see `pixel_weights`. rows, columns: bool [H] and [W], whether
-    a row or column differs from the background. visible: the number of pixels that do.
+    a row or column differs from the background. visible: the number of pixels that do. exposure: [2, 3], see
+    `TrainingViews`; None with a single camera.
     """
 
     view: View
@@ -44,16 +45,19 @@ class TrainingView:
     rows: Tensor
     columns: Tensor
     visible: int
+    exposure: Tensor | None = None
 
     @staticmethod
-    def of(view: View, background: Sequence[float], device: torch.device) -> TrainingView:
+    def of(
+        view: View, background: Sequence[float], device: torch.device, exposure: Tensor | None = None
+    ) -> TrainingView:
         """Copies the image to the device."""
         pixels = torch.as_tensor(view.image, device=device)
         mask = torch.ones(pixels.shape[:2], device=device)
         if view.mask is not None:
             mask = torch.as_tensor(view.mask, device=device).float()
         shown = (pixels != torch.tensor(background, device=device) * 255).any(2)
-        return TrainingView(view, pixels, pixel_weights(mask), shown.any(1), shown.any(0), int(shown.sum()))
+        return TrainingView(view, pixels, pixel_weights(mask), shown.any(1), shown.any(0), int(shown.sum()), exposure)
 
     @property
     def nbytes(self) -> int:
@@ -65,6 +69,10 @@ class TrainingView:
         """float32 [H, W, 3], 0..1."""
         return self.pixels.float() / 255
 
+    def exposed(self, image: Tensor) -> Tensor:
+        """A picture [H, W, 3] of this view as its camera exposes it."""
+        return image if self.exposure is None else image * self.exposure[0].exp() + self.exposure[1]
+
     def content(self, alpha: Tensor) -> Part:
         """The rows and columns that the loss of a picture with `alpha` [H, W] depends on: elsewhere the picture and the
         image show the background."""
@@ -74,24 +82,47 @@ class TrainingView:
     def squared_error(self, image: Tensor, where: Tensor | None = None) -> float:
         """The squared error of a picture [H, W, 3] of this view, summed over colours and weighted pixels; only over the
         mask `where`, bool [H, W], if given."""
-        errors = (image - self.image).square().sum(-1) * self.weights
+        errors = (self.exposed(image) - self.image).detach().square().sum(-1) * self.weights
         return float((errors if where is None else errors[where]).sum())
 
 
 class TrainingViews:
-    """A dataset's training views, copied to the device on demand, where KEPT_BYTES of them stay."""
+    """A dataset's training views, copied to the device on demand, where KEPT_BYTES of them stay.
+
+    exposures: by camera, [2, 3], logarithms of gains and offsets per channel by which its pictures differ from the mean
+    of all cameras; empty with a single camera. They are trained, but not packed. Without them the colours in one
+    camera's direction take on its exposure, and haze in front of it imitates it.
+    """
 
     def __init__(self, views: Sequence[View], background: Sequence[float], device: torch.device):
         self.views, self.background, self.device = views, background, device
+        cameras = sorted({view.camera_id for view in views})
+        several = cameras if len(cameras) > 1 else []
+        self.exposures = {camera: nn.Parameter(torch.zeros(2, 3, device=device)) for camera in several}
         self._kept: OrderedDict[tuple[int, int], TrainingView] = OrderedDict()
         self._bytes = 0
 
     def __len__(self) -> int:
         return len(self.views)
 
-    def spread(self, most: int) -> list[TrainingView]:
-        """At most `most` views, evenly spread."""
-        return [self[i] for i in range(0, len(self), -(-len(self) // most))]
+    def spread(self, most: int, among: Sequence[int] | None = None, turn: int = 0) -> list[TrainingView]:
+        """At most `most` of the views `among` (default: all), evenly spread; other ones in another `turn`."""
+        among = range(len(self)) if among is None else among
+        stride = -(-len(among) // most)
+        if not self.exposures:
+            return [self[index] for index in among[turn % stride :: stride]]
+        # views are often listed by instant, then camera: a constant stride could meet one camera only
+        blocks = enumerate(range(0, len(among), stride))
+        chosen = [start + (turn + k) % min(stride, len(among) - start) for k, start in blocks]
+        return [self[among[i]] for i in chosen]
+
+    @torch.no_grad()
+    def centre_exposures(self) -> None:
+        """Subtracts the mean of the exposures, which belongs to the model's colours."""
+        if self.exposures:
+            mean = torch.stack(list(self.exposures.values())).mean(0)
+            for exposure in self.exposures.values():
+                exposure.sub_(mean)
 
     def __getitem__(self, index: int) -> TrainingView:
         return self.reduced(index, 1)
@@ -102,7 +133,8 @@ class TrainingViews:
         k = k if min(view.width, view.height) >= LARGE else 1
         found = self._kept.pop((index, k), None)
         if found is None:
-            found = TrainingView.of(shrunk_view(view, k), self.background, self.device)
+            exposure = self.exposures.get(view.camera_id)
+            found = TrainingView.of(shrunk_view(view, k), self.background, self.device, exposure)
             self._bytes += found.nbytes
         self._kept[index, k] = found
         while self._bytes > KEPT_BYTES and len(self._kept) > 1:
@@ -142,10 +174,10 @@ class TrainState:
         key = config.key_instant if config.rollout == "key" else None
         model = fresh_model(self.size, dataset, config.widths, steps, config.seed, config.max_layer, key)
         self.model = model.to(device)
-        self.optimiser = Optimiser(self.model, config.rates, config.cooldown)
+        self.views = TrainingViews(dataset.train, model.info.background, device)
+        self.optimiser = Optimiser(self.model, config.rates, config.cooldown, self.views.exposures.values())
         self.generator = torch.Generator().manual_seed(config.seed)
         self.noise = Noise(config.seed + 1, device)
-        self.views = TrainingViews(dataset.train, model.info.background, device)
         self.statistics = fresh_statistics(len(model.anchor_q), config.slots)
         self.iteration = self.skipped = 0
         self.share: float | None = None
@@ -261,6 +293,7 @@ class TrainState:
             "guided": self.guided,
             "skipped": self.skipped,
             "order": self.order,
+            "exposures": {camera: exposure.detach() for camera, exposure in self.views.exposures.items()},
             "optimiser": self.optimiser.state(),
             "densifier": self.statistics,
             "generator": self.generator.get_state(),
@@ -281,8 +314,10 @@ class TrainState:
                 raise ValueError(f"{name} is {state[name]!r}, expected a number from 0 to {most}")
         if not math.isfinite(state["rho"]):
             raise ValueError(f"rho is {state['rho']!r}, expected a finite number")
+        for camera, exposure in self.views.exposures.items():
+            exposure.data.copy_(state["exposures"][camera])
         self.model = model.to(self.device)
-        self.optimiser = Optimiser(self.model, self.config.rates, self.config.cooldown)
+        self.optimiser = Optimiser(self.model, self.config.rates, self.config.cooldown, self.views.exposures.values())
         self.optimiser.load_state(state["optimiser"])
         self.statistics = {name: state["densifier"][name].float() for name in fresh}
         self.generator.set_state(state["generator"])

@@ -180,7 +180,7 @@ def moving_points(state: TrainState) -> tuple[Points, float]:
     @lru_cache(maxsize=3)
     def evidence(index: int) -> Evidence:
         shown = state.picture(index)
-        different = (images(state, shown, (0,))[0] - shown.image).abs().mean(-1) * (shown.weights > 0)
+        different = (shown.exposed(images(state, shown, (0,))[0]) - shown.image).abs().mean(-1) * (shown.weights > 0)
         moved, *colour = avg_pool2d(torch.cat([different[None], shown.image.permute(2, 0, 1)]), 3, 1, 1).cpu()
         around = max_pool2d(moved[None], 5, 1, 2)[0]
         return Evidence(shown.view, moved, around, torch.stack(colour, -1), shown.visible)

@@ -57,8 +57,7 @@ class Prune(Phase):
         """Prunes, and logs how many anchors left the model and how many left layer 0."""
         model, levels = state.model, state.measured_levels()
         share, before, order = state.config.prune / PRUNING_ROUNDS, len(model.anchor_q), other_views(state)
-        stride = -(-len(order) // VIEWS)
-        views = [state.views[i] for i in order[self.turn % stride :: stride]]
+        views = state.views.spread(VIEWS, order, self.turn)
         errors = added_error(model, levels, views, state.rounding(noisy=False), omission_error).to(state.device)
         errors[:, round_of(model.anchor_q) != self.turn] = torch.inf
         redundant = least(errors.amax(0), share)
