@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.data.view import Dataset
+from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.draw.simd import Tasks, parallel
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.model.config import ModelConfig
@@ -132,9 +133,14 @@ def near_box(points: Tensor, box: Tensor) -> Tensor:
 
 
 def on_plain_background(dataset: Dataset) -> bool:
-    """Whether half of the pixels at the borders of the training views show the background."""
-    edges = [line for v in dataset.train for line in (v.image[0], v.image[-1], v.image[:, 0], v.image[:, -1])]
+    """Whether half of the pixels at the borders of training views show the background."""
+    images = [view.image for view in _carving_views(dataset)]
+    edges = [line for image in images for line in (image[0], image[-1], image[:, 0], image[:, -1])]
     return not _shown(np.concatenate(edges), dataset).mean() > 0.5
+
+
+def _carving_views(dataset: Dataset) -> Sequence[View]:
+    return dataset.train[:: max(1, len(dataset.train) // CARVE_VIEWS)]
 
 
 def _shown(pixels: np.ndarray, dataset: Dataset) -> np.ndarray:
@@ -154,7 +160,7 @@ def carved_points(dataset: Dataset, count: int, generator: torch.Generator) -> T
     points = low + (high - low) * torch.rand(CARVE_CANDIDATES * count, 3, generator=generator)
     px, py, pz = points.numpy().T.copy()
     seen, hits = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
-    for view in dataset.train[:: max(1, len(dataset.train) // CARVE_VIEWS)]:
+    for view in _carving_views(dataset):
         shown = _shown(view.image, dataset)
         line, column, inside = view.project(px, py, pz)
         seen[inside] += 1

@@ -315,7 +315,9 @@ class TrainState:
         if not math.isfinite(state["rho"]):
             raise ValueError(f"rho is {state['rho']!r}, expected a finite number")
         for camera, exposure in self.views.exposures.items():
-            exposure.data.copy_(state["exposures"][camera])
+            if (stored := state["exposures"][camera]).shape != exposure.shape:
+                raise ValueError(f"exposure has shape {tuple(stored.shape)}, expected {tuple(exposure.shape)}")
+            exposure.data.copy_(stored)
         self.model = model.to(self.device)
         self.optimiser = Optimiser(self.model, self.config.rates, self.config.cooldown, self.views.exposures.values())
         self.optimiser.load_state(state["optimiser"])

@@ -56,12 +56,14 @@ def _chosen(views: Sequence[View], key: float) -> list[View]:
 
 
 class Eye:
-    """A view for the search. picture: float32 [H, W], 0..1. position: [3], world. rotation: [3, 3], world to camera. K:
-    [3, 3]."""
+    """A view for the search. picture: float32 [H, W], 0..1, NaN where the view is not valid. position: [3], world.
+    rotation: [3, 3], world to camera. K: [3, 3]."""
 
     def __init__(self, view: View):
         small = shrunk_view(view, max(1, min(view.width, view.height) // SIZE))
         self.picture = torch.from_numpy(small.image.astype(np.float32).mean(2) / 255)
+        if small.mask is not None:
+            self.picture[~torch.from_numpy(small.mask)] = torch.nan
         viewmat, self.K = (torch.from_numpy(np.array(matrix, np.float32)) for matrix in (small.viewmat, small.K))
         self.rotation = viewmat[:3, :3]
         self.position = -self.rotation.T @ viewmat[:3, 3]
@@ -69,6 +71,8 @@ class Eye:
     def patches(self) -> tuple[Tensor, Tensor]:
         """(float32 [m, PATCH²], the surroundings of each pixel that is not too near to the border, by line; int64 [n],
         the indices of those with contrast)."""
+        if min(self.picture.shape) < PATCH:
+            return torch.zeros(0, PATCH**2), torch.zeros(0, dtype=torch.int64)
         found = unfold(self.picture[None, None], PATCH)[0].T
         return found, (found.std(1) >= CONTRAST).nonzero()[:, 0]
 

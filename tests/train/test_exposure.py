@@ -50,9 +50,12 @@ def test_a_resumed_run_has_the_same_exposures():
     again.restore(run.model, state)
     for camera, exposure in run.views.exposures.items():
         assert torch.equal(again.views.exposures[camera], exposure) and exposure.abs().sum() > 0
-    state["exposures"] = {0: state["exposures"][0]}
-    with pytest.raises(KeyError):
-        learner(3).restore(run.model, state)
+    for broken, error in (
+        ({0: state["exposures"][0]}, KeyError),
+        (dict.fromkeys(range(3), torch.zeros(3)), ValueError),
+    ):
+        with pytest.raises(error):
+            learner(3).restore(run.model, state | {"exposures": broken})
 
 
 def test_spread_views_are_of_all_cameras_though_listed_by_instant_and_camera():

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from pd4dgs_codec.data import dataset
+from pd4dgs_codec.data.view import shrunk_view
 from pd4dgs_codec.scene import Steps, Widths
 from pd4dgs_codec.train import initialise
 from pd4dgs_codec.train.stereo import PIXELS, with_points
@@ -52,6 +53,18 @@ def test_box_and_depths_span_the_points(room, found):
     assert 0 < found.near < np.percentile(depths[depths > 0], 5) and found.far > np.percentile(depths, 95)
 
 
+def test_no_point_is_found_where_views_are_not_valid(room, found):
+    left = np.arange(room.train[0].width) < room.train[0].width // 2
+    masked = tuple(dataclasses.replace(view, mask=np.tile(left, (view.height, 1))) for view in room.train)
+    half = with_points(dataclasses.replace(room, points=None, train=masked), 0.5).points
+    assert 0 < len(half) < len(found.points)
+    seen = np.zeros(len(half), bool)
+    for view in masked:
+        _, column, inside = view.project(*half.T)
+        seen |= inside & (column < view.width // 2)
+    assert seen.all()
+
+
 def test_views_without_texture_or_neighbours_keep_the_dataset(room):
     blank = dataclasses.replace(
         room,
@@ -59,6 +72,9 @@ def test_views_without_texture_or_neighbours_keep_the_dataset(room):
         train=tuple(dataclasses.replace(view, image=np.full_like(view.image, 90)) for view in room.train),
     )
     assert with_points(blank, 0.5) is blank
+    tiny = dataclasses.replace(room, points=None, train=tuple(shrunk_view(view, 30) for view in room.train))
+    assert tiny.train[0].image.shape == (4, 5, 3)
+    assert with_points(tiny, 0.5) is tiny
     alone = dataclasses.replace(room, points=None, train=room.train[:1])
     assert with_points(alone, None) is alone
 
