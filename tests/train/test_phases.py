@@ -289,7 +289,7 @@ def test_a_level_that_stays_leaves_the_model_as_it_was(dataset, monkeypatch, lea
 def test_the_first_worker_decides_whether_a_level_changes_pictures(dataset, monkeypatch):
     """If each decided for itself, a single pixel could make one try a level while another goes on."""
     monkeypatch.setattr(levels, "MIN_CONTRAST", 2.0)  # this one finds no pixel
-    monkeypatch.setattr(levels.workers, "alike", lambda measure: 1e6)
+    monkeypatch.setattr(levels, "workers", Mock(alike=lambda measure: 1e6))
     monkeypatch.setattr(learner.Learner, "practise", practised := Mock())
     selected(dataset, monkeypatch, 0.0)
     assert practised.called
@@ -329,9 +329,10 @@ def test_levels_without_gain_go_from_the_top_and_leave_their_anchors(dataset, mo
 @pytest.mark.parametrize(
     "gain_2, over_0, gain_1, kept, steps",
     [(0.6, 3.9, 0.1, 2, 500), (0.6, 3.9, 0.0, 0, 500), (0.7, 3.9, 0.0, 2, 500)]
-    + [(0.6, 4.1, 0.1, 1, 500), (0.6, 4.1, 0.0, 0, 500), (1.0, 3.9, 0.0, 0, 3000), (1.0, 3.9, 0.2, 2, 3000)]
+    + [(0.6, 4.1, 0.1, 1, 500), (0.6, 4.1, 0.0, 0, 500), (1.0, 3.9, 0.2, 0, 3000), (1.4, 3.9, 0.2, 2, 3000)]
     + [(0.4, 0.1, 0.3, 1, 500), (0.4, 0.1, 0.2, 0, 500), (-3.0, 9.0, 0.7, 1, 500), (-3.0, 9.0, 0.6, 0, 500)]
-    + [(0.4, 0.1, 0.8, 1, 3000), (0.4, 0.1, 0.6, 0, 3000), (-3.0, 9.0, 1.2, 1, 3000), (-3.0, 9.0, 0.8, 0, 3000)],
+    + [(0.4, 0.1, 0.6, 1, 750), (0.4, 0.1, 0.5, 0, 750)]
+    + [(0.4, 0.1, 1.2, 1, 3000), (0.4, 0.1, 0.8, 0, 3000), (-3.0, 9.0, 1.6, 1, 3000), (-3.0, 9.0, 1.2, 0, 3000)],
 )
 def test_level_2_needs_a_share_of_all_motion_and_counts_for_level_1(
     dataset, monkeypatch, gain_2, over_0, gain_1, kept, steps

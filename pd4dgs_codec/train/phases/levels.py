@@ -28,7 +28,7 @@ EVERY = 16
 MIN_VIEWS = 4
 #: Levels that move stay if their gains sum to MIN_GAIN_1 dB, or less in proportion in runs of fewer than LEARNT steps,
 #: which learn fast motion incompletely. Level 2 must also gain MIN_GAIN_2 dB and SHARE_2 of its gain over level 0.
-MIN_GAIN_1, LEARNT, SHARE_2, MIN_GAIN_2 = 1.1, 850, 0.15, 0.5
+MIN_GAIN_1, LEARNT, SHARE_2, MIN_GAIN_2 = 1.5, 1160, 0.15, 0.5
 #: A gain counts the pixels in which the level changes a colour by MIN_CONTRAST; if there are fewer than this, it is 0.
 MIN_CONTRAST, MIN_PIXELS = 0.02, 32
 #: Steps for which the level below is trained before: a share of the run, and the fewest for levels 0 and 1. In short
