@@ -256,7 +256,7 @@ def selected(dataset, monkeypatch, least):
     """(a learner after selecting levels, which need a gain of `least`; its parameters and moments before)."""
     for name in ("MIN_GAIN_1", "MIN_GAIN_2"):
         monkeypatch.setattr(levels, name, least)
-    monkeypatch.setattr(levels, "LEARNT", 1)
+    monkeypatch.setattr(levels, "LEARNING", (0, 1))
     monkeypatch.setattr(levels, "SHARE_2", min(least, 0.0))
     monkeypatch.setattr(levels, "MIN_PRACTICE", (3, 3))
     learner = trainer_of(replace(dataset, train=dataset.train * 12)).learner
@@ -328,10 +328,10 @@ def test_levels_without_gain_go_from_the_top_and_leave_their_anchors(dataset, mo
 
 @pytest.mark.parametrize(
     "gain_2, over_0, gain_1, kept, steps",
-    [(0.6, 3.9, 0.1, 2, 500), (0.6, 3.9, 0.0, 0, 500), (0.7, 3.9, 0.0, 2, 500)]
-    + [(0.6, 4.1, 0.1, 1, 500), (0.6, 4.1, 0.0, 0, 500), (1.0, 3.9, 0.2, 0, 3000), (1.4, 3.9, 0.2, 2, 3000)]
-    + [(0.4, 0.1, 0.3, 1, 500), (0.4, 0.1, 0.2, 0, 500), (-3.0, 9.0, 0.7, 1, 500), (-3.0, 9.0, 0.6, 0, 500)]
-    + [(0.4, 0.1, 0.6, 1, 750), (0.4, 0.1, 0.5, 0, 750)]
+    [(0.6, 3.9, 0.2, 2, 750), (0.6, 3.9, 0.1, 0, 750), (0.8, 3.9, 0.0, 2, 750), (0.6, 3.9, 0.0, 2, 500)]
+    + [(0.6, 4.1, 0.2, 1, 750), (0.6, 4.1, 0.1, 0, 750), (1.0, 3.9, 0.2, 0, 3000), (1.4, 3.9, 0.2, 2, 3000)]
+    + [(0.2, 0.1, 0.2, 1, 500), (0.2, 0.1, 0.1, 0, 500), (-3.0, 9.0, 0.4, 1, 500), (-3.0, 9.0, 0.3, 0, 500)]
+    + [(0.4, 0.1, 0.4, 1, 750), (0.4, 0.1, 0.3, 0, 750), (-3.0, 9.0, 0.8, 1, 750), (-3.0, 9.0, 0.7, 0, 750)]
     + [(0.4, 0.1, 1.2, 1, 3000), (0.4, 0.1, 0.8, 0, 3000), (-3.0, 9.0, 1.6, 1, 3000), (-3.0, 9.0, 1.2, 0, 3000)],
 )
 def test_level_2_needs_a_share_of_all_motion_and_counts_for_level_1(

@@ -26,9 +26,10 @@ from pd4dgs_codec.train.state import TrainingView, TrainState
 #: One in EVERY training views is held back until levels are selected, if these are at least MIN_VIEWS.
 EVERY = 16
 MIN_VIEWS = 4
-#: Levels that move stay if their gains sum to MIN_GAIN_1 dB, or less in proportion in runs of fewer than LEARNT steps,
-#: which learn fast motion incompletely. Level 2 must also gain MIN_GAIN_2 dB and SHARE_2 of its gain over level 0.
-MIN_GAIN_1, LEARNT, SHARE_2, MIN_GAIN_2 = 1.5, 1160, 0.15, 0.5
+#: Levels that move stay if their gains sum to MIN_GAIN_1 dB. Shorter runs, which learn fast motion incompletely, need
+#: less in proportion, from 0 at the first of LEARNING steps to all of it at the second. Level 2 must also gain
+#: MIN_GAIN_2 dB and SHARE_2 of its gain over level 0.
+MIN_GAIN_1, LEARNING, SHARE_2, MIN_GAIN_2 = 1.5, (300, 1160), 0.15, 0.5
 #: A gain counts the pixels in which the level changes a colour by MIN_CONTRAST; if there are fewer than this, it is 0.
 MIN_CONTRAST, MIN_PIXELS = 0.02, 32
 #: Steps for which the level below is trained before: a share of the run, and the fewest for levels 0 and 1. In short
@@ -113,7 +114,8 @@ class SelectLevels(phases.Phase):
 
 def motion_gain(steps: int) -> float:
     """The gain in dB that the levels that move need together in a run of so many steps."""
-    return MIN_GAIN_1 * min(1.0, steps / LEARNT)
+    first, last = LEARNING
+    return MIN_GAIN_1 * min(max((steps - first) / (last - first), 0.0), 1.0)
 
 
 @torch.no_grad()
