@@ -362,9 +362,15 @@ def geometry(
     return {"points": points, "box": box, "near": near, "far": far, "up": mean_up(frames), "masked": False}
 
 
+def border_pixels(views: Sequence[View]) -> np.ndarray:
+    """uint8 [n, 3]: the pixels of the images' borders."""
+    images = (view.image for view in views)
+    return np.concatenate([e for image in images for e in (image[0], image[-1], image[:, 0], image[:, -1])])
+
+
 def border_color(views: Sequence[View]) -> tuple[float, float, float]:
     """The background: the colour of the images' borders if they have one colour, else black."""
-    edges = np.concatenate([e for v in views for e in (v.image[0], v.image[-1], v.image[:, 0], v.image[:, -1])])
+    edges = border_pixels(views)
     middle = np.median(edges, axis=0)
     same = (np.abs(edges - middle) <= BORDER_LEVELS).all(axis=1).mean() >= BORDER_SHARE
     r, g, b = middle / 255.0 if same else np.zeros(3)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.data.view import Dataset, View
+from pd4dgs_codec.data.view import Dataset, View, border_pixels
 from pd4dgs_codec.draw.simd import Tasks, parallel
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.model.config import ModelConfig
@@ -134,9 +134,7 @@ def near_box(points: Tensor, box: Tensor) -> Tensor:
 
 def on_plain_background(dataset: Dataset) -> bool:
     """Whether half of the pixels at the borders of training views show the background."""
-    images = [view.image for view in _carving_views(dataset)]
-    edges = [line for image in images for line in (image[0], image[-1], image[:, 0], image[:, -1])]
-    return not _shown(np.concatenate(edges), dataset).mean() > 0.5
+    return bool(_shown(border_pixels(_carving_views(dataset)), dataset).mean() <= 0.5)
 
 
 def _carving_views(dataset: Dataset) -> Sequence[View]:

@@ -55,6 +55,12 @@ def _chosen(views: Sequence[View], key: float) -> list[View]:
     return list(chosen[:: -(-len(chosen) // VIEWS)])
 
 
+def pixel_rays(rotation: Tensor, K: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
+    """[..., 3]: the rays of pixels, in world axes, of depth 1. rotation: [3, 3], world to camera. K: [3, 3]."""
+    x, y = (columns + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1]
+    return torch.stack([x, y, torch.ones_like(x)], -1) @ rotation
+
+
 class Eye:
     """A view for the search. picture: float32 [H, W], 0..1, NaN where the view is not valid. position: [3], world.
     rotation: [3, 3], world to camera. K: [3, 3]."""
@@ -75,11 +81,6 @@ class Eye:
             return torch.zeros(0, PATCH**2), torch.zeros(0, dtype=torch.int64)
         found = unfold(self.picture[None, None], PATCH)[0].T
         return found, (found.std(1) >= CONTRAST).nonzero()[:, 0]
-
-    def rays(self, rows: Tensor, columns: Tensor) -> Tensor:
-        """[..., 3]: the rays of pixels, in world axes, of depth 1."""
-        x, y = (columns + 0.5 - self.K[0, 2]) / self.K[0, 0], (rows + 0.5 - self.K[1, 2]) / self.K[1, 1]
-        return torch.stack([x, y, torch.ones_like(x)], -1) @ self.rotation
 
     def sample(self, places: Tensor) -> Tensor:
         """[n, p]: the picture at places [n, p, 3]; NaN where one of the p is outside."""
@@ -125,7 +126,8 @@ def _search(
     row, column = pixels // width, pixels % width
     offsets = torch.arange(PATCH)
     down, across = offsets.repeat_interleave(PATCH), offsets.repeat(PATCH)
-    rays, own = eye.rays(row[:, None] + down, column[:, None] + across), _normalised(patches)
+    rays = pixel_rays(eye.rotation, eye.K, row[:, None] + down, column[:, None] + across)
+    own = _normalised(patches)
     alike = torch.full((len(pixels), len(depths)), -1.0)
     for i, depth in enumerate(depths):
         places = eye.position + depth * rays

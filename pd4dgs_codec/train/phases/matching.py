@@ -28,6 +28,7 @@ from pd4dgs_codec.data.view import View
 from pd4dgs_codec.train import phases, workers
 from pd4dgs_codec.train.phases.levels import images, other_views
 from pd4dgs_codec.train.state import TrainState
+from pd4dgs_codec.train.stereo import pixel_rays
 
 
 class Strength(NamedTuple):
@@ -205,8 +206,7 @@ def _points(
     `near`."""
     viewmat, K = (torch.from_numpy(np.array(matrix)) for matrix in (own.view.viewmat, own.view.K))
     eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
-    x, y = (pixels.flip(1) + 0.5 - K[:2, 2]).div(K.diagonal()[:2]).unbind(1)
-    rays = torch.stack([x, y, torch.ones_like(x)], 1) @ viewmat[:3, :3]
+    rays = pixel_rays(viewmat[:3, :3], K, *pixels.unbind(1))
     bounds = torch.stack([(low - eye) / rays, (high - eye) / rays])
     first, last = bounds.amin(0).amax(1).clamp(min=near), bounds.amax(0).amin(1)
     depths = first[:, None] + (last - first)[:, None] * ((torch.arange(DEPTHS) + 0.5) / DEPTHS)
