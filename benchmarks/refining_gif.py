@@ -1,9 +1,9 @@
-"""A GIF of a scene that becomes better as its bytes arrive, while its time runs and the cameras of its dataset move.
+"""A GIF of a scene that becomes better as its bytes arrive, while its time runs and the camera moves.
 
-    python benchmarks/refining_gif.py scene.pd4 SOURCE -o docs/img/refining.gif
+    python benchmarks/refining_gif.py scene.pd4 [SOURCE] -o docs/img/refining.gif
 
-Best with a file in slices (`pd4dgs-encode --slices 50k --data SOURCE`). The first picture is that of the first slice;
-then follow the other slices of layer 0, and the layers above it.
+Best with a file in slices (`pd4dgs-encode --slices 50k`). The first picture is that of the first slice; then follow the
+other slices of layer 0, and the layers above it. Without a dataset the file's own camera draws it, from side to side.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import numpy as np
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.io import whole_file
+from pd4dgs_codec.quality.frames import Frame, dataset_frames, own_frames
 from pd4dgs_codec.quality.image import to_uint8
 from pd4dgs_codec.quality.levels import load_levels
 from pd4dgs_codec.scene import Camera
@@ -28,8 +29,10 @@ LIMIT, TRIED = 1_500_000, ((192, 10), (96, 8), (64, 6), (64, 5), (16, 4))
 WIDTH = 320
 #: Seconds that each prefix is shown, and the whole file.
 PREFIX_SECONDS, LAST_SECONDS = 0.9, 3.0
-#: Seconds in which the recording runs from its start to its end; then it runs back.
+#: Seconds in which the recording runs from its start to its end; with cameras of a dataset it then runs back.
 PERIOD = 4.0
+#: Frames of the file's own camera, and the degrees by which it turns.
+FRAMES, ORBIT = 120, 50.0
 BAR = 26
 #: Thresholds of ordered dithering, -0.5 to 0.5, and their weight in levels of 8 bits. Unlike diffused errors they are
 #: the same in every picture, so that what stands still stays equal.
@@ -39,25 +42,31 @@ DITHER = 3
 SHOWN = "one instant", "its motion", "motion finer in time"
 
 
-def draw(data: bytes, source: str, path: Path) -> None:
+def draw(data: bytes, source: str | None, path: Path) -> None:
     """Writes the GIF of the file `data`, from the cameras of the dataset `source` in the order of their times."""
-    dataset = load(source)
-    views = sorted((*dataset.train, *dataset.test), key=lambda view: view.time)
     ends = [(row["layer"], part["end"]) for row in info(data)["layers"] for part in row["slices"]]
     shown = [load_levels(data, max_bytes=end, last_only=True)[-1] for _, end in ends]
+    frames = _frames(source) if source else own_frames(shown[-1].model.info, FRAMES, ORBIT)
     for colours, rate in TRIED:
         pictures, second = [], 0.0
         for (layer, end), level in zip(ends, shown, strict=True):
             stays = LAST_SECONDS if end == ends[-1][1] else PREFIX_SECONDS
             for _ in range(round(stays * rate)):
-                view = views[round((1 - abs(1 - second / PERIOD % 2)) * (len(views) - 1))]
-                picture = level.picture(widened(view.camera, WIDTH), view.time)
+                share = 1 - abs(1 - second / PERIOD % 2) if source else second / PERIOD % 1
+                frame = frames[round(share * (len(frames) - 1))]
+                picture = level.picture(widened(frame.camera, WIDTH), frame.time)
                 pictures.append(labelled(dithered(picture), layer, end, len(data)))
                 second += 1 / rate
         with whole_file(path, overwrite=True) as temporary:
             write(pictures, temporary, colours, rate)
         if path.stat().st_size <= LIMIT:
             break
+
+
+def _frames(source: str) -> list[Frame]:
+    """The dataset's views in the order of their times."""
+    dataset = load(source)
+    return dataset_frames(sorted((*dataset.train, *dataset.test), key=lambda view: view.time))
 
 
 def widened(camera: Camera, width: int) -> Camera:
@@ -104,7 +113,7 @@ def main() -> None:
     """The GIF of the file that the command line names."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("file", type=Path, help="a .pd4 file")
-    parser.add_argument("source", metavar="SOURCE", help="the dataset whose cameras draw it")
+    parser.add_argument("source", metavar="SOURCE", nargs="?", help="the dataset whose cameras draw it")
     parser.add_argument("-o", "--output", type=Path, required=True)
     args = parser.parse_args()
     draw(args.file.read_bytes(), args.source, args.output)

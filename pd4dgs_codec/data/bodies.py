@@ -63,18 +63,21 @@ class Body:
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """A body at one instant: x = A m + c, m = inverse (x - c)."""
+    """A body at one instant: x = A m + c, m = inverse (x - c). radius: of a ball around the inscribed ellipsoid."""
 
     body: Body
     A: np.ndarray
     c: np.ndarray
     inverse: np.ndarray
+    radius: float
 
 
 def place(bodies: Sequence[Body], t: float) -> list[Placed]:
     """Places all bodies at time t."""
     poses = [b.pose(t) for b in bodies]
-    return [Placed(b, A, c, np.linalg.inv(A)) for b, (A, c) in zip(bodies, poses, strict=True)]
+    return [
+        Placed(b, A, c, np.linalg.inv(A), float(np.linalg.norm(A, 2))) for b, (A, c) in zip(bodies, poses, strict=True)
+    ]
 
 
 def _slab(o: float, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -183,18 +186,24 @@ def light_reaching(placed: Sequence[Placed], own: int, world: np.ndarray) -> np.
     """Share of the light, 0..1 [n], that reaches `world` [3, n] past the ellipsoids inscribed in the other bodies."""
     low, high = PENUMBRA
     result = np.ones(world.shape[1], world.dtype)
+    middle = (world.min(axis=1) + world.max(axis=1)) / 2
+    radius = float(np.linalg.norm(world.max(axis=1) - middle))
     for i, body in enumerate(placed):
         if i == own or not body.body.casts:
             continue
+        gap = middle - body.c
+        if gap @ gap - (gap @ LIGHT) ** 2 > (radius + high * body.radius) ** 2:
+            continue  # seen along the light, they are apart
         towards = body.inverse @ LIGHT
         towards = (towards / np.linalg.norm(towards)).astype(world.dtype)
         m = material(body, world)
         along = towards @ m
-        miss = np.sqrt(np.maximum((m * m).sum(axis=0) - along * along, 0))
+        square = (m * m).sum(axis=0) - along * along
+        near = np.flatnonzero(square < high * high)
+        miss, along = np.sqrt(np.maximum(square[near], 0)), along[near]
         s = np.clip((miss - low) / (high - low), 0, 1)
         # Points past the body's centre towards the light (along > 0) are lit; the fade avoids a visible edge.
-        s = np.maximum(s * s * (3 - 2 * s), np.clip(along + 1, 0, 1))
-        result *= s
+        result[near] *= np.maximum(s * s * (3 - 2 * s), np.clip(along + 1, 0, 1))
     return result
 
 
@@ -239,7 +248,7 @@ MOTIONS = {
 }
 
 
-def _turn(axis: int, angle: float) -> np.ndarray:
+def rotation(axis: int, angle: float) -> np.ndarray:
     """Rotation about a coordinate axis."""
     c, s = np.cos(angle), np.sin(angle)
     i, j = (axis + 1) % 3, (axis + 2) % 3
@@ -282,7 +291,7 @@ class RoomBuilder(Painter):
         """Rotation and position of the platform."""
         m = self.motion
         angle = m.sway * np.sin(2 * np.pi * 0.75 * t)
-        return _turn(2, angle), np.array([0, 0, m.heave * np.sin(np.pi * t) ** 2])
+        return rotation(2, angle), np.array([0, 0, m.heave * np.sin(np.pi * t) ** 2])
 
     def fixed(self, shape: str, size: Size, at: Size, *look: Any, casts: bool = False, **more: Any) -> Body:
         """A body that never moves. look, more: arguments of `paint`. casts: False for floor and wall."""
@@ -294,7 +303,7 @@ class RoomBuilder(Painter):
     ) -> Body:
         """A body on the platform; `local` is its motion there."""
         half = np.asarray(size, float)
-        yaw = _turn(2, self.rng.uniform(-0.4, 0.4))
+        yaw = rotation(2, self.rng.uniform(-0.4, 0.4))
         place = np.asarray(at, float) + np.array([*self.rng.uniform(-0.05, 0.05, 2), 0])
 
         def pose(t: float) -> Pose:
@@ -312,7 +321,7 @@ class RoomBuilder(Painter):
         def part(size: Size, along: float) -> Callable[[float], Pose]:
             def pose(t: float) -> Pose:
                 R, p = self.group(t)
-                turn = R @ _turn(1, rest + m.swing * np.sin(2 * np.pi * m.swing_rate * t))
+                turn = R @ rotation(1, rest + m.swing * np.sin(2 * np.pi * m.swing_rate * t))
                 return turn @ np.diag(size), R @ pivot + p + turn @ np.array([along, -0.2, 0])
 
             return pose
@@ -340,7 +349,7 @@ class RoomBuilder(Painter):
             return still, hop(t, 0.4, 0.8), one
 
         def crate(t: float) -> Local:
-            return _turn(2, 2 * np.pi * m.spin * t), np.zeros(3), one
+            return rotation(2, 2 * np.pi * m.spin * t), np.zeros(3), one
 
         def runner(t: float) -> Local:
             angle = 2 * np.pi * m.orbit * t
@@ -390,19 +399,6 @@ class Thing:
         return self.turn(t) @ np.diag(np.multiply(self.size, self.stretch(t))), np.asarray(at, float)
 
 
-def _slice(k: int) -> Thing:
-    """The k-th of 10 slices of a column that bends, twists and breathes."""
-
-    def at(t: float) -> Point:
-        angle = 0.11 * k * np.sin(4 * pi * t)
-        return 0.075 * k * np.sin(angle), 0.0, 0.125 * k * np.cos(angle / 2) - 0.6
-
-    def turn(t: float) -> np.ndarray:
-        return np.asarray(_turn(1, 0.14 * k * np.sin(4 * pi * t)) @ _turn(2, 0.11 * k * np.sin(2 * pi * t)))
-
-    return Thing("box", (0.28, 0.28, 0.085), at, turn, lambda t: (w := 1 + 0.25 * np.sin(6 * pi * t - 0.4 * k), w, 1.0))
-
-
 #: The bodies of the scenes on white, within 1.2 of the origin.
 THINGS: dict[str, tuple[Thing, ...]] = {
     "flyby": (  # a ball flies past a cube
@@ -417,18 +413,11 @@ THINGS: dict[str, tuple[Thing, ...]] = {
         ),
     ),
     "rods": (  # thin rods turn, swing and slide
-        Thing("cylinder", (0.025, 0.025, 0.9), (0.0, -0.5, 0.1), lambda t: _turn(0, 0.5) @ _turn(1, 4 * pi * t)),
-        Thing("cylinder", (0.025, 0.025, 0.7), (0.0, 0.5, 0.0), lambda t: _turn(1, np.sin(6 * pi * t))),
+        Thing("cylinder", (0.025, 0.025, 0.9), (0.0, -0.5, 0.1), lambda t: rotation(0, 0.5) @ rotation(1, 4 * pi * t)),
+        Thing("cylinder", (0.025, 0.025, 0.7), (0.0, 0.5, 0.0), lambda t: rotation(1, np.sin(6 * pi * t))),
         Thing("box", (0.02, 0.8, 0.02), lambda t: (0.9 * np.cos(2 * pi * t), 0.0, 0.7)),
         Thing("cylinder", (0.03, 0.03, 0.6), (0.6, 0.0, -0.2)),
     ),
-    "tunnel": (  # a ball goes to and fro through a tunnel
-        Thing("box", (0.6, 0.05, 0.4), (0.0, -0.35, 0.0)),
-        Thing("box", (0.6, 0.05, 0.4), (0.0, 0.35, 0.0)),
-        Thing("box", (0.6, 0.4, 0.05), (0.0, 0.0, 0.4)),
-        Thing("sphere", (0.2, 0.2, 0.2), lambda t: (-1.1 * np.cos(4 * pi * t), 0.0, -0.1)),
-    ),
-    "bend": tuple(map(_slice, range(10))),  # a column bends, twists and breathes
     "blink": (  # beside a cube a ball appears and vanishes, and a cylinder grows after it
         Thing("box", (0.35, 0.35, 0.35), (-0.4, 0.2, -0.2)),
         Thing("sphere", (0.25, 0.25, 0.25), (0.5, -0.4, 0.2), stretch=lambda t: 1.0 if 0.3 < t < 0.6 else GONE),
@@ -448,7 +437,7 @@ def bodies(name: str, seed: int) -> list[Body]:
     if name in MOTIONS:
         return RoomBuilder(name, seed).bodies()
     painter = Painter(seed)
-    facing = _turn(2, painter.rng.uniform(0, 2 * pi))
+    facing = rotation(2, painter.rng.uniform(0, 2 * pi))
 
     def pose(thing: Thing, t: float) -> Pose:
         shape, at = thing.pose(t)

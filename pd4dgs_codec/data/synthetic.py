@@ -1,9 +1,9 @@
-"""`synthetic:NAME[?seed=n&size=WxH&frames=N&path=pass|sweeps|jump]`: ray-cast dynamic scenes, named in `bodies`.
+"""`synthetic:NAME[?seed=n&size=WxH&frames=N&path=pass|sweeps|jump]`: ray-cast dynamic scenes, named in STAGES.
 
 In a room one camera moves along an arc (60 training frames); two fixed cameras off that arc give the test views, with
 exact covisibility masks. On white the camera jumps on the upper hemisphere, as D-NeRF's does (150 frames without
-points); two fixed cameras see all instants. Another size keeps the vertical field of view; more frames
-repeat the same motion more densely. The content depends on the source string alone.
+points); two fixed cameras see all instants, of the dancer 15. Another size keeps the vertical field of view; more
+frames repeat the same motion more densely. The content depends on the source string alone.
 """
 
 import re
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from pd4dgs_codec.data.bodies import MOTIONS, NO_BODY, THINGS, Body, Eye, bodies, material, normal, place, shade
+from pd4dgs_codec.data.dancer import DANCER, Dancer
 from pd4dgs_codec.data.dataset import SYNTHETIC
 from pd4dgs_codec.data.files import check_downscale, split_options
 from pd4dgs_codec.data.view import Dataset, Lens, View, shrunk_view, world_to_camera
@@ -107,6 +108,14 @@ WHITE = Stage(
     viewmat=white_viewmat,
     fixed=(white_viewmat(0.9, 0.3), white_viewmat(0.3, 0.6)),
 )
+#: The first test camera is in front of the dancer.
+FIGURE = replace(
+    WHITE,
+    lens=Lens(200, 200, 277.778, 277.778, 100.0, 100.0),
+    fixed=(white_viewmat(0.03, 0.2), white_viewmat(0.3, 0.5)),
+    instants=15,
+)
+STAGES = dict.fromkeys(MOTIONS, ROOM) | dict.fromkeys(THINGS, WHITE) | {DANCER: FIGURE}
 
 
 # -- a dataset of a scene ----------------------------------------------------------------------------------------------
@@ -147,10 +156,10 @@ class Take:
 def parse(source: str) -> Take:
     """Parses a `synthetic:` source. Raises DataError."""
     name, options = split_options(source.removeprefix(SYNTHETIC), source, _value, EXAMPLES)
-    if name not in MOTIONS and name not in THINGS:
-        expected = f"{SYNTHETIC}{'|'.join((*MOTIONS, *THINGS))}[?seed=n&size=WxH&frames=N&path={'|'.join(PATHS)}]"
+    stage = STAGES.get(name)
+    if stage is None:
+        expected = f"{SYNTHETIC}{'|'.join(STAGES)}[?seed=n&size=WxH&frames=N&path={'|'.join(PATHS)}]"
         raise DataError(f"{source}: unknown synthetic scene, expected {expected}")
-    stage = ROOM if name in MOTIONS else WHITE
     usual: dict[str, Any] = {"size": (stage.lens.width, stage.lens.height), "frames": stage.frames, "path": stage.path}
     return Take(name, stage, **(usual | options))
 
@@ -266,7 +275,7 @@ def _initial_points(
 @lru_cache(maxsize=4)
 def _dataset(take: Take) -> Dataset:
     stage, lens, times, viewmats = take.stage, take.lens, take.times, take.viewmats()
-    scene = bodies(take.name, take.seed)
+    scene = Dancer(take.seed).bodies() if take.name == DANCER else bodies(take.name, take.seed)
     eyes = [Eye(place(scene, t), v) for t, v in zip(times, viewmats, strict=True)]
 
     def view(viewmat: np.ndarray, camera: int, i: int) -> View:

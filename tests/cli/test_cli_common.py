@@ -8,7 +8,7 @@ import pytest
 from pd4dgs_codec import FORMAT_VERSION
 from pd4dgs_codec import __main__ as dispatcher
 from pd4dgs_codec.cli import common
-from pd4dgs_codec.data.bodies import MOTIONS, THINGS
+from pd4dgs_codec.data.synthetic import STAGES
 
 VERBS = {verb: import_module(f"pd4dgs_codec.cli.{dispatcher.MODULES.get(verb, verb)}") for verb in dispatcher.VERBS}
 
@@ -27,7 +27,7 @@ def test_help_has_a_summary_an_example_and_exits_0(verb, capsys):
 @pytest.mark.parametrize("verb", ("train", "render", "eval"))
 def test_help_lists_every_synthetic_scene(verb):
     text = VERBS[verb].parser().format_help()
-    for name in (*MOTIONS, *THINGS):
+    for name in STAGES:
         assert f"synthetic:{name}" in text
 
 

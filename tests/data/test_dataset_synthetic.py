@@ -1,13 +1,14 @@
 """The ray caster against ray marching, and the documented properties of the scenes."""
 
 import hashlib
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 import pytest
 
 from pd4dgs_codec.data import synthetic as syn
 from pd4dgs_codec.data.bodies import MOTIONS, NO_BODY, THINGS, Eye, bodies, enter, place, shade
+from pd4dgs_codec.data.dancer import Dancer
 from pd4dgs_codec.data.dataset import load
 
 LENS, SWEEPS = syn.ROOM.lens, syn.PATHS["sweeps"]
@@ -234,3 +235,43 @@ def test_scenes_on_white(name):
     for v in d.train:
         border = np.concatenate([v.image[0], v.image[-1], v.image[:, 0], v.image[:, -1]])
         assert (border == 255).all() and (v.image < 200).any()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_dancer_moves_in_a_closed_cycle_on_the_ground(seed):
+    """Every part goes a continuous way that ends where it began, some feet are on the ground, and limbs are whole."""
+    dancer = Dancer(seed)
+    figure = dancer.bodies()[1:]
+    times = np.linspace(0, 1, 61)
+    centers = np.stack([[body.pose(t)[1] for body in figure] for t in times])
+    np.testing.assert_allclose(centers[0], centers[-1], atol=1e-9)
+    assert np.abs(centers).max() < 1.2
+    steps = np.linalg.norm(np.diff(centers, axis=0), axis=2)
+    assert 0.01 < steps.max() < 0.06  # the fastest is the lantern
+    assert (steps.max(axis=0) > 0).all()
+    for t in times[::6]:
+        bones = dancer.bones(t)
+        soles = [bones[f"{side} foot"][1][2] for side in ("left", "right")]
+        assert min(soles) == pytest.approx(0.08) and max(soles) < 0.2
+        for side, limb, joint in product(("left", "right"), ("arm", "leg"), ("elbow", "knee")):
+            if (limb, joint) in (("arm", "elbow"), ("leg", "knee")):
+                halves = [bones[f"{side} {limb} {k}"] for k in range(2)]
+                ends = halves[0][1] + halves[0][0][:, 2], halves[1][1] - halves[1][0][:, 2]
+                np.testing.assert_allclose(ends, [bones[f"{side} {joint}"][1]] * 2, atol=1e-9)
+
+
+def test_seeds_of_the_dancer_differ_in_build_clothes_and_motion():
+    view = syn.FIGURE.fixed[0]
+    pictures = [shoot(Dancer(seed).bodies(), view, 0.5) for seed in (0, 1, 2)]
+    for a, b in combinations(pictures, 2):
+        assert (a != b).any(axis=2).mean() > 0.05
+    a, b = (Dancer(seed) for seed in (0, 1))
+    assert a.tall != b.tall and a.phase != b.phase and a.hue != b.hue
+
+
+def test_the_dancer_is_a_set_in_the_layout_of_d_nerf():
+    d = load("synthetic:dancer?size=48x48&frames=30")
+    assert len(d.train) == 30 and len(d.test) == 2 * 14 and d.points is None and d.background == (1, 1, 1)
+    for v in d.train:
+        border = np.concatenate([v.image[0], v.image[-1], v.image[:, 0], v.image[:, -1]])
+        assert (border == 255).all() and (v.image < 160).any()
