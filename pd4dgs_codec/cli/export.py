@@ -115,7 +115,7 @@ def _check_usage(args: argparse.Namespace) -> None:
     suffix = Path(args.output).suffix.lower().removeprefix(".")
     if args.to is None:
         if suffix not in KINDS:
-            raise UsageError(f"found -o {args.output}, expected a name that ends in {FILES}, or --to")
+            raise UsageError(f"found -o {args.output}, expected a name that ends in {FILES}, or --to KIND")
         args.to = suffix
     if suffix in KINDS if args.to == "ply-seq" else suffix not in ("", args.to):
         raise UsageError(f"-o {args.output} ends in .{suffix}, but --to is {args.to}")

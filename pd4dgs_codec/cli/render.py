@@ -54,7 +54,7 @@ def parser() -> options.Parser:
     p.add_argument("--data", metavar="SOURCE", help="take cameras, times and ground truth from this dataset")
     p.add_argument("--split", choices=("test", "train"), help="views of the dataset (default: test)")
     options.add_reading(p, unset=("holdout",))
-    what = "render a single picture, at this share 0..1 of the time range"
+    what = "render a single picture at time T, as 0..1 of the file's time range"
     p.add_argument("--time", type=options.share, metavar="T", help=what)
     what = f"number of evenly spaced frames (default: {FRAMES}); with --data, render the first N views"
     p.add_argument("--frames", type=options.positive_int, metavar="N", help=what)
