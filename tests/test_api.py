@@ -68,7 +68,7 @@ def test_gaussians_need_numpy_alone_and_pictures_numba(tmp_path):
     )
     count, told = run(code, tmp_path, "torch", "numba", "scipy", "PIL").splitlines()
     assert int(count) > 50
-    assert told == "pictures need the package numba, which is not installed: pip install 'pd4dgs-codec[train]'"
+    assert told == "pictures need the package numba, which is not installed: pip install 'pd4dgs-codec[draw]'"
 
 
 def test_levels_times_and_eyes(scene):

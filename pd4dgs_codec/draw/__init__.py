@@ -25,7 +25,7 @@ def render(scene: Scene, camera: Camera, t: float, level: int | None = None) -> 
     afterwards. Raises RenderError for another time, level or camera, DataError if numba is not installed.
     """
     part = scene.at(t, level)
-    required("numba", "train", "pictures")
+    required("numba", "draw", "pictures")
     from pd4dgs_codec.draw.player import Player
 
     with _one:
