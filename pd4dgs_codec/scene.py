@@ -8,12 +8,17 @@ active at level l, so the arrays of prefix l are the first rows of the arrays of
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from pd4dgs_codec.errors import RenderError
+
+#: Three numbers.
+Vector = Sequence[float] | np.ndarray
 SCALING_DIM = 6
 #: Width of the view direction, a unit vector that follows the feature in a network's input.
 VIEW_DIM = 3
@@ -37,6 +42,8 @@ PLANES: tuple[tuple[str, int, int], ...] = (
 MASK_STEP = np.float32(1.0 / 255.0)
 MASK_THRESHOLD = 0.01
 MASK_MIN_CODE = 3
+#: A Gaussian of less opacity is invisible and skipped.
+MIN_OPACITY = 1.0 / 255.0
 
 #: Attributes of an anchor, in coding order: fields of Scene and of Steps.
 ATTRIBUTES = ("feature", "scaling_log", "offset")
@@ -148,6 +155,42 @@ class Camera:
     width: int
     height: int
 
+    @classmethod
+    def look_at(cls, eye: Vector, target: Vector, up: Vector, *, width: int, height: int, fov: float = 50.0) -> Camera:
+        """A camera at `eye` whose optical axis goes through `target`, both [3], world. up: a world direction, such as
+        `SceneInfo.up`. fov: vertical angle of view, degrees. Raises RenderError if these determine no view."""
+        ahead = np.subtract(target, eye, dtype=np.float64)
+        right = np.cross(ahead, up)
+        rows = np.stack([right, np.cross(ahead, right), ahead])
+        lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+        if not (0 < fov < 180 and np.isfinite(rows).all() and lengths.all()):
+            raise RenderError("eye, target, up and fov determine no view, expected up across the line of sight")
+        focal = height / 2 / math.tan(math.radians(fov) / 2)
+        K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32)
+        viewmat = np.eye(4, dtype=np.float32)
+        viewmat[:3, :3] = rows / lengths
+        viewmat[:3, 3] = -(rows / lengths) @ np.asarray(eye, np.float64)
+        return cls(viewmat, K, width, height)
+
+    @property
+    def eye(self) -> np.ndarray:
+        """float32 [3]: the camera's centre, world."""
+        rotation = np.asarray(self.viewmat, np.float32)[:3]
+        centre: np.ndarray = -rotation[:, :3].T @ rotation[:, 3]
+        return centre
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """K Gaussians with their activations and masks applied, float32."""
+
+    means: np.ndarray  #: [K, 3] world, scene units
+    quats: np.ndarray  #: [K, 4] rotations wxyz, unit
+    scales: np.ndarray  #: [K, 3] standard deviations, scene units
+    opacities: np.ndarray  #: [K] 0..1
+    colors: np.ndarray  #: [K, 3] RGB as displayed, 0..1
+    slots: np.ndarray  #: int64 [K]: Gaussian i is number slots[i] % G of the G of anchor slots[i] // G
+
 
 @dataclass(frozen=True, eq=False)
 class SceneInfo:
@@ -181,6 +224,53 @@ class Deformation:
     def channels(self) -> int:
         """Number of features that the planes give: the sum of channels over all scales."""
         return sum(len(scale["xy"]) for scale in self.planes)
+
+    def residuals(self, points: np.ndarray, t: float, box: np.ndarray) -> dict[str, np.ndarray]:
+        """Returns F(x, t), less F(x, t*) if there is a key instant, at points [n, 3] and normalised time t: float32
+        [n, outputs] by `Head.unit`, lengths in scene units. box: see SceneInfo."""
+        low, high = box.astype(np.float64)
+        where, products = [*((points - low) / (high - low)).T, np.full(1, t)], []
+        for scale in self.planes:
+            sampled = [_bilinear(scale[name], where[a], where[b]) for name, a, b in PLANES]
+            products.append(math.prod(sampled[1:], start=sampled[0]))
+        hidden = np.maximum(_perceptron(self.networks[TRUNK], np.concatenate(products, axis=1)), 0)
+        found = dict[str, np.ndarray]()
+        for name in HEADS.keys() & self.networks.keys():
+            unit = deformation_unit(box) if name in LENGTH_HEADS else np.float32(1)
+            found[HEADS[name].unit] = found.get(HEADS[name].unit, 0) + unit * _perceptron(self.networks[name], hidden)
+        if self.key is None:
+            return found
+        still = replace(self, key=None).residuals(points, instant(self.key), box)
+        return {unit: moved - still[unit] for unit, moved in found.items()}
+
+
+def _bilinear(plane: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Samples a plane float32 [C, H, W] at u (along W) and v (along H), [n] or [1], 0..1: float32 [n, C]."""
+    (i, i2, fu), (j, j2, fv) = (_cells(at, side) for at, side in ((u, plane.shape[2]), (v, plane.shape[1])))
+    table = plane.transpose(1, 2, 0)
+    upper = table[j, i] * (1 - fu) + table[j, i2] * fu
+    sampled: np.ndarray = upper * (1 - fv) + (table[j2, i] * (1 - fu) + table[j2, i2] * fu) * fv
+    return sampled
+
+
+def _cells(at: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Returns the cells int64 [n] on both sides of `at` [n], 0..1, and the weight float32 [n, 1] of the second."""
+    place = np.nan_to_num(at).clip(0, 1) * (side - 1)
+    cell = place.astype(np.int64).clip(max=max(side - 2, 0))
+    return cell, (cell + 1).clip(max=side - 1), (place - cell).astype(np.float32)[:, None]
+
+
+def _perceptron(network: Network, x: np.ndarray) -> np.ndarray:
+    """Evaluates a network for x float32 [n, inputs]: float32 [n, outputs]."""
+    for i, (weight, bias) in enumerate(network):
+        x = (np.maximum(x, 0) if i else x) @ weight.T + bias
+    return x
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    """Returns vectors [n, any] divided by their lengths."""
+    unit: np.ndarray = vectors / np.linalg.norm(vectors, axis=1, keepdims=True).clip(min=1e-12)
+    return unit
 
 
 #: A file stores normalised times as multiples of 1 / INSTANTS.
@@ -319,6 +409,54 @@ class Scene:
         and key instant of its highest layer with a deformation; None if no layer has one."""
         found = [one for one in (self.global_deformation, self.local_deformation)[:layer] if one is not None]
         return replace(found[-1], planes=tuple(s for one in found for s in one.planes)) if found else None
+
+    def at(self, t: float, level: int | None) -> Scene:
+        """Returns the prefix to draw at a level, None for the highest. Raises RenderError unless normalised time t is
+        from 0 to 1 and the level 0, 1 or 2."""
+        if not 0 <= t <= 1:
+            low, high = self.info.time_range
+            raise RenderError(f"time is {t:g}, expected 0 to 1, from {low:g} to {high:g} s of the scene")
+        if level not in (None, 0, 1, 2):
+            raise RenderError(f"level is {level}, expected 0, 1, 2 or None for the highest")
+        return self if level is None else self.prefix(level)
+
+    def gaussians(self, t: float, level: int | None = None, eye: Vector | None = None) -> Gaussians:
+        """Returns the visible Gaussians at normalised time t in 0..1, evaluated by numpy alone.
+
+        level: 0, 1 or 2, by default the highest; a level that the scene lacks equals the one below. eye: centre [3] of
+        the camera, world, on which colours depend, and opacities and sizes as far as `widths.viewing` says; by default
+        that of the file's camera, without one the middle of the box. Raises RenderError for other values.
+        """
+        scene, info, slots = self.at(t, level), self.info, self.widths.slots
+        if eye is None:
+            eye = info.box.mean(axis=0) if info.camera is None else info.camera.eye
+        centre = np.asarray(eye, np.float32)
+        if centre.shape != (3,) or not np.isfinite(centre).all():
+            raise RenderError(f"eye is {centre.tolist()}, expected 3 finite numbers")
+        rows = np.flatnonzero(scene.mask[-1] * MASK_STEP > MASK_THRESHOLD)
+        mask, values = scene.mask[-1][rows] * MASK_STEP, {"length": scene.anchor_at(rows)}
+        values |= {name: array[rows].reshape(len(rows), -1) for name, array in scene.attributes.items()}
+        with np.errstate(all="ignore"):
+            if motion := scene.motion(scene.level):
+                for unit, added in motion.residuals(values["length"], t, info.box).items():
+                    values[unit] = values[unit] + added
+            position, extent = values["length"], np.exp(values["scaling_log"])
+            inputs = np.concatenate([values["feature"], _unit(position - centre)], axis=1)
+            networks = [scene.networks[name] for name in SCAFFOLD_NETWORKS]
+            outputs = [_perceptron(network, inputs[:, : network[0][0].shape[1]]) for network in networks]
+            opacity = np.tanh(outputs[0])
+            seen = opacity * mask[:, None] >= np.float32(MIN_OPACITY)
+            owner, slot = np.nonzero(seen)
+            shape, color = (values.reshape(*seen.shape, -1)[seen] for values in outputs[1:])
+            offset = values["offset"].reshape(*seen.shape, 3)[seen]
+            return Gaussians(
+                means=position[owner] + offset * extent[owner, :3],
+                quats=_unit(shape[:, 3:]),
+                scales=extent[owner, 3:] / (1 + np.exp(-shape[:, :3])) * mask[owner, None],
+                opacities=opacity[seen] * mask[owner],
+                colors=1 / (1 + np.exp(-color)),
+                slots=rows[owner] * slots + slot,
+            )
 
     def full_masks(self) -> list[np.ndarray]:
         """Returns mask codes uint8 [N] per layer present; anchors that a layer's prefix lacks have code 0."""

@@ -20,12 +20,6 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 VECTOR = "valid/layers-0-1-2.pd4"
-#: What the README's Python leaves to the reader.
-BEFORE = """\
-from functools import partial
-blocks = iter(partial(open("scene.pd4", "rb").read, 500), b"")
-show = lambda scene: print("shown: layers", scene.layers)
-"""
 INSTALLED = "import pd4dgs_codec; print(pd4dgs_codec.__file__)"
 
 
@@ -66,8 +60,9 @@ def check_decoding(env: Environment) -> None:
     assert "site-packages" in env.run("python", "-c", INSTALLED), "the package was not imported from the environment"
     assert json.loads(env.run("pd4dgs-info", "scene.pd4", "--hashes", "--json"))["hashes"] == expected_layers()
     env.run("pd4dgs-decode", "scene.pd4", "-o", "scene.npz")
+    env.run("pd4dgs-info", "--sample", "--check")
     env.run("pd4dgs-package", "scene.pd4", "-o", "site", "--no-video")
-    print(env.run("python", "-c", BEFORE + readme_python()), end="")
+    print(env.run("python", "-c", readme_python()), end="")
 
 
 def check_training(env: Environment) -> None:

@@ -19,11 +19,12 @@ Without -o, pd4dgs-decode only checks the file and prints a summary.
 A .npz output holds anchor, feature, scaling_log, offset, mask_L, mlp.*, planes.* and meta_*.
 A .pt output is a checkpoint for encode, render and eval.
 From a URL (http, https), only the requested layers are fetched; interrupted transfers resume.
+--max-layer is another name of --level.
 
 examples:
   pd4dgs-decode scene.pd4
-  pd4dgs-decode http://127.0.0.1:8000/scene.pd4 --max-layer 1 -o prefix.npz
-  pd4dgs-decode scene.pd4 --max-layer 0 -o base.npz
+  pd4dgs-decode http://127.0.0.1:8000/scene.pd4 --level 1 -o prefix.npz
+  pd4dgs-decode scene.pd4 --level 0 -o base.npz
   pd4dgs-decode scene.pd4 --max-bytes 100k -o early.npz
   head -c 300000 scene.pd4 | pd4dgs-decode - --allow-partial -o prefix.pt
 
@@ -46,12 +47,12 @@ def _decode(args: argparse.Namespace, console: Console) -> int:
     kind = _output_kind(args)
     if args.output:
         common.check_output(args.output, args.overwrite)
-    data, _ = common.read_prefix(args.input, console, args.max_layer, args.max_bytes, args.allow_partial)
+    data, _ = common.read_prefix(args.input, console, args.level, args.max_bytes, args.allow_partial)
     from pd4dgs_codec.format.decoder import decode_partial
 
     start = time.perf_counter()
     scene, complete = decode_partial(
-        data, max_layer=args.max_layer, max_bytes=args.max_bytes, allow_partial=args.allow_partial
+        data, max_layer=args.level, max_bytes=args.max_bytes, allow_partial=args.allow_partial
     )
     seconds = time.perf_counter() - start
     console.detail(f"steps {scene.steps}")
@@ -100,9 +101,9 @@ def _summary(scene: Scene, data: bytes, complete: bool, seconds: float, args: ar
         anchors, active = total - (scene.rows[i - 1] if i else 0), int((scene.mask[i] > 0).sum())
         about = {"layer": layer, "offset": described[layer]["offset"], "bytes": size, "end": end}
         rows.append({**about, "anchors": anchors, "active": active})
-    wanted = range(3 if args.max_layer is None else args.max_layer + 1)
+    wanted = range(3 if args.level is None else args.level + 1)
     return {
-        **{name: getattr(args, name) for name in ("input", "output", "max_layer", "max_bytes")},
+        **{name: getattr(args, name) for name in ("input", "output", "level", "max_bytes")},
         "bytes": len(data),
         "complete": complete,
         "seconds": round(seconds, 4),
@@ -120,7 +121,7 @@ def _text(result: dict[str, Any]) -> str:
         state = "truncated, valid so far"
     elif result["max_bytes"] is not None:
         state = f"first {layers[-1]['end']:,} bytes valid"
-    elif result["max_layer"] is not None:  # nothing is known about the bytes behind the prefix
+    elif result["level"] is not None:  # nothing is known about the bytes behind the prefix
         state = f"layers {', '.join(str(row['layer']) for row in layers)} valid"
     else:
         state = "complete and valid"

@@ -44,7 +44,7 @@ def _evaluate(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.quality.perceptual import PERCEPTUAL, VGG, load_perceptual
 
     file = common.named_input(args.input)
-    levels = load_levels(file, args.max_layer, max_bytes=args.max_bytes, background=args.background)
+    levels = load_levels(file, args.level, max_bytes=args.max_bytes, background=args.background)
     dataset = common.read_dataset(args.source, args, levels[-1].model.info)
     console.detail(f"{args.source}: {len(dataset.train)} training views, {len(dataset.test)} held out")
     if not dataset.test:

@@ -40,28 +40,29 @@ PLY and 4dgs keep the axes of the file. For glTF and SPZ, the scene is rotated s
 {options.SOURCES}
 
 examples:
-  pd4dgs-export scene.pd4 -o scene.ply --to ply --time 0.5
+  pd4dgs-export scene.pd4 -o scene.ply --time 0.5
   pd4dgs-export scene.pd4 -o frames --to ply-seq --fps 10 --sh 1 --data recordings/kitchen
-  pd4dgs-export scene.pd4 -o scene.glb --to glb --compare recordings/kitchen"""
+  pd4dgs-export scene.pd4 -o scene.glb --compare recordings/kitchen"""
 
 SEQUENCES = ("ply-seq", "4dgs")
 KINDS = ("ply", "ply-seq", "spz", "glb", "4dgs")
+FILES = ".ply, .spz, .glb or .4dgs"
 LIBRARIES = {"spz": "gaussforge", "4dgs": "fourdgs"}
 FPS, STEPS, MAX_FRAMES = 30.0, 300, 100_000
 SCALE = options.checked(float, lambda x: 1e-6 <= x <= 1e6, "a number from 1e-6 to 1e6")
 
 
 def parser() -> options.Parser:
-    p = options.Parser("export", "FILE -o OUT --to KIND", "Export a scene as Gaussians for other viewers.", DETAILS)
+    p = options.Parser("export", "FILE -o OUT", "Export a scene as Gaussians for other viewers.", DETAILS)
     p.add_argument("input", metavar="FILE", help=".pd4 file; - reads stdin")
     what = "output file; a folder for ply-seq"
     p.add_argument("-o", "--output", required=True, type=options.named, metavar="OUT", help=what)
-    p.add_argument("--to", required=True, choices=KINDS, help="file format, see below")
+    p.add_argument("--to", choices=KINDS, help="file format, see below (default: by the suffix of OUT)")
     what = "time of ply, spz and glb, as 0..1 of the file's time range (default: 0)"
     p.add_argument("--time", type=options.share, metavar="T", help=what)
     what = f"frame rate of ply-seq and 4dgs (default: {FPS:g})"
     p.add_argument("--fps", type=options.fps, metavar="F", help=what)
-    p.add_argument("--level", type=int, choices=(0, 1, 2), help="level to export (default: the highest)")
+    options.add_level(p, "export")
     what = "degree of the spherical harmonics (default: 3)"
     p.add_argument("--sh", type=int, choices=(0, 1, 2, 3), default=3, help=what)
     what = f"refinement steps; later frames take a quarter (default: {STEPS} or 0, see below)"
@@ -77,8 +78,8 @@ def parser() -> options.Parser:
 
 
 def _export(args: argparse.Namespace, console: Console) -> int:
-    _check_usage(args)
     common.check_other_file(args.input, args.output)
+    _check_usage(args)
     if args.to == "ply-seq":
         _check_folder(args.output, args.overwrite)
     else:
@@ -111,12 +112,16 @@ main = common.command(parser, _export)
 
 
 def _check_usage(args: argparse.Namespace) -> None:
+    suffix = Path(args.output).suffix.lower().removeprefix(".")
+    if args.to is None:
+        if suffix not in KINDS:
+            raise UsageError(f"found -o {args.output}, expected a name that ends in {FILES}, or --to KIND")
+        args.to = suffix
+    if suffix in KINDS if args.to == "ply-seq" else suffix not in ("", args.to):
+        raise UsageError(f"-o {args.output} ends in .{suffix}, but --to is {args.to}")
     options.conditional(args, args.to not in SEQUENCES, "needs --to ply, spz or glb", time=0.0)
     options.conditional(args, args.to in SEQUENCES, "needs --to ply-seq or 4dgs", fps=FPS)
     options.conditional(args, args.data or args.compare, "needs --data or --compare", **options.READING)
-    suffix = Path(args.output).suffix.lower().removeprefix(".")
-    if suffix in KINDS and suffix != args.to:
-        raise UsageError(f"-o {args.output} ends in .{suffix}, but --to is {args.to}")
 
 
 def _check_folder(path: str, overwrite: bool) -> None:

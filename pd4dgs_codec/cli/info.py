@@ -14,7 +14,7 @@ Error bounds are the largest differences between decoded and original values, as
 
 examples:
   pd4dgs-info scene.pd4
-  pd4dgs-info scene.pd4 --bytes
+  pd4dgs-info --sample --bytes
   pd4dgs-info scene.pd4 --check --at 500k,2M,50M --json
   pd4dgs-info http://127.0.0.1:8000/scene.pd4"""
 
@@ -25,7 +25,7 @@ DETAIL_KEYS = ("steps", "planes", "networks", "key_instant")
 
 def parser() -> options.Parser:
     p = options.Parser("info", "FILE", "Show the header and layers of a .pd4 file.", DETAILS)
-    p.add_argument("input", metavar="FILE", help=".pd4 file or URL; - reads stdin")
+    options.add_file(p, "FILE", ".pd4 file or URL; - reads stdin")
     p.add_argument("--check", action="store_true", help="decode the whole file and check every checksum and rule")
     p.add_argument("--bytes", action="store_true", help="show the bytes of each section and layer")
     what = "show SHA-256 of the integers and float32 tensors of each layer"
@@ -37,6 +37,7 @@ def parser() -> options.Parser:
 
 
 def _info(args: argparse.Namespace, console: Console) -> int:
+    options.choose_file(args, "FILE")
     whole = args.check or args.bytes or args.hashes
     data, total = read_prefix(args.input, console, max_bytes=None if whole else 0)
     from pd4dgs_codec.format.decoder import read_layers

@@ -113,9 +113,35 @@ def add_background(options: argparse._ActionsContainer, default: str) -> None:
     options.add_argument("--background", type=background, metavar="COLOR", help=what)
 
 
+def add_file(options: argparse._ActionsContainer, metavar: str, what: str) -> None:
+    """Adds the input, and --sample in its place; see `choose_file`."""
+    options.add_argument("input", nargs="?", metavar=metavar, help=what)
+    what = f"the scene that comes with the package, in place of {metavar}"
+    options.add_argument("--sample", action="store_true", help=what)
+
+
+def choose_file(args: argparse.Namespace, metavar: str) -> None:
+    """Makes the sample the input with --sample. Raises UsageError unless one of them is given."""
+    if args.input is None and not args.sample:
+        raise UsageError(f"found no {metavar}, expected one, or --sample")
+    if args.sample:
+        if args.input is not None:
+            raise UsageError(f"found {metavar} and --sample, expected one of them")
+        from pd4dgs_codec import sample
+
+        args.input = str(sample())
+
+
+def add_level(options: argparse._ActionsContainer, verb: str) -> None:
+    """Adds --level, also known as --max-layer."""
+    what = f"highest level to {verb} (default: the highest of the file)"
+    options.add_argument("--level", type=int, choices=(0, 1, 2), help=what)
+    options.add_argument("--max-layer", dest="level", type=int, choices=(0, 1, 2), help=argparse.SUPPRESS)
+
+
 def add_prefix(options: argparse._ActionsContainer, verb: str) -> None:
-    """Adds --max-layer and --max-bytes, which limit what the command decodes, renders, ...: the `verb`."""
-    options.add_argument("--max-layer", type=int, choices=(0, 1, 2), help=f"highest layer to {verb}")
+    """Adds --level and --max-bytes, which limit what the command decodes, renders, ...: the `verb`."""
+    add_level(options, verb)
     what = f"{verb} only the slices within the first SIZE bytes, such as 50k"
     options.add_argument("--max-bytes", type=size, metavar="SIZE", help=what)
 
@@ -197,9 +223,12 @@ def duration(text: str) -> float:
     return _scaled(text, {"ms": 1e-3, "s": 1.0}, "a time such as 50ms or 1.5s", low=0.0)
 
 
-def size(text: str, expected: str = "a size in bytes such as 50k") -> int:
-    """Reads bytes with k, M for 1e3, 1e6: "50k" -> 50000."""
-    return int(_scaled(text, {"k": 1e3, "M": 1e6}, expected, low=1.0, high=2.0**63))
+def size(text: str, expected: str = "a size in bytes such as 50k or 1.5MB") -> int:
+    """Reads bytes with k or K, M, G for 1e3, 1e6, 1e9, and B or not: "50k", "50KB" -> 50000."""
+    units = {"k": 1e3, "K": 1e3, "M": 1e6, "G": 1e9}
+    with contextlib.suppress(argparse.ArgumentTypeError):
+        return int(_scaled(text.removesuffix("B"), units, expected, low=1.0, high=2.0**63))
+    raise argparse.ArgumentTypeError(f"found {text!r}, expected {expected}")
 
 
 def layer_sizes(text: str) -> dict[int, int]:

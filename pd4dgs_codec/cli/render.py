@@ -6,6 +6,7 @@ import argparse
 import re
 import statistics
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,16 +24,23 @@ if TYPE_CHECKING:
 
 DETAILS = f"""\
 Renders the file's own camera over its time range, or with --data the views of a dataset at their times.
+The suffix of -o decides the kind: .gif and .mp4 are films, .png, .jpg, .webp and .bmp pictures.
 
 {options.SOURCES}
 
 examples:
+  pd4dgs-render scene.pd4 -o middle.png --time 0.5
   pd4dgs-render scene.pd4 -o scene.gif --orbit 20
+  pd4dgs-render scene.pd4 -o scene.mp4 --duration 4 --fps 30
   pd4dgs-render scene.pd4 -o levels.mp4 --side-by-side --data synthetic:local
-  pd4dgs-render scene.pd4 -o out/%04d.png --max-layer 0 --data recordings/kitchen --split test --downscale 2"""
+  pd4dgs-render scene.pd4 -o out/%04d.png --level 0 --data recordings/kitchen --split test --downscale 2"""
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 VIDEOS = (".gif", ".mp4")
+FRAMES, MAX_FRAMES, FPS = 60, 100_000, 20.0
+#: Options of which one replaces the other.
+EXCLUSIVE = (("data", "orbit"), ("data", "duration"), ("data", "time"), ("time", "orbit"), ("time", "frames"),
+             ("duration", "frames"))  # fmt: skip
 MAX_GIF_FPS = 50  #: browsers slow down pictures that are shown for a shorter time
 
 
@@ -46,12 +54,16 @@ def parser() -> options.Parser:
     p.add_argument("--data", metavar="SOURCE", help="take cameras, times and ground truth from this dataset")
     p.add_argument("--split", choices=("test", "train"), help="views of the dataset (default: test)")
     options.add_reading(p, unset=("holdout",))
-    what = "number of evenly spaced frames (default: 60); with --data, render the first N views"
+    what = "render a single picture at time T, as 0..1 of the file's time range"
+    p.add_argument("--time", type=options.share, metavar="T", help=what)
+    what = f"number of evenly spaced frames (default: {FRAMES}); with --data, render the first N views"
     p.add_argument("--frames", type=options.positive_int, metavar="N", help=what)
     what = "swing the file's camera by DEG degrees about its look-at point (default: 0)"
-    p.add_argument("--orbit", type=options.finite_float, default=0.0, metavar="DEG", help=what)
-    what = "frame rate of a video (default: 20)"
+    p.add_argument("--orbit", type=options.finite_float, metavar="DEG", help=what)
+    what = f"frame rate of a film (default: {FPS:g})"
     p.add_argument("--fps", type=options.fps, metavar="F", help=what)
+    what = f"length of a film, such as 4s, in place of --frames (default: {FRAMES} frames)"
+    p.add_argument("--duration", type=options.duration, metavar="S", help=what)
     what = "show all levels side by side, with --data beside the ground truth"
     p.add_argument("--side-by-side", action="store_true", help=what)
     p.add_common()
@@ -71,7 +83,7 @@ def _render(args: argparse.Namespace, console: Console) -> int:
         check_mp4()
     levels = load_levels(
         common.named_input(args.input),
-        args.max_layer,
+        args.level,
         max_bytes=args.max_bytes,
         last_only=not args.side_by_side,
         background=args.background,
@@ -93,7 +105,7 @@ def _render(args: argparse.Namespace, console: Console) -> int:
         "height": frames[0].camera.height,
         "levels": [level.level for level in levels],
         "render_ms": statistics.median(milliseconds),
-    }
+    } | ({"seconds": len(frames) / args.fps} if kind in VIDEOS else {})
     console.result(result, _text(result))
     return OK
 
@@ -107,10 +119,12 @@ def _check_usage(args: argparse.Namespace) -> str:
     if args.output == STDIO or kind not in (*PICTURES, *VIDEOS):
         raise UsageError(f"found -o {args.output}, expected images such as out/%04d.png, or a .gif or .mp4")
     common.check_other_file(args.input, args.output)
-    if args.data and args.orbit:
-        raise UsageError("found --orbit and --data, expected one of them")
+    for one, other in EXCLUSIVE:
+        if None not in (getattr(args, one), getattr(args, other)):
+            raise UsageError(f"found --{one} and --{other}, expected one of them")
     options.conditional(args, args.data, "needs --data SOURCE", split="test", holdout=options.READING["holdout"])
-    options.conditional(args, kind in VIDEOS, "needs a .gif or .mp4 as -o", fps=20.0)
+    options.conditional(args, kind in VIDEOS, "needs a .gif or .mp4 as -o", fps=FPS, duration=None)
+    options.conditional(args, kind not in VIDEOS, "needs a picture such as a.png as -o", time=None)
     if kind == ".gif" and args.fps > MAX_GIF_FPS:
         raise UsageError(f"found --fps {args.fps:g}, expected at most {MAX_GIF_FPS:g} for a .gif")
     if kind not in VIDEOS and "%" in args.output:
@@ -123,8 +137,13 @@ def _check_usage(args: argparse.Namespace) -> str:
 def _frames(args: argparse.Namespace, level: Level) -> list[Frame]:
     from pd4dgs_codec.quality.frames import dataset_frames, own_frames
 
+    if args.time is not None:
+        return [replace(own_frames(level.model.info, 1, downscale=args.downscale)[0], time=args.time)]
     if args.data is None:
-        return own_frames(level.model.info, args.frames or 60, args.orbit, args.downscale)
+        count = args.frames or (FRAMES if args.duration is None else max(1, round(args.duration * args.fps)))
+        if count > MAX_FRAMES:
+            raise UsageError(f"found {count:,} frames, expected at most {MAX_FRAMES:,}")
+        return own_frames(level.model.info, count, args.orbit or 0.0, args.downscale)
     dataset = common.read_dataset(args.data, args, level.model.info)
     views = dataset.test if args.split == "test" else dataset.train
     if not views:
@@ -159,7 +178,7 @@ def _write(args: argparse.Namespace, kind: str, pictures: Iterator[np.ndarray], 
     numbered = "%" in args.output
     if count > 1 and not numbered:
         raise UsageError(
-            f"found -o {args.output} for {count} images, expected a frame number such as %04d in it, or --frames 1"
+            f"found -o {args.output} for {count} images, expected a frame number such as %04d in it, or --time 0.5"
         )
     names = [args.output % i if numbered else args.output for i in range(count)]
     with whole_files(names, args.overwrite, args.output) as temporaries:
@@ -171,4 +190,6 @@ def _text(result: dict[str, Any]) -> str:
     levels = ", ".join(map(str, result["levels"]))
     size = f"{result['width']}x{result['height']}"
     speed = f"{result['render_ms']:.1f} ms per frame"
-    return f"{result['output']}: {result['frames']} frames of {size}, level {levels}, {speed}"
+    count = f"{result['frames']} frames" if result["frames"] > 1 else "1 frame"
+    lasts = f", {result['seconds']:.3g} s" if "seconds" in result else ""
+    return f"{result['output']}: {count} of {size}{lasts}, level {levels}, {speed}"

@@ -2,23 +2,27 @@
 
 import argparse
 import contextlib
+import os
 from pathlib import Path
-from urllib.parse import quote
 
 from pd4dgs_codec.cli import common, options
 from pd4dgs_codec.cli.common import OK, Console, UsageError, command, say
 from pd4dgs_codec.cli.serve import add_link, serving
+from pd4dgs_codec.errors import DataError, DecodeError
 from pd4dgs_codec.io import check_output, temporary_folder, write_bytes
 
 DETAILS = """\
-SCENE is a .pd4 file, the URL of one, or a checkpoint, which is encoded first.
+SCENE is a .pd4 file, the URL of one, a folder of .pd4 files, from which the page lets you choose, or a checkpoint,
+which is encoded first. --sample shows the scene that comes with the package.
 The first line on stdout is the address of the page, printed when it is ready; the default browser opens it. Ctrl-C or
 SIGTERM stops the server. The server of a URL must allow cross-origin requests, as pd4dgs-serve does.
 
 -o writes one HTML file with the player and the scene instead, which browsers open without a server.
 
 examples:
+  pd4dgs-view --sample
   pd4dgs-view scene.pd4
+  pd4dgs-view out/scenes
   pd4dgs-view model.pt --no-browser --port 8000
   pd4dgs-view scene.pd4 -o scene.html
   pd4dgs-view scene.pd4 --rate 2M --latency 50ms"""
@@ -28,7 +32,7 @@ SCENE = "scene.pd4"
 
 def parser() -> options.Parser:
     p = options.Parser("view", "SCENE", "Show a scene in the browser.", DETAILS)
-    p.add_argument("input", metavar="SCENE", help=".pd4 file, its URL, or .pt checkpoint; - reads stdin")
+    options.add_file(p, "SCENE", ".pd4 file, its URL, a folder of .pd4 files, or .pt checkpoint; - reads stdin")
     what = "write one HTML file instead of starting a server"
     p.add_argument("-o", "--output", type=options.named, metavar="FILE", help=what)
     what = "port to listen on (default: any free port)"
@@ -41,8 +45,10 @@ def parser() -> options.Parser:
 
 def _view(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.web import PAGE, is_url
+    from pd4dgs_codec.web.package import player_of
     from pd4dgs_codec.web.page import page
 
+    options.choose_file(args, "SCENE")
     options.conditional(args, not args.output, "has no effect with -o", port=0, rate=None, latency=0.0)
     if args.output:
         common.check_other_file(args.input, args.output)
@@ -54,13 +60,16 @@ def _view(args: argparse.Namespace, console: Console) -> int:
         console.result({"output": args.output, "input": args.input}, args.output)
         return OK
     with temporary_folder() as folder:
-        source = args.input
         (folder / PAGE).write_bytes(page().encode())
-        if not is_url(source):
-            (folder / SCENE).write_bytes(_packed(source))
-            source = SCENE
+        if os.path.isdir(args.input):
+            shown = _copied(args.input, folder)
+        elif is_url(args.input):
+            shown = player_of(args.input)
+        else:
+            (folder / SCENE).write_bytes(_packed(args.input))
+            shown = player_of(SCENE)
         with serving(folder, args, console, port=args.port, private=True) as server:
-            url = f"{server.url}{PAGE}?src={quote(source, safe='')}"
+            url = f"{server.url}{shown}"
             console.result({"url": url, "input": args.input}, url, on_stdout=True)
             if not args.no_browser:
                 import webbrowser
@@ -71,6 +80,23 @@ def _view(args: argparse.Namespace, console: Console) -> int:
 
 
 main = command(parser, _view)
+
+
+def _copied(source: str, folder: Path) -> str:
+    """Copies all `.pd4` files of a folder to another one, beside a page that lists them; returns the page's name."""
+    from pd4dgs_codec.web.package import CHOICE, choice_page
+
+    names = sorted(path.name for path in Path(source).glob("*.pd4") if path.is_file() and path.name[0] != ".")
+    if not names:
+        raise DataError(f"{source}: found no .pd4 file in this folder, expected one or more")
+    sizes = dict[str, int]()
+    for name in names:
+        try:
+            sizes[name] = (folder / name).write_bytes(_packed(str(Path(source) / name)))
+        except DecodeError as error:
+            raise DataError(f"{Path(source) / name}: {error}") from None
+    (folder / CHOICE).write_bytes(choice_page(sizes))
+    return CHOICE
 
 
 def _packed(source: str) -> bytes:

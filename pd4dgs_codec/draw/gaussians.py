@@ -13,14 +13,12 @@ results are bitwise reproducible for a fixed number of parts.
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from pd4dgs_codec.draw.layers import Layer, Layers, multiply, up, whole
-from pd4dgs_codec.draw.projection import ALPHA_MIN
 from pd4dgs_codec.draw.simd import (
     LANES,
     PRODUCT_ROWS,
@@ -43,12 +41,10 @@ from pd4dgs_codec.errors import RenderError
 from pd4dgs_codec.scene import SCALING_DIM, VIEW_DIM, Camera, Network, SceneInfo
 from pd4dgs_codec.threads import kernel_threads
 
-#: A Gaussian fainter than the rasteriser's threshold never reaches a pixel, so its networks are not evaluated.
-MIN_OPACITY = ALPHA_MIN
 #: Assumed distance of an anchor's Gaussians from it, in multiples of its largest extent; in trained scenes one anchor
 #: in 7,000 has a Gaussian farther away.
 OFFSET_REACH = 2.0
-#: Standard deviations from its mean at which a Gaussian of opacity 1 has alpha ALPHA_MIN: sqrt(2 ln 255) = 3.3290.
+#: Standard deviations from its mean at which a Gaussian of opacity 1 has alpha MIN_OPACITY: sqrt(2 ln 255) = 3.3290.
 SIGMA_REACH = 3.33
 #: Anchors farther outside the image than this share of its longer side plus their Gaussians' reach are not evaluated.
 FRUSTUM_MARGIN = 0.15
@@ -85,18 +81,6 @@ def in_view(camera: Camera, viewmat: Any, position: Any, radius: Any, near: floa
     margin = max(fx, fy) * radius / z + FRUSTUM_MARGIN * max(width, height)
     inside = (x > -margin) & (x < width + margin) & (y > -margin) & (y < height + margin)
     return inside & (depth + radius > 0)
-
-
-@dataclass(frozen=True, eq=False)
-class Gaussians:
-    """The input of the rasteriser, float32: K Gaussians, activated and gated."""
-
-    means: Array  #: [K, 3] world
-    quats: Array  #: [K, 4] wxyz, unit
-    scales: Array  #: [K, 3] scene units
-    opacities: Array  #: [K] 0..1
-    colors: Array  #: [K, 3] 0..1
-    slots: Array  #: int64 [K], anchor * G + offset, of G slots
 
 
 class Functions(NamedTuple):

@@ -10,11 +10,9 @@ import numpy as np
 from pd4dgs_codec.draw.gaussians import (
     COLOR,
     GAUSSIAN_WIDTH,
-    MIN_OPACITY,
     OFFSET_REACH,
     SIGMA_REACH,
     Decoders,
-    Gaussians,
     check_time,
     finished,
     in_view,
@@ -27,11 +25,13 @@ from pd4dgs_codec.draw.simd import LANES
 from pd4dgs_codec.scene import (
     MASK_STEP,
     MASK_THRESHOLD,
+    MIN_OPACITY,
     PLANES,
     SCAFFOLD_NETWORKS,
     TRUNK,
     Camera,
     Deformation,
+    Gaussians,
     Network,
     Scene,
     SceneInfo,
@@ -101,7 +101,7 @@ class Player:
         with np.errstate(all="ignore"):
             near = in_view(camera, viewmat, self._anchor, self._radius, self.info.near)
             rows = np.flatnonzero(near & (self._mask > MASK_THRESHOLD))
-            return self._of_eyes(rows, t, [-viewmat[:3, :3].T @ viewmat[:3, 3]])
+            return self._of_eyes(rows, t, [camera.eye])
 
     def gaussians_of_eyes(self, rows: np.ndarray, t: float, eyes: np.ndarray) -> Gaussians:
         """Returns the Gaussians of the anchors `rows` (int64 [n]) at normalised time t for all `eyes` (float32 [E, 3],

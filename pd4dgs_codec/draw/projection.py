@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.draw.simd import LANES, Array, Tasks, double, kernel, load, parallel, splat, store
+from pd4dgs_codec.scene import MIN_OPACITY
 
 TILE_WIDTH, TILE_HEIGHT = 32, 16  #: pixels
 ALPHA_MAX = 0.999  #: alpha is clamped to this (gsplat 1.5.3)
-ALPHA_MIN = 1.0 / 255.0  #: fainter contributions are skipped
+ALPHA_MIN = MIN_OPACITY  #: fainter contributions are skipped
 EPS2D = 0.3  #: added to the diagonal of the covariance in the image, square pixels
 FAR = 1e10  #: Gaussians beyond this depth are skipped, scene units
 REACH_LOG2 = math.log2(255.0)  #: a Gaussian is drawn where log2(opacity) - t^2 - r^2 >= -REACH_LOG2

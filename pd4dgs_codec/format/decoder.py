@@ -1,6 +1,8 @@
 """Decodes a `.pd4` file at once or as its bytes arrive. Needs only numpy, constriction and msgpack."""
 
 from collections.abc import Iterator
+from os import PathLike
+from pathlib import Path
 
 from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.errors import DecodeError, Malformed, Truncated, UnsupportedFeature
@@ -148,14 +150,20 @@ def read_layers(data: bytes, *, max_layer: int | None = None) -> tuple[Header, S
 
 
 def decode(
-    data: bytes, *, max_layer: int | None = None, max_bytes: int | None = None, allow_partial: bool = False
+    data: bytes | bytearray | memoryview | str | PathLike[str],
+    *,
+    max_layer: int | None = None,
+    max_bytes: int | None = None,
+    allow_partial: bool = False,
 ) -> Scene:
     """Decodes a file, its layers <= max_layer, or the slices within its first max_bytes bytes, at least one. Later
     bytes are ignored.
 
-    A cut file raises Truncated, unless allow_partial is set and the file holds at least one slice: then its longest
-    valid prefix of slices is decoded. Other faults raise other DecodeErrors; max_layer < 0 raises ValueError.
+    data: the bytes of the file, or its path; one that cannot be read raises OSError. A cut file raises Truncated,
+    unless allow_partial is set and the file holds at least one slice: then its longest valid prefix of slices is
+    decoded. Other faults raise other DecodeErrors; max_layer < 0 raises ValueError.
     """
+    data = Path(data).read_bytes() if isinstance(data, (str, PathLike)) else bytes(data)
     return decode_partial(data, max_layer=max_layer, max_bytes=max_bytes, allow_partial=allow_partial)[0]
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pd4dgs_codec.data.view import View, rotation_matrix
-from pd4dgs_codec.draw.gaussians import LEAST_NEAR, MIN_OPACITY, near_plane
+from pd4dgs_codec.draw.gaussians import LEAST_NEAR, near_plane
 from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.draw.rasteriser import Geometry, backward, composite, project
 from pd4dgs_codec.interchange.splats import (
@@ -33,7 +33,7 @@ from pd4dgs_codec.interchange.splats import (
 )
 from pd4dgs_codec.quality.frames import shrunk
 from pd4dgs_codec.quality.image import mpsnr
-from pd4dgs_codec.scene import Camera
+from pd4dgs_codec.scene import MIN_OPACITY, Camera
 
 Step = Callable[[], None]
 UNTURNED = np.eye(3)

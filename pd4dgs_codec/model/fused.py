@@ -17,9 +17,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pd4dgs_codec.draw import gaussians as kernels
-from pd4dgs_codec.draw.gaussians import MIN_OPACITY, Decoders, Functions
+from pd4dgs_codec.draw.gaussians import Decoders, Functions
 from pd4dgs_codec.model.networks import MLP, Quantisation, rounded
-from pd4dgs_codec.scene import SCALING_DIM
+from pd4dgs_codec.scene import MIN_OPACITY, SCALING_DIM
 
 TORCH = Functions(
     lambda x: torch.from_numpy(x).tanh().numpy(),

@@ -17,10 +17,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from pd4dgs_codec.draw.gaussians import MIN_OPACITY
 from pd4dgs_codec.draw.projection import ALPHA_MAX, ALPHA_MIN, EPS2D, FAR
 from pd4dgs_codec.model.networks import MLP, Quantisation, round_straight_through
-from pd4dgs_codec.scene import SCALING_DIM, Camera
+from pd4dgs_codec.scene import MIN_OPACITY, SCALING_DIM, Camera
 
 T_MIN = 1e-4
 #: Side of a block, pixels.

@@ -186,3 +186,35 @@ def _library_page(scenes: list[dict[str, Any]]) -> str:
     title, head = f"{len(scenes)} scenes", '<!doctype html><html lang="en"><meta charset="utf-8">'
     head += f"<title>{title}</title><style>{STYLE}</style>\n<h1>{title}</h1>"
     return f"{head}\n<main>\n" + "\n".join(cards) + "\n</main>\n"
+
+
+# -- scenes to choose from ---------------------------------------------------------------------------------------------
+
+CHOICE = "scenes.html"
+_CHOICE_STYLE = (
+    "body{margin:0;display:flex;height:100vh;font:16px system-ui;background:#111}iframe{flex:1;border:0}"
+    "nav{overflow:auto}a{display:block;padding:.6rem 1rem;color:#eee;text-decoration:none}small{color:#aaa}"
+    "a[aria-current]{background:#345}@media(max-width:40rem){body{flex-direction:column}nav{display:flex}}"
+)
+_CHOICE_SCRIPT = (
+    'document.querySelector("nav").onclick=({target})=>{const chosen=target.closest("a");if(!chosen)return;'
+    'for(const a of document.links)a.removeAttribute("aria-current");chosen.setAttribute("aria-current","true");}'
+)
+
+
+def player_of(address: str) -> str:
+    """The player's page beside this one, with the scene at `address`."""
+    return f"{PAGE}?src={quote(os.fsencode(address), safe='')}"
+
+
+def choice_page(sizes: dict[str, int]) -> bytes:
+    """A page that lists scenes beside it, name -> bytes, and shows the one chosen, at first the first."""
+    links = [
+        f'<a target="scene" href="{player_of(name)}"{" aria-current=true" if i == 0 else ""}>'
+        f"{html.escape(printable(name, ''))}<br><small>{size / 1e3:,.0f} kB</small></a>"
+        for i, (name, size) in enumerate(sizes.items())
+    ]
+    head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{len(sizes)} scenes</title>'
+    head += f'<meta name="viewport" content="width=device-width"><style>{_CHOICE_STYLE}</style>\n<nav>\n'
+    frame = f'<iframe name="scene" title="The scene" allow="fullscreen" src="{player_of(next(iter(sizes)))}"></iframe>'
+    return (head + "\n".join(links) + f"\n</nav>\n{frame}\n<script>{_CHOICE_SCRIPT}</script>\n").encode()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from strategies import make_scene
 
+from pd4dgs_codec.cli import options
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.info import info
@@ -78,6 +79,12 @@ def test_decoded_checkpoint_encodes_to_the_same_symbols(cli, scene_pd4, tmp_path
     assert cli("encode", checkpoint, "-o", again, "--effort", 1).code == 0
     first, second = (cli("info", path, "--hashes", "--json").json["hashes"] for path in (scene_pd4, again))
     assert [row["symbols"] for row in first] == [row["symbols"] for row in second]
+
+
+@pytest.mark.parametrize("text", ["100000", "100k", "100K", "100kB", "100KB", ".1M", "0.1MB", "100000B", "0.0001G"])
+def test_sizes_are_written_with_decimal_units(text):
+    assert options.size(text) == 100_000
+    assert options.layer_sizes(f"L0={text}") == {0: 100_000}
 
 
 def test_partial_input_exits_3_only_when_allowed(cli, scene_pd4, tmp_path):

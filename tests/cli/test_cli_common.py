@@ -1,7 +1,11 @@
 """Options, help, usage errors and the dispatcher."""
 
 import json
+import re
+import shlex
+from collections.abc import Iterator
 from importlib import import_module
+from pathlib import Path
 
 import pytest
 
@@ -10,6 +14,7 @@ from pd4dgs_codec import __main__ as dispatcher
 from pd4dgs_codec.cli import common
 from pd4dgs_codec.data.synthetic import STAGES
 
+ROOT = Path(__file__).resolve().parents[2]
 VERBS = {verb: import_module(f"pd4dgs_codec.cli.{dispatcher.MODULES.get(verb, verb)}") for verb in dispatcher.VERBS}
 
 
@@ -29,6 +34,27 @@ def test_help_lists_every_synthetic_scene(verb):
     text = VERBS[verb].parser().format_help()
     for name in STAGES:
         assert f"synthetic:{name}" in text
+
+
+def commands() -> Iterator[str]:
+    """The command lines of the pages and of the examples of --help."""
+    for page in (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))):
+        for block in re.findall(r"^```(?:bash|sh)\n(.*?)^```$", page.read_text("utf-8"), re.DOTALL | re.MULTILINE):
+            yield from block.splitlines()
+    for module in VERBS.values():
+        yield from module.parser().format_help().partition("\nexamples:\n")[2].splitlines()
+
+
+def test_every_command_that_is_shown_has_options_that_exist(monkeypatch):
+    parsed = list[str]()
+    monkeypatch.setattr(common, "run", lambda parser, action, argv: parsed.append(parser.parse_args(argv)) or 0)
+    for line in commands():
+        for part in line.split(" | "):
+            words = shlex.split(part, comments=True)
+            if words and words[0].startswith("pd4dgs-") and words[-1] != "--help":
+                argv = words[1 : words.index(">") if ">" in words else None]
+                assert VERBS[words[0].removeprefix("pd4dgs-")].main(argv) == 0, line
+    assert len(parsed) > 60
 
 
 def test_dispatcher_runs_verbs_and_refuses_others(scene_pd4, capsys):

@@ -19,7 +19,7 @@ def _count(path) -> int:
 
 def test_one_instant_as_ply(cli, scene_pd4, tmp_path):
     out = tmp_path / "scene.ply"
-    command = ("export", scene_pd4, "-o", out, "--to", "ply", "--sh", 1, "--refine", 2, "--json")
+    command = ("export", scene_pd4, "-o", out, "--sh", 1, "--refine", 2, "--json")
     result = cli(*command, "--time", 0.5)
     assert result.code == 0, result.err
     assert result.json["gaussians"] == _count(out) > 20 and result.json["bytes"] == out.stat().st_size
@@ -81,6 +81,6 @@ def test_other_kinds(cli, scene_pd4, tmp_path, kind):
         pytest.importorskip({"spz": "gaussforge", "4dgs": "fourdgs"}[kind])
     out = tmp_path / f"scene.{kind}"
     options = ("--fps", 2) if kind == "4dgs" else ("--time", 1)
-    result = cli("export", scene_pd4, "-o", out, "--to", kind, "--refine", 0, "--json", *options)
+    result = cli("export", scene_pd4, "-o", out, "--refine", 0, "--json", *options)
     assert result.code == 0, result.err
     assert result.json["bytes"] == out.stat().st_size > 100

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 from tiny import TINY
 
-from pd4dgs_codec import decode
+from pd4dgs_codec import decode, render
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.info import info
@@ -51,7 +51,7 @@ def test_eval_averages_the_views_of_each_levels_own_prefix(scene_pd4, shared_dat
 def test_eval_of_checkpoint_and_pipe(cli, model_pt, scene_pd4, shared_dataset):
     levels = cli("eval", model_pt, shared_dataset, "--json").json["levels"]
     assert [row["cumulative_bytes"] for row in levels] == [None] * 3
-    piped = cli("eval", "-", shared_dataset, "--json", "--max-layer", 1, stdin=scene_pd4.read_bytes()).json["levels"]
+    piped = cli("eval", "-", shared_dataset, "--json", "--level", 1, stdin=scene_pd4.read_bytes()).json["levels"]
     assert [row["level"] for row in piped] == [0, 1]
     # what quantisation may cost on this scene
     assert piped[1]["mpsnr"] == pytest.approx(levels[1]["mpsnr"], abs=0.5)
@@ -60,7 +60,7 @@ def test_eval_of_checkpoint_and_pipe(cli, model_pt, scene_pd4, shared_dataset):
 def test_eval_measures_what_moves_where_cameras_stand_still(cli, scene_pd4):
     """Against the region found from the truth at hand, with the pictures that render writes."""
     source = "synthetic:flyby?size=32x32&frames=4"
-    report = cli("eval", scene_pd4, source, "--json", "--max-layer", 1).json
+    report = cli("eval", scene_pd4, source, "--json", "--level", 1).json
     views, (*_, level) = load(source).test, load_levels(scene_pd4, 1)
     scores, shares = [], []
     for view in views:
@@ -70,7 +70,7 @@ def test_eval_measures_what_moves_where_cameras_stand_still(cli, scene_pd4):
         shares.append(region.mean())
     assert report["levels"][1]["moving_mpsnr"] == pytest.approx(np.mean(scores))
     assert 0 < report["moving_share"] == pytest.approx(np.mean(shares))
-    shown = cli("eval", scene_pd4, source, "--max-layer", 0).out.decode()
+    shown = cli("eval", scene_pd4, source, "--level", 0).out.decode()
     assert "moving dB" in shown and f"views of fixed cameras ({100 * np.mean(shares):.1f} %)" in shown
 
 
@@ -86,7 +86,7 @@ def transparent(dataset):
 def test_truth_and_scene_have_the_background_of_the_file_or_the_option(cli, scene, tmp_path, transparent, given):
     file = tmp_path / "green.pd4"
     file.write_bytes(encode(replace(scene, info=replace(scene.info, background=(0.0, 1.0, 0.0))), effort=1))
-    behind, options = (0.0, 1.0, 0.0), ["--max-layer", 0, "--json"]
+    behind, options = (0.0, 1.0, 0.0), ["--level", 0, "--json"]
     if given:
         behind, options = (0.0, 0.6, 1.0), [*options, "--background", given]
     (view,), level = load(str(transparent)).test, load_levels(file, 0)[-1]
@@ -118,7 +118,7 @@ def test_eval_by_the_protocol_of_3dgs(cli, scene_pd4, monkeypatch):
         return perceptual.Distance("LPIPS-VGG", "by hand", lambda a, b: np.abs(a - b).max())
 
     source = "synthetic:local?size=32x24&frames=4"
-    options = ("--protocol", "3dgs", "--max-layer", 0)
+    options = ("--protocol", "3dgs", "--level", 0)
     monkeypatch.setattr(perceptual, "_lpips", lambda *_, **__: vgg())
     report, plain = (cli("eval", scene_pd4, source, *o, "--json").json for o in (options, options[2:]))
     (row,), (usual,), level = report["levels"], plain["levels"], load_levels(scene_pd4, 0)[0]
@@ -140,7 +140,7 @@ def test_eval_of_the_first_bytes(cli, scene_pd4, shared_dataset):
 
 
 def test_eval_without_held_out_views_says_so(cli, scene_pd4, shared_dataset):
-    result = cli("eval", scene_pd4, shared_dataset, "--holdout", 0, "--max-layer", 0)
+    result = cli("eval", scene_pd4, shared_dataset, "--holdout", 0, "--level", 0)
     assert result.code == 0 and "training views" in result.err and b"6 training views" in result.out
 
 
@@ -148,7 +148,7 @@ def test_eval_adds_perceptual_distances_and_names_the_absent(cli, scene_pd4, sha
     distance = Distance("MAE", "by hand", lambda a, b: np.abs(a - b).mean(axis=2))
     loaded = Perceptual({"mae": distance}, {"lpips": "it is not here"})
     monkeypatch.setattr("pd4dgs_codec.quality.perceptual.load_perceptual", lambda names: loaded)
-    command = ("eval", scene_pd4, shared_dataset, "--max-layer", 1)
+    command = ("eval", scene_pd4, shared_dataset, "--level", 1)
     result = cli(*command, "--perceptual", "--json")
     assert result.error_lines == ["no lpips: it is not here"]
     assert result.json["perceptual"]["absent"] == loaded.absent
@@ -183,6 +183,18 @@ def test_render_own_camera_to_gif_and_one_picture(cli, scene_pd4, tmp_path):
     assert movie.n_frames == 5 and movie.size == (WIDTH, HEIGHT)
     assert cli("render", scene_pd4, "-o", tmp_path / "a.png", "--frames", 1, "--downscale", 2).code == 0
     assert Image.open(tmp_path / "a.png").size == (WIDTH // 2, HEIGHT // 2)
+
+
+def test_a_picture_at_a_time_and_films_of_a_length(cli, scene_pd4, tmp_path):
+    for name, time in (("first.png", 0), ("late.png", 0.75)):
+        done = cli("render", scene_pd4, "-o", tmp_path / name, "--time", time, "--level", 1, "--json")
+        assert done.code == 0 and done.json["frames"] == 1 and done.json["levels"] == [1]
+        scene = decode(scene_pd4, max_layer=1)
+        expected = to_uint8(render(scene, scene.info.camera, time))
+        assert np.array_equal(np.asarray(Image.open(tmp_path / name)), expected)
+    film = tmp_path / "film.gif"
+    done = cli("render", scene_pd4, "-o", film, "--duration", "1.5s", "--fps", 8)
+    assert done.code == 0 and f"{film}: 12 frames of 32x24, 1.5 s, level 2" in done.err
 
 
 def test_side_by_side_holds_all_levels_and_the_truth(cli, scene_pd4, shared_dataset, tmp_path):

@@ -1,5 +1,6 @@
 """`pd4dgs-view`: a page, the player and the scene from one address, until a signal comes."""
 
+import re
 import signal
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from typing import IO
 
 import pytest
 
+import pd4dgs_codec
 from pd4dgs_codec import decode, show
 from pd4dgs_codec.web.page import page as whole_page
 
@@ -33,6 +35,31 @@ def test_the_page_and_the_scene_come_from_one_address(scene_pd4):
             urllib.request.urlopen(urllib.request.Request(f"{base}/scene.pd4", headers=header), timeout=60)
     process.send_signal(signal.SIGTERM)
     assert process.wait(60) == 0
+
+
+def test_a_folder_is_listed_and_its_scenes_are_switched(scene_pd4, tmp_path):
+    names = ["a b&c.pd4", "second.pd4"]
+    for name in names:
+        (tmp_path / name).write_bytes(scene_pd4.read_bytes())
+    (tmp_path / "notes.txt").write_text("no scene")
+    process = run(tmp_path)
+    page = process.stdout.readline().strip()
+    text, base = fetch(page).decode(), page.rpartition("/")[0]
+    links = re.findall(r'<a target="scene" href="([^"]+)"', text)
+    assert links == ["index.html?src=a%20b%26c.pd4", "index.html?src=second.pd4"] and f'src="{links[0]}"' in text
+    for link in links:
+        assert fetch(f"{base}/{link.partition('=')[2]}") == scene_pd4.read_bytes()
+    assert "a b&amp;c.pd4" in text and "notes" not in text
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(60) == 0
+
+
+def test_the_sample_is_shown_and_described_without_a_file(cli, scene_pd4, tmp_path, monkeypatch):
+    monkeypatch.setattr(pd4dgs_codec, "sample", lambda: scene_pd4)
+    told = cli("info", "--sample", "--json")
+    assert told.code == 0 and told.json["bytes"] == scene_pd4.stat().st_size and told.json["input"] == str(scene_pd4)
+    assert cli("view", "--sample", "-o", tmp_path / "sample.html").code == 0
+    assert (tmp_path / "sample.html").read_text() == whole_page(scene_pd4.read_bytes())
 
 
 def fetch(url: str) -> bytes:

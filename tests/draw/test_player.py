@@ -1,7 +1,7 @@
 """Pictures without torch: those of the torch model, to rounding, and in a process where torch cannot be imported."""
 
 import hashlib
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -36,20 +36,19 @@ def _scene(**changes: object) -> Scene:
     return plan(replace(scene, mask=masks), EncodeOptions(layers=2, omit="nothing")).symbols.scene()
 
 
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {},
-        {"hidden": (16, 8)},
-        {"channels": 5, "width": 7},
-        {"widths": Widths(16, 4)},
-        {"widths": Widths(3, 13)},
-        {"widths": Widths(viewing=("color",))},
-        {"widths": Widths(viewing=("covariance",)), "hidden": (16,)},
-        KEYED,
-    ],
-    ids=["usual", "deep", "odd", "narrow", "odd widths", "views of color", "views of covariance", "key instant"],
-)
+KINDS = {
+    "usual": {},
+    "deep": {"hidden": (16, 8)},
+    "odd": {"channels": 5, "width": 7},
+    "narrow": {"widths": Widths(16, 4)},
+    "odd widths": {"widths": Widths(3, 13)},
+    "views of color": {"widths": Widths(viewing=("color",))},
+    "views of covariance": {"widths": Widths(viewing=("covariance",)), "hidden": (16,)},
+    "key instant": KEYED,
+}
+
+
+@pytest.mark.parametrize("changes", KINDS.values(), ids=KINDS)
 def test_pictures_are_those_of_the_torch_model(changes):
     scene = _scene(**changes)
     seen = 0.0
@@ -65,6 +64,21 @@ def test_pictures_are_those_of_the_torch_model(changes):
             assert np.abs(got - expected).max() < 5e-3 and np.abs(got - expected).mean() < 5e-5
             seen += float(np.ptp(got))
     assert seen > 2, "the pictures show something"
+
+
+@pytest.mark.parametrize("changes", KINDS.values(), ids=KINDS)
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_the_gaussians_of_a_scene_are_those_that_are_drawn(changes, level):
+    scene, eye = _scene(**changes), np.array([1.0, -2.0, 8.0], np.float32)
+    for t in (0.0, 0.37, 1.0):
+        player = Player(scene.prefix(level))
+        drawn, found = player.gaussians_of_eyes(player.active, t, eye[None]), scene.gaussians(t, level, eye)
+        both = np.intersect1d(drawn.slots, found.slots)  # one at the threshold of opacity may come or go
+        assert len(both) > 50 and len(both) >= max(len(drawn.slots), len(found.slots)) - 2
+        for field in fields(found):
+            own, other = (getattr(g, field.name)[np.isin(g.slots, both)] for g in (found, drawn))
+            assert own.dtype == other.dtype
+            np.testing.assert_allclose(own, other, rtol=5e-3, atol=1e-4, err_msg=field.name)
 
 
 @pytest.mark.parametrize("level", [1, 2])

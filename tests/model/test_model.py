@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from pd4dgs_codec import decode, encode
+from pd4dgs_codec import decode, encode, open_stream
 from pd4dgs_codec.draw.hexplane import Field
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.model import checkpoint, fused
@@ -344,6 +344,14 @@ def graded_model() -> Model:
     model.step_class.copy_(torch.arange(70) % 7)
     model.centre.copy_(centre(model))
     return model
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_scene_of_a_stream_becomes_a_model_of_its_own():
+    stream = open_stream()
+    scene = stream.feed(encode(to_scene(graded_model()), effort=1))[-1]
+    model = from_scene(scene)
+    assert torch.equal(model.step_class, torch.from_numpy(scene.grading.classes.copy()))
 
 
 def test_what_training_rounds_is_what_the_file_holds():

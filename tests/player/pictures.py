@@ -9,10 +9,9 @@ import numpy as np
 from browser import call, pixels
 
 from pd4dgs_codec import decode
-from pd4dgs_codec.draw.gaussians import Gaussians
 from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.quality.frames import turned
-from pd4dgs_codec.scene import Camera, Scene
+from pd4dgs_codec.scene import Camera, Gaussians, Scene
 
 
 def decibels(a: np.ndarray, b: np.ndarray) -> float:
@@ -26,8 +25,7 @@ class Rasterised(Player):
 
     def gaussians(self, camera: Camera, t: float) -> Gaussians:
         """Without a test of the frustum."""
-        eye = -camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]
-        return self.gaussians_of_eyes(self.active, t, eye[None].astype(np.float32))
+        return self.gaussians_of_eyes(self.active, t, camera.eye[None])
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:

@@ -40,10 +40,10 @@ def test_info_checks_and_hashes_the_whole_remote_file(cli, folder, scene_bytes):
 def test_decode_fetches_the_prefix_and_nothing_more(cli, folder, tmp_path, scene_bytes, layer):
     end = dict(slice_ends(scene_bytes))[layer]
     with FaultyServer(scene_bytes, [Fault(100), Fault(), Fault(1234)]) as server:
-        done = cli("decode", server.url, "--max-layer", layer, "-o", tmp_path / "there.npz", "-v")
+        done = cli("decode", server.url, "--level", layer, "-o", tmp_path / "there.npz", "-v")
         assert server.sent == end
     assert done.code == 0 and f"{end:,} bytes in 4 requests, 2 interruptions" in done.err
-    assert cli("decode", folder / "scene.pd4", "--max-layer", layer, "-o", tmp_path / "here.npz").code == 0
+    assert cli("decode", folder / "scene.pd4", "--level", layer, "-o", tmp_path / "here.npz").code == 0
     assert (tmp_path / "there.npz").read_bytes() == (tmp_path / "here.npz").read_bytes()
 
 
@@ -59,7 +59,7 @@ def test_decode_of_the_whole_file_is_one_request(cli, scene_bytes):
 
 def test_a_server_without_ranges_serves_prefixes_too(cli, scene_bytes):
     with FaultyServer(scene_bytes, ranges=False) as server:
-        done = cli("decode", server.url, "--max-layer", 0, "--json")
+        done = cli("decode", server.url, "--level", 0, "--json")
         assert len(server.requests) == 1
     assert done.code == 0 and done.json["bytes"] == slice_ends(scene_bytes)[0][1]
 

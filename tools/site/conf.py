@@ -53,6 +53,7 @@ CONTENTS = {
     "Use": [
         "docs/README",
         "docs/tutorial",
+        "docs/python",
         "docs/training",
         "docs/encoding",
         "docs/player-and-delivery",
@@ -122,6 +123,8 @@ What most programs need can be imported from the package itself. A decoded file 
 come from a :class:`~pd4dgs_codec.web.client.SceneClient`.
 
 .. autofunction:: pd4dgs_codec.decode
+.. autofunction:: pd4dgs_codec.render
+.. autofunction:: pd4dgs_codec.sample
 .. autofunction:: pd4dgs_codec.open_stream
 .. autofunction:: pd4dgs_codec.encode
 
