@@ -56,7 +56,7 @@ def parser() -> options.Parser:
     options.add_reading(p, unset=("holdout",))
     what = "render a single picture at time T, as 0..1 of the file's time range"
     p.add_argument("--time", type=options.share, metavar="T", help=what)
-    what = f"number of evenly spaced frames (default: {FRAMES}); with --data, render the first N views"
+    what = f"number of evenly spaced frames (default: {FRAMES}); with --data, of evenly spread views (default: all)"
     p.add_argument("--frames", type=options.positive_int, metavar="N", help=what)
     what = "swing the file's camera by DEG degrees about its look-at point (default: 0)"
     p.add_argument("--orbit", type=options.finite_float, metavar="DEG", help=what)
@@ -64,7 +64,7 @@ def parser() -> options.Parser:
     p.add_argument("--fps", type=options.fps, metavar="F", help=what)
     what = f"length of a film, such as 4s, in place of --frames (default: {FRAMES} frames)"
     p.add_argument("--duration", type=options.duration, metavar="S", help=what)
-    what = "show all levels side by side, with --data beside the ground truth"
+    what = "show all levels side by side, with --data beside the ground truth; a.png gets a row per frame"
     p.add_argument("--side-by-side", action="store_true", help=what)
     p.add_common()
     return p
@@ -148,7 +148,8 @@ def _frames(args: argparse.Namespace, level: Level) -> list[Frame]:
     views = dataset.test if args.split == "test" else dataset.train
     if not views:
         raise DataError(f"{args.data}: has no held-out views; expected --split train or another --holdout")
-    return dataset_frames(views[: args.frames])
+    count = min(args.frames or len(views), len(views))
+    return dataset_frames([views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)])
 
 
 def _pictures(
@@ -169,13 +170,15 @@ def _pictures(
 
 def _write(args: argparse.Namespace, kind: str, pictures: Iterator[np.ndarray], count: int) -> int:
     """Writes all pictures; returns the number of files."""
-    from pd4dgs_codec.quality.frames import write_gif, write_mp4, write_pictures
+    from pd4dgs_codec.quality.frames import stacked, write_gif, write_mp4, write_pictures
 
     if kind in VIDEOS:
         with whole_file(args.output, args.overwrite) as temporary:
             (write_gif if kind == ".gif" else write_mp4)(pictures, temporary, args.fps)
         return 1
     numbered = "%" in args.output
+    if args.side_by_side and not numbered:
+        pictures, count = iter([stacked(list(pictures))]), 1
     if count > 1 and not numbered:
         raise UsageError(
             f"found -o {args.output} for {count} images, expected a frame number such as %04d in it, or --time 0.5"

@@ -135,6 +135,12 @@ def side_by_side(panels: Sequence[Panel]) -> np.ndarray:
     return np.asarray(sheet)
 
 
+def stacked(rows: Sequence[np.ndarray]) -> np.ndarray:
+    """Joins pictures top to bottom, the narrower ones filled up with white; returns uint8 [h, w, 3]."""
+    width = max(row.shape[1] for row in rows)
+    return np.concatenate([np.pad(r, ((0, 0), (0, width - r.shape[1]), (0, 0)), constant_values=255) for r in rows])
+
+
 def _fitting(text: str, width: int, length: Callable[[str], float]) -> str:
     """Cuts the end of `text` until it fits `width`, by whole words if possible."""
     while length(text) > width and text:

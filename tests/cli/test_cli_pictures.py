@@ -207,6 +207,17 @@ def test_side_by_side_holds_all_levels_and_the_truth(cli, scene_pd4, shared_data
     assert sheet.shape[1] == 4 * WIDTH + 3 * 4
 
 
+def test_side_by_side_in_one_picture_has_a_row_per_view(cli, scene_pd4, tmp_path):
+    """Three of eleven views, evenly spread."""
+    source = "synthetic:flyby?size=32x32&frames=11"
+    options = ("--data", source, "--split", "train", "--side-by-side", "--frames", 3)
+    assert cli("render", scene_pd4, "-o", tmp_path / "sheet.png", *options, "--json").json["outputs"] == 1
+    sheet = np.asarray(Image.open(tmp_path / "sheet.png"))
+    rows = np.split(sheet, 3)
+    for row, i in zip(rows, (1, 5, 9), strict=True):
+        assert np.array_equal(row[-32:, -32:], load(source).train[i].image)
+
+
 def test_render_mp4(cli, scene_pd4, tmp_path):
     imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
     assert cli("render", scene_pd4, "-o", tmp_path / "a.mp4", "--frames", 7, "--fps", 10).code == 0
