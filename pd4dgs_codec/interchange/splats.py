@@ -51,8 +51,9 @@ TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 JSON, BINARY = 0x4E4F534A, 0x004E4942  #: types of chunks
 #: SPZ stores positions in 24 bits, 12 of them fractional: multiples of SPZ_STEP below SPZ_REACH, scene units.
 SPZ_STEP, SPZ_REACH = 1 / 4096, 2048.0
-#: SPZ's first bytes; most Gaussians, and most unpacked bytes of each: 65 with all harmonics, the rest for extensions.
-SPZ_MAGIC, SPZ_MOST, SPZ_BYTES = b"NGSP", 10_000_000, 128
+#: SPZ's first bytes; most Gaussians, and least and most unpacked bytes of each: 16 in version 1, 65 with all harmonics,
+#: the rest for extensions.
+SPZ_MAGIC, SPZ_MOST, SPZ_LEAST, SPZ_BYTES = b"NGSP", 10_000_000, 16, 128
 GZIP, ZIP, PICKLE = b"\x1f\x8b\x08", b"PK\3\4", b"\x80\x02\x8a"  #: first bytes of SPZ below version 4, of torch's files
 PACKED = b"\nproperty uint packed_position"  #: in the header of a compressed PLY
 #: A row of a .splat file: linear scales, and as 0..255 sRGB, opacity and a quaternion wxyz around 128.
@@ -333,8 +334,8 @@ def _unpacked(path: Path, data: bytes, kind: str) -> bytes:
 
 
 def _check_spz(path: Path, data: bytes) -> None:
-    """Raises DataError unless `data` is an SPZ file that unpacks to no more bytes than its Gaussians need. gaussforge
-    has no such limit."""
+    """Raises DataError unless `data` is an SPZ file that unpacks to as many bytes as its Gaussians need. gaussforge has
+    no such limits."""
     unpacker, zipped = zlib.decompressobj(wbits=31), data[:4] != SPZ_MAGIC  # versions from 4 do not compress it
     try:
         head = unpacker.decompress(data, 20) if zipped else data[:20]
@@ -356,6 +357,8 @@ def _check_spz(path: Path, data: bytes) -> None:
         size = sum(int.from_bytes(table[i + 8 : i + 16], "little") for i in range(0, len(table), 16))
     if size > most:
         raise DataError(f"{path}: unpacks to more bytes than {count:,} Gaussians need, expected at most {most:,}")
+    if size < SPZ_LEAST * count:
+        raise DataError(f"{path}: unpacks to {size:,} bytes, too few for the {count:,} Gaussians that it declares")
 
 
 def _read_gsplat(path: Path, raw: bytes) -> Splats:

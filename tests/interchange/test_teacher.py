@@ -249,9 +249,12 @@ def _header(version: int, count: int, streams: int = 0) -> bytes:
         (gzip.compress(_header(3, 5) + bytes(1 << 24)), "unpacks to more bytes than 5 Gaussians need"),
         (gzip.compress(_header(3, 2**32 - 1) + bytes(99)), "declares 4,294,967,295 Gaussians, expected 10,000,000"),
         (_header(4, 5, 1) + struct.pack("<IIQQQ", 32, 0, 0, 9, 1 << 40), "unpacks to more bytes than 5 Gaussians need"),
-        (gzip.compress(_header(3, 5)), "gaussforge cannot read it"),
+        (gzip.compress(_header(3, 5)), "unpacks to 16 bytes, too few for the 5 Gaussians that it declares"),
+        (gzip.compress(_header(3, 5_000_000) + bytes(6000)), "too few for the 5,000,000 Gaussians that it declares"),
+        (_header(4, 5_000_000, 1) + struct.pack("<IIQQQ", 32, 0, 0, 9, 6000), "too few for the 5,000,000 Gaussians"),
+        (gzip.compress(_header(3, 5) + bytes(80)), "gaussforge cannot read it"),
     ],
-    ids=["other bytes", "a bomb", "a count", "a bomb of version 4", "no Gaussians"],
+    ids=["other", "a bomb", "a count", "a bomb of version 4", "none", "few", "few of version 4", "cut"],
 )
 def test_bad_spz_files_are_refused_before_they_fill_memory(tmp_path, capfd, data, message):
     pytest.importorskip("gaussforge")
