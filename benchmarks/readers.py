@@ -13,6 +13,7 @@ import gzip
 import io
 import json
 import resource
+import struct
 import subprocess
 import sys
 import tempfile
@@ -22,6 +23,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import torch
 from common import ROOT, peak_bytes
 from PIL import Image
 
@@ -108,6 +110,26 @@ def blank_film(side: int, frames: int) -> bytes:
 def spz(size: int) -> bytes:
     """An SPZ file that says it has ten million Gaussians, all zero."""
     return gzip.compress(b"NGSP" + (2).to_bytes(4, "little") + (10_000_000).to_bytes(4, "little") + bytes(size))
+
+
+def spz_count(zipped: bool) -> bytes:
+    """An SPZ file that says it has ten million Gaussians, and holds none."""
+    head = b"NGSP" + struct.pack("<IIBBBB", 3 if zipped else 4, 10_000_000, 0, 12, 0, 0 if zipped else 1)
+    return gzip.compress(head) if zipped else head + struct.pack("<IIQQQ", 32, 0, 0, 9, 1 << 20) + bytes(9)
+
+
+def splat(rows: int) -> bytes:
+    """A .splat file of equal Gaussians."""
+    return (np.ones(6, "<f4").tobytes() + bytes([9, 9, 9, 255, 255, 128, 128, 128])) * rows
+
+
+def stretched(rows: int) -> bytes:
+    """A checkpoint of gsplat whose tensors repeat one number."""
+    stream = io.BytesIO()
+    shapes = dict(means=(3,), quats=(4,), scales=(3,), opacities=(), sh0=(1, 3), shN=(0, 3))
+    one = torch.ones(1)
+    torch.save({"splats": {name: one.expand(rows, *shape) for name, shape in shapes.items()}}, stream)
+    return stream.getvalue()
 
 
 def compressed_ply(points: int) -> bytes:
@@ -212,6 +234,16 @@ CASES: dict[str, tuple[str, Callable[[], bytes], Callable[[Path], object]]] = {
         read_splats,
     ),
     "Gaussians (.spz): zeros": ("x.spz", lambda: spz(256 * MEGABYTE), read_splats),
+    "Gaussians (.spz): a count": ("x.spz", lambda: spz_count(zipped=True), read_splats),
+    "Gaussians (.spz 4): a count": ("x.spz", lambda: spz_count(zipped=False), read_splats),
+    "Gaussians (.splat)": ("x.splat", lambda: splat(MEGABYTE // 32), read_splats),
+    "Gaussians (.ply): lines of a header": ("x.ply", lambda: b"ply\n" + b"\n" * MEGABYTE, read_splats),
+    "Gaussians (.ply): elements": (
+        "x.ply",
+        lambda: b"ply\nformat ascii 1.0\n" + b"element a 1\n" * 5000 + b"element vertex 0\nend_header\n",
+        read_splats,
+    ),
+    "Gaussians (gsplat): stride 0": ("ckpt.pt", lambda: stretched(50_000_000), read_splats),
     "Gaussians (.compressed.ply): zeros": ("x.compressed.ply", lambda: compressed_ply(MEGABYTE // 16), read_splats),
     "Gaussians (.4dgs): equal ones": ("x.4dgs", lambda: equal_gaussians(45_000), read_teacher),
     "Gaussians (.4dgs): too many equal ones": ("x.4dgs", lambda: equal_gaussians(300_000), read_teacher),

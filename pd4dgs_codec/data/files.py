@@ -340,53 +340,64 @@ def shrink_mask(mask: np.ndarray, k: int) -> np.ndarray:
 # -- PLY files ---------------------------------------------------------------------------------------------------------
 
 SCALARS = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
-    "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
-    "double": "<f8", "float64": "<f8",
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
 }  # fmt: skip
-END = b"end_header"
+ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}  #: of the bytes of numbers
+END = re.compile(rb"\nend_header[ \t]*\r?\n")  #: as a line: comments may hold the word
+MAX_HEADER = 1 << 16  #: bytes of a PLY file's header
 DIGITS = 12  #: of a count; Python refuses to parse thousands
 
 
-def _header(path: Path, raw: bytes) -> tuple[str, int, np.dtype, int]:
-    """(format, vertex count, dtype of a vertex, byte at which the body starts). Raises DataError."""
-    stop = raw.find(END)
-    if not raw.startswith(b"ply") or stop < 0:
-        raise DataError(f"{path}: not a PLY file (expected it to start with 'ply' and hold an end_header line)")
-    newline = raw.find(b"\n", stop)
-    kind, count, fields, elements = "", -1, [], 0
-    for line in raw[:stop].decode("ascii", "replace").splitlines():
-        words = line.split()
+def _header(path: Path, raw: bytes) -> tuple[str, int, np.dtype, int, int]:
+    """(format, vertex count, dtype of a vertex, byte at which the body starts, bytes or lines before the vertices).
+    Raises DataError."""
+    end = END.search(raw, 0, MAX_HEADER)
+    if not raw.startswith(b"ply") or end is None:
+        found = f"begins with {raw[:4]!r}" if not raw.startswith(b"ply") else "has no line end_header"
+        raise DataError(f"{path}: not a PLY file: {found}, expected 'ply' and a header of {MAX_HEADER:,} bytes at most")
+    kind, elements = "", list[tuple[str, int, list[list[str]]]]()
+    for words in map(str.split, raw[: end.start()].decode("ascii", "replace").splitlines()):
         if words[:1] == ["format"] and len(words) >= 2:
             kind = words[1]
-        elif words[:1] == ["element"] and len(words) == 3:
-            elements += 1
-            if elements == 1 and words[1] == "vertex" and words[2].isdigit() and len(words[2]) <= DIGITS:
-                count = int(words[2])
-        elif words[:1] == ["property"] and elements == 1:
-            if len(words) != 3 or words[1] not in SCALARS:
-                raise DataError(f"{path}: unknown vertex property {' '.join(words[1:])!r}, expected a scalar")
-            fields.append((words[2], SCALARS[words[1]]))
-    if kind not in ("ascii", "binary_little_endian") or count < 0 or newline < 0:
-        found = f"format {kind!r}, first element with {count} vertices"
-        raise DataError(f"{path}: found {found}; expected ascii or binary_little_endian and the element vertex first")
-    names = [name for name, _ in fields]
+        elif words[:1] == ["element"]:
+            if len(words) != 3 or not (words[2].isdigit() and len(words[2]) <= DIGITS):
+                raise DataError(f"{path}: found {one_line(' '.join(words), 60)!r}, expected a name and a count")
+            elements.append((words[1], int(words[2]), []))
+        elif words[:1] == ["property"] and elements:
+            elements[-1][2].append(words[1:])
+    places = [i for i, (name, _, _) in enumerate(elements) if name == "vertex"]
+    if kind not in ORDERS or not places:
+        found = f"format {one_line(repr(kind), 40)} and {'an' if places else 'no'} element vertex"
+        raise DataError(f"{path}: found {found}; expected {', '.join(ORDERS)} and the element vertex")
+    skipped = 0
+    for name, count, properties in elements[: places[0] + 1]:
+        for words in properties:
+            if len(words) != 2 or words[0] not in SCALARS:
+                found = f"{name} property {one_line(' '.join(words), 60)!r}"
+                raise DataError(f"{path}: unknown {one_line(found, 80)}, expected a scalar")
+        sizes = [np.dtype(SCALARS[scalar]).itemsize for scalar, _ in properties]
+        skipped += 0 if name == "vertex" else count * (sum(sizes) if kind != "ascii" else 1)
+    names = [name for _, name in properties]
     if len(set(names)) != len(names) or not {"x", "y", "z"} <= set(names):
-        raise DataError(f"{path}: vertex properties are {', '.join(names)}, expected x, y, z once each")
-    return kind, count, np.dtype(fields), newline + 1
+        found = one_line(", ".join(names), 120)
+        raise DataError(f"{path}: vertex properties are {found}, expected x, y, z once each")
+    fields = [(name, ORDERS[kind] + SCALARS[scalar]) for scalar, name in properties]
+    return kind, count, np.dtype(fields), end.end(), skipped
 
 
 def read_vertices(path: Path, raw: bytes | None = None) -> np.ndarray:
     """Structured array [count] of the vertex element, one field per property. raw: the file's bytes, if known."""
     raw = read_file(path) if raw is None else raw
-    kind, count, dtype, start = _header(path, raw)
-    names, body = dtype.names or (), raw[start:]
-    if kind == "binary_little_endian":
-        if len(body) < count * dtype.itemsize:
-            size = count * dtype.itemsize
-            raise DataError(f"{path}: {len(body)} bytes of vertices, expected {size} for {count} of them")
-        return np.frombuffer(body, dtype, count)
-    lines = body.decode("ascii", "replace").splitlines()[:count]
+    kind, count, dtype, start, skipped = _header(path, raw)
+    names = dtype.names or ()
+    if kind != "ascii":
+        size, left = count * dtype.itemsize, len(raw) - start - skipped
+        if left < size:
+            raise DataError(f"{path}: {max(left, 0)} bytes of vertices, expected {size} for {count} of them")
+        return np.frombuffer(raw, dtype, count, start + skipped)
+    lines = raw[start:].decode("ascii", "replace").splitlines()[skipped : skipped + count]
     if len(lines) < count:
         raise DataError(f"{path}: {len(lines)} vertex lines, expected {count}")
     try:
@@ -394,7 +405,7 @@ def read_vertices(path: Path, raw: bytes | None = None) -> np.ndarray:
     except ValueError:
         raise DataError(f"{path}: vertex lines are not {len(names)} numbers each") from None
     vertices = np.empty(count, dtype)
-    with np.errstate(over="ignore"):  # numbers beyond a type's range become infinite
+    with np.errstate(over="ignore", invalid="ignore"):  # numbers beyond a type's range become infinite or any integer
         for name, column in zip(names, table.T, strict=True):
             vertices[name] = column
     return vertices

@@ -259,4 +259,7 @@ def _cells(anchor: np.ndarray, voxel: float, path: Path) -> np.ndarray:
         raise DataError(f"{path}: {found}, expected multiples of it; --voxel-size sets another")
     if np.ptp(anchor, axis=0).any() and not np.ptp(cells, axis=0).any():
         raise DataError(f"{path}: all anchors lie in one voxel of {voxel:g}, expected a smaller voxel size")
+    if shared := len(cells) - len(np.unique(cells, axis=0)):
+        found = f"{shared:,} of {len(cells):,} anchors share a voxel of {voxel:g} with another"
+        raise DataError(f"{path}: {found}, expected one anchor per voxel")
     return cells.astype(np.int32)

@@ -3,8 +3,8 @@
 Real harmonics and their signs are those of its reference implementation (Kerbl et al. 2023), as in PLY, SPZ and
 KHR_gaussian_splatting. A colour is max(0, 0.5 + sum c_j Y_j(d)), d the unit vector from the eye to the mean.
 
-Files: reads PLY, SPZ and gsplat checkpoints, and writes PLY, glTF, SPZ and 4dgs. SPZ and compressed PLY need
-gaussforge, 4dgs needs fourdgs; the extra `interchange` installs both.
+Files: reads PLY, SPZ, .splat and gsplat checkpoints, which it tells apart by their content, and writes PLY, glTF, SPZ
+and 4dgs. SPZ and compressed PLY need gaussforge, 4dgs needs fourdgs; the extra `interchange` installs both.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import os
 import re
 import struct
 import sys
+import warnings
 import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -26,10 +27,10 @@ from typing import Any, TypeVar
 import numpy as np
 
 from pd4dgs_codec.archives import read_tensors
-from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, LARGEST, read_file, read_vertices
+from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, LARGEST, MAX_HEADER, read_file, read_vertices
 from pd4dgs_codec.data.view import world_to_camera
 from pd4dgs_codec.draw.rasteriser import draw
-from pd4dgs_codec.errors import DataError, one_line, required
+from pd4dgs_codec.errors import DamageWarning, DataError, one_line, required
 from pd4dgs_codec.scene import Camera
 
 T = TypeVar("T")
@@ -50,8 +51,15 @@ TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 JSON, BINARY = 0x4E4F534A, 0x004E4942  #: types of chunks
 #: SPZ stores positions in 24 bits, 12 of them fractional: multiples of SPZ_STEP below SPZ_REACH, scene units.
 SPZ_STEP, SPZ_REACH = 1 / 4096, 2048.0
-#: SPZ's first bytes; most Gaussians, and most unpacked bytes of each: 65 with all harmonics, the rest for extensions.
-SPZ_MAGIC, SPZ_MOST, SPZ_BYTES = b"NGSP", 10_000_000, 128
+#: SPZ's first bytes; most Gaussians, and least and most unpacked bytes of each: 16 in version 1, 65 with all harmonics,
+#: the rest for extensions.
+SPZ_MAGIC, SPZ_MOST, SPZ_LEAST, SPZ_BYTES = b"NGSP", 10_000_000, 16, 128
+GZIP, ZIP, PICKLE = b"\x1f\x8b\x08", b"PK\3\4", b"\x80\x02\x8a"  #: first bytes of SPZ below version 4, of torch's files
+PACKED = b"\nproperty uint packed_position"  #: in the header of a compressed PLY
+#: A row of a .splat file: linear scales, and as 0..255 sRGB, opacity and a quaternion wxyz around 128.
+#: https://github.com/antimatter15/splat
+ROUNDED = 0.05  #: most difference of the length of such a quaternion from 1
+ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgb", "u1", 3), ("a", "u1"), ("quats", "u1", 4)])
 #: 4dgs files store harmonics from degree 1 on as bytes, for values from -SH_SPAN to SH_SPAN.
 SH_SPAN = 4.0
 
@@ -206,8 +214,12 @@ def checked(
         raise DataError(f"{where}: {sh.shape[1]} coefficients per colour, expected {expected}")
     good = finite_rows(parts)
     good &= (np.linalg.norm(quats, axis=1) > 0) & (scales >= 0).all(axis=1) & (opacities >= 0) & (opacities <= 1)
+    usable = f"finite and at most {LARGEST:g}, with a quaternion other than 0"
     if not good.any():
-        raise DataError(f"{where}: none of {n} Gaussians is finite with a quaternion other than 0, expected one")
+        raise DataError(f"{where}: none of {n} Gaussians is {usable}, expected one")
+    if not good.all():
+        left = f"{n - np.count_nonzero(good):,} of {n:,} Gaussians are left out, expected all to be {usable}"
+        warnings.warn(DamageWarning(f"{where}: {left}"), stacklevel=2)
     kept = {name: np.ascontiguousarray(array[good], np.float32) for name, array in parts.items()}
     return Splats(**kept | {"quats": unit(kept["quats"])})
 
@@ -237,28 +249,43 @@ def quiet() -> Iterator[None]:
                 os.close(old)
 
 
-def read_splats(path: Path) -> Splats:
-    """Reads a PLY file of 3D Gaussian splatting, a compressed PLY or an SPZ file. Raises DataError."""
-    return checked(str(path), **activated(read_parameters(path)))
+def read_splats(path: Path, raw: bytes | None = None) -> Splats:
+    """Reads a PLY file of 3D Gaussian splatting, a compressed PLY, an SPZ or .splat file, or a checkpoint of gsplat,
+    whatever its name. raw: its bytes, if known. Raises DataError."""
+    raw = read_file(path) if raw is None else raw
+    if raw.startswith((ZIP, PICKLE)):
+        return _read_gsplat(path, raw)
+    return checked(str(path), **activated(read_parameters(path, raw)))
 
 
-def read_parameters(path: Path) -> dict[str, np.ndarray]:
+def read_parameters(path: Path, raw: bytes | None = None) -> dict[str, np.ndarray]:
     """Reads the numbers that `read_splats` activates, float32, by the names of Splats: logarithms of scales, logits of
     opacities, and quaternions of any length. Raises DataError."""
-    kind = next((kind for kind in ("spz", "compressed.ply") if path.name.lower().endswith(f".{kind}")), None)
-    rows = read_vertices(path, _unpacked(path, kind) if kind else None)
+    raw = read_file(path) if raw is None else raw
+    if raw.startswith((SPZ_MAGIC, GZIP)):
+        _check_spz(path, raw)
+        raw = _unpacked(path, raw, "spz")
+    elif PACKED in raw[:MAX_HEADER]:
+        raw = _unpacked(path, raw, "compressed.ply")
+    elif not raw.startswith(b"ply"):
+        return _splat_rows(path, raw)
+    rows = read_vertices(path, raw)
     names = set(rows.dtype.names or ())
 
     def stack(*wanted: str) -> np.ndarray:
         missing = [name for name in wanted if name not in names]
         if missing:
-            raise DataError(f"{path}: has no property {missing[0]}, expected those of 3D Gaussian splatting")
+            found = f"has no property {missing[0]}" if "opacity" in names else f"is a point cloud without {missing[0]}"
+            raise DataError(f"{path}: {found}, expected the properties of 3D Gaussian splatting")
         return np.stack([rows[name] for name in wanted], axis=1).astype(np.float32)
 
     rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in names)
     if rest % 3 or rest // 3 not in REST:
         raise DataError(f"{path}: has {rest} properties f_rest_*, expected {', '.join(str(3 * n) for n in REST)}")
-    sh = [stack(f"f_dc_{c}", *(f"f_rest_{c * rest // 3 + i}" for i in range(rest // 3))) for c in range(3)]
+    if "f_dc_0" not in names and names >= {"red", "green", "blue"} and rows.dtype["red"] == np.uint8:
+        sh = [(stack(name) / 255 - 0.5) / SH_C0 for name in ("red", "green", "blue")]
+    else:
+        sh = [stack(f"f_dc_{c}", *(f"f_rest_{c * rest // 3 + i}" for i in range(rest // 3))) for c in range(3)]
     return {
         "means": stack("x", "y", "z"),
         "quats": stack("rot_0", "rot_1", "rot_2", "rot_3"),
@@ -268,6 +295,26 @@ def read_parameters(path: Path) -> dict[str, np.ndarray]:
     }
 
 
+def _splat_rows(path: Path, raw: bytes) -> dict[str, np.ndarray]:
+    """Reads the rows of a .splat file as `read_parameters` does. It has no signature, but its quaternions have length
+    1. Raises DataError for other bytes."""
+    rows = np.frombuffer(raw, ROW, len(raw) // ROW.itemsize)
+    quats = (rows["quats"].astype(np.float32) - 128) / 128
+    units = np.count_nonzero(np.abs(np.linalg.norm(quats, axis=1) - 1) < ROUNDED)
+    if len(raw) % ROW.itemsize or 2 * units <= len(rows):
+        kinds = "a PLY, SPZ, .splat or .4dgs file or a checkpoint of gsplat"
+        raise DataError(f"{path}: begins with {raw[:8]!r} and is of no known kind, expected {kinds}")
+    with np.errstate(divide="ignore", invalid="ignore"):
+        opacities, scales = rows["a"] / np.float32(255), np.log(rows["scales"])
+        return {
+            "means": rows["means"].astype(np.float32),
+            "quats": quats,
+            "scales": scales,
+            "opacities": np.log(opacities / (1 - opacities)),
+            "sh": ((rows["rgb"][:, None] / np.float32(255) - np.float32(0.5)) / np.float32(SH_C0)),
+        }
+
+
 def activated(parameters: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Returns the parameters with scales and opacities instead of their logarithms and logits."""
     with np.errstate(over="ignore"):
@@ -275,12 +322,9 @@ def activated(parameters: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return parameters | {"scales": scales, "opacities": opacities}
 
 
-def _unpacked(path: Path, kind: str) -> bytes:
+def _unpacked(path: Path, data: bytes, kind: str) -> bytes:
     """Converts an SPZ file or a compressed PLY to a PLY with gaussforge."""
     forge = required("gaussforge", EXTRA, "SPZ files and compressed PLYs").GaussForge()
-    data = read_file(path)
-    if kind == "spz":
-        _check_spz(path, data)
     with quiet():
         found = forge.convert(data, kind, "ply")
     if "error" in found or not found["data"]:
@@ -290,8 +334,8 @@ def _unpacked(path: Path, kind: str) -> bytes:
 
 
 def _check_spz(path: Path, data: bytes) -> None:
-    """Raises DataError unless `data` is an SPZ file that unpacks to no more bytes than its Gaussians need. gaussforge
-    has no such limit."""
+    """Raises DataError unless `data` is an SPZ file that unpacks to as many bytes as its Gaussians need. gaussforge has
+    no such limits."""
     unpacker, zipped = zlib.decompressobj(wbits=31), data[:4] != SPZ_MAGIC  # versions from 4 do not compress it
     try:
         head = unpacker.decompress(data, 20) if zipped else data[:20]
@@ -313,11 +357,13 @@ def _check_spz(path: Path, data: bytes) -> None:
         size = sum(int.from_bytes(table[i + 8 : i + 16], "little") for i in range(0, len(table), 16))
     if size > most:
         raise DataError(f"{path}: unpacks to more bytes than {count:,} Gaussians need, expected at most {most:,}")
+    if size < SPZ_LEAST * count:
+        raise DataError(f"{path}: unpacks to {size:,} bytes, too few for the {count:,} Gaussians that it declares")
 
 
-def read_gsplat(path: Path) -> Splats:
+def _read_gsplat(path: Path, raw: bytes) -> Splats:
     """Reads a checkpoint of gsplat's trainers, {"splats": state dict}. Raises DataError."""
-    content = read_tensors(read_file(path), str(path))
+    content = read_tensors(raw, str(path))
     state = content.get("splats") if isinstance(content, dict) else None
     wanted = ("means", "quats", "scales", "opacities", "sh0", "shN")
     missing = [name for name in wanted if not isinstance(state, dict) or not isinstance(state.get(name), np.ndarray)]

@@ -1,7 +1,7 @@
 """Renders other programs' Gaussians over time into a dataset: the source `teacher:PATH[?key=value&...]`.
 
-PATH is a folder of PLY or SPZ files, one per frame, in the order of the last number in their names, or one such file; a
-`.4dgs` file; a static gsplat checkpoint (`.pt`, `.ckpt`); a run of 4DGaussians or Deformable-3DGS or one of its
+PATH is a folder of PLY, SPZ or .splat files, one per frame, in the order of the last number in their names, or one such
+file; a `.4dgs` file; a static gsplat checkpoint; a run of 4DGaussians or Deformable-3DGS or one of its
 `point_cloud/iteration_N`; or `module:function`, called with t in 0..1. The function returns means, quats (wxyz),
 scales, opacities and either colors or sh, as a mapping or as attributes, numpy arrays or tensors.
 
@@ -40,7 +40,6 @@ from pd4dgs_codec.interchange.splats import (
     checked,
     looking,
     picture,
-    read_gsplat,
     read_splats,
     sphere,
     spread,
@@ -49,7 +48,8 @@ from pd4dgs_codec.quality.frames import shrunk
 from pd4dgs_codec.scene import Camera
 
 PREFIX = "teacher:"
-FRAME_SUFFIXES = (".ply", ".spz")
+FRAME_SUFFIXES = (".ply", ".spz", ".splat")
+FOURDGS = b"\x894DGS"  #: a .4dgs file begins with it
 #: Keys of a function's result, which has colors instead of sh if there are no harmonics.
 PARTS = ("means", "quats", "scales", "opacities", "sh")
 #: Gaussians of lower opacity give no initial anchors and do not count towards the extent of the scene.
@@ -215,22 +215,23 @@ def read_model(place: str, fps: float) -> Teacher:
         run = read_deformed(path)
         return Teacher(run[0], None, 1.0, run[1]) if run else _folder(path, fps)
     if path.is_file():
-        name = path.name.lower()
-        if name.endswith(".4dgs"):
-            return _fourdgs(path)
-        read = read_gsplat if name.endswith((".pt", ".pth", ".ckpt")) else read_splats
-        splats = read(path)
+        raw = read_file(path)
+        if raw.startswith(FOURDGS):
+            return _fourdgs(path, raw)
+        splats = read_splats(path, raw)
         return Teacher(lambda t: splats, (0.0,), 1.0)
     if match := re.fullmatch(r"([A-Za-z_][\w.]*):([A-Za-z_]\w*)", place):
         return Teacher(_function(*match.groups()), None, 1.0)
-    raise DataError(f"{place}: found nothing, expected a folder of PLY or SPZ files, a run, a file, or module:function")
+    raise DataError(
+        f"{place}: found nothing, expected a folder of PLY, SPZ or .splat files, a run, a file, or module:function"
+    )
 
 
 def _folder(folder: Path, fps: float) -> Teacher:
     """Reads a folder of one file per frame, in the order of the last number in the names."""
     paths = max((files_of(folder, [suffix]) for suffix in FRAME_SUFFIXES), key=len)
     if not paths:
-        raise DataError(f"{folder}: holds no file that ends in {' or '.join(FRAME_SUFFIXES)}, expected one per frame")
+        raise DataError(f"{folder}: holds no file that ends in {', '.join(FRAME_SUFFIXES)}, expected one per frame")
     paths = [path for _, path in sorted(zip(last_numbers(paths) or range(len(paths)), paths, strict=True))]
     times = tuple(i / max(len(paths) - 1, 1) for i in range(len(paths)))
 
@@ -238,10 +239,9 @@ def _folder(folder: Path, fps: float) -> Teacher:
     return Teacher(lambda t: frame(paths[round(t * (len(paths) - 1))]), times, max(len(paths) - 1, 1) / fps)
 
 
-def _fourdgs(path: Path) -> Teacher:
+def _fourdgs(path: Path, data: bytes) -> Teacher:
     """Reads a .4dgs file."""
     fourdgs = required("fourdgs", EXTRA, ".4dgs files")
-    data = read_file(path)
     most = FREE_BYTES + INFLATES * len(data)
     if _numbers(data, most) > most:
         raise DataError(f"{path}: more than {most:,} numbers in a file of {len(data):,} bytes")

@@ -95,7 +95,7 @@ FAULTS = {
         ("r_1.png", lambda data: data[: len(data) // 2], "r_1.png"),
         ("points.ply", b"", "points.ply: not a PLY file"),
         ("points.ply", b"ply\nformat ascii 1.0\n", "not a PLY file"),
-        ("points.ply", ply("binary_big_endian"), "expected ascii or binary_little_endian"),
+        ("points.ply", ply("binary_pdp_endian"), "expected ascii, binary_little_endian, binary_big_endian"),
         ("points.ply", ply("binary_little_endian", bytes(23)), "23 bytes of vertices, expected 24"),
         ("points.ply", ply("ascii", b"1 2 3\n"), "1 vertex lines, expected 2"),
         ("points.ply", ply("ascii", b"1 2 3\n1 2\n"), "vertex lines are not 3 numbers"),

@@ -210,9 +210,9 @@ def test_an_instant_without_gaussians_is_one_line(tmp_path):
         ("teacher:{folder}?colour=red", "found 'colour=red', expected each of cameras, views"),
         ("teacher:{folder}?views=1", "views is '1'; expected for example views=200, 2 to 100000"),
         ("teacher:{folder}?size=9", "size is '9'"),
-        ("teacher:{empty}", "holds no file that ends in .ply or .spz"),
+        ("teacher:{empty}", "holds no file that ends in .ply, .spz, .splat"),
         ("teacher:{rest}", "has 10 properties f_rest_"),
-        ("teacher:{plain}", "has no property f_dc_0"),
+        ("teacher:{plain}", "is a point cloud without f_dc_0"),
         ("teacher:{nan}", "none of 40 Gaussians is finite"),
         ("teacher:{faint}", "no Gaussian is as opaque as 0.1"),
         ("teacher:{cut}", "bytes of vertices, expected"),
@@ -245,15 +245,16 @@ def _header(version: int, count: int, streams: int = 0) -> bytes:
 @pytest.mark.parametrize(
     "data, message",
     [
-        (b"", "is not an SPZ file, expected it to begin with NGSP"),
-        (b"junk" * 20, "is not an SPZ file"),
         (gzip.compress(b"abc"), "is not an SPZ file, expected it to begin with NGSP"),
         (gzip.compress(_header(3, 5) + bytes(1 << 24)), "unpacks to more bytes than 5 Gaussians need"),
         (gzip.compress(_header(3, 2**32 - 1) + bytes(99)), "declares 4,294,967,295 Gaussians, expected 10,000,000"),
         (_header(4, 5, 1) + struct.pack("<IIQQQ", 32, 0, 0, 9, 1 << 40), "unpacks to more bytes than 5 Gaussians need"),
-        (gzip.compress(_header(3, 5)), "gaussforge cannot read it"),
+        (gzip.compress(_header(3, 5)), "unpacks to 16 bytes, too few for the 5 Gaussians that it declares"),
+        (gzip.compress(_header(3, 5_000_000) + bytes(6000)), "too few for the 5,000,000 Gaussians that it declares"),
+        (_header(4, 5_000_000, 1) + struct.pack("<IIQQQ", 32, 0, 0, 9, 6000), "too few for the 5,000,000 Gaussians"),
+        (gzip.compress(_header(3, 5) + bytes(80)), "gaussforge cannot read it"),
     ],
-    ids=["empty", "junk", "other bytes", "a bomb", "a count", "a bomb of version 4", "no Gaussians"],
+    ids=["other", "a bomb", "a count", "a bomb of version 4", "none", "few", "few of version 4", "cut"],
 )
 def test_bad_spz_files_are_refused_before_they_fill_memory(tmp_path, capfd, data, message):
     pytest.importorskip("gaussforge")

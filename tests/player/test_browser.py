@@ -7,8 +7,10 @@ skipped, unless PD4DGS_REQUIRE_BROWSER is 1.
 import functools
 import gzip
 import http.server
+import json
 import math
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -321,6 +323,34 @@ def test_pictures_through_other_viewers_are_those_of_the_rasteriser(page, reposi
         seen.append(shot.player)
     assert decibels(seen[0], seen[1]) < 60 and decibels(seen[1], seen[3]) < 60  # levels and times differ
     call(page, "harness.close")
+
+
+@pytest.mark.parametrize("name", ["element", "spark", "playcanvas"])
+def test_the_snippets_of_the_documentation_show_the_scene(page, server, repository, folder, name):
+    """Each page is what docs/player-and-delivery.md prints, with the import map that it asks for."""
+    text = (ROOT / "docs" / "player-and-delivery.md").read_text(encoding="utf-8")
+    wanted = "player/element.js" if name == "element" else f'from "pd4-player/{name}"'
+    body = next(code for code in re.findall(r"```(?:html|js)\n(.*?)```", text, re.DOTALL) if wanted in code)
+    if name != "element":
+        try:
+            check_packages(name)
+        except DataError as error:
+            pytest.skip(str(error))
+        harness = (PLAYER / "test-browser" / "harness.html").read_text(encoding="utf-8")
+        (known,) = re.findall(r'importmap">(.*?)</script>', harness, re.DOTALL)
+        places = {
+            key: place.replace("..", f"{repository.url}player") for key, place in json.loads(known)["imports"].items()
+        }
+        places[f"pd4-player/{name}"] = f"./player/{name}.js"
+        head = f'<script type="importmap">{json.dumps({"imports": places})}</script>'
+        canvas = "<canvas></canvas>" * (name == "playcanvas")
+        body = f'{head}{canvas}<script type="module">{body}</script>'
+    (folder / "snippet.html").write_text(f"<!doctype html><body style='margin: 0'>{body}", encoding="utf-8")
+    page.set_viewport_size({"width": 160, "height": 120})  # these engines draw all the time
+    page.goto(server.url_of("snippet.html"))
+    end = time.monotonic() + TIMEOUT_MS / 1000
+    while np.ptp(screenshot(page)[:70], axis=(0, 1)).min() < 60:  # above the controls of the element
+        assert time.monotonic() < end, "the page shows one colour"
 
 
 def test_supersplat_shows_the_script_in_place_of_a_still(page, repository, server, folder, lively):
