@@ -7,5 +7,6 @@ source tools/environment.sh
 make_environment .venv-docs docs
 rm -rf out/site
 .venv-docs/bin/python -m sphinx -q -W --keep-going -j auto -c tools/site -d out/site.doctrees "$@" . out/site
+.venv-docs/bin/python -m pd4dgs_codec view --sample -o out/site/sample.html # the first page shows it
 .venv-docs/bin/python tools/notebook.py docs/tutorial.md out/site/tutorial.ipynb
 echo "The site is in out/site/index.html"

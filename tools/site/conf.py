@@ -66,6 +66,8 @@ CONTENTS = {
     "Project": ["docs/results", "docs/design", "CONTRIBUTING", "SECURITY", "CHANGELOG"],
 }
 
+PLAYER = '<iframe src="sample.html" title="The dancer, playing" width="480" height="480" style="border: 0"></iframe>'
+
 #: Rooms that are used as commands, not as a library.
 LEFT_OUT = {"cli", "bench"}
 
@@ -76,8 +78,11 @@ def toctree(pages: list[str], caption: str) -> str:
 
 
 def add_contents(app: Any, docname: str, source: list[str]) -> None:
-    """Event source-read: the start page gets the table of contents, and what tools/docs.sh lays beside the pages."""
+    """Event source-read: the start page gets the table of contents, and what tools/docs.sh lays beside the pages: the
+    player with the sample in place of its animation, and the notebook."""
     if docname == root_doc:
+        source[0], count = re.subn(r"!\[[^]]*\]\(docs/img/refining\.gif\)", PLAYER, source[0])
+        assert count == 1, "README.md shows docs/img/refining.gif once"
         source[0] += '\n<a href="tutorial.ipynb">The tutorial as a notebook</a>\n'
         source[0] += "".join(toctree([f"/{page}" for page in pages], caption) for caption, pages in CONTENTS.items())
 
