@@ -192,6 +192,9 @@ class Gaussians:
     slots: np.ndarray  #: int64 [K]: Gaussian i is number slots[i] % G of the G of anchor slots[i] // G
 
 
+Viewpoint = tuple[Camera, float]  #: a camera and a normalised time
+
+
 @dataclass(frozen=True, eq=False)
 class SceneInfo:
     """Values that every layer and a player need. All reals are exact binary32 values."""

@@ -25,7 +25,7 @@ from pd4dgs_codec.threads import configure
 
 if TYPE_CHECKING:
     from pd4dgs_codec.data.view import Dataset
-    from pd4dgs_codec.scene import Scene, SceneInfo
+    from pd4dgs_codec.scene import Scene, SceneInfo, Viewpoint
     from pd4dgs_codec.train.loop import Trainer
 
 #: A last garbage collection at exit took a quarter of the time of a cold start's first picture.
@@ -246,13 +246,13 @@ def is_pd4(data: bytes) -> bool:
     return data.startswith(SIGNATURE[:4])
 
 
-def checkpoint_scene(path: str, data: bytes) -> Scene:
-    """The scene of a checkpoint of bytes `data`, read from `path`. Needs torch."""
+def checkpoint_scene(path: str, data: bytes) -> tuple[Scene, list[Viewpoint]]:
+    """The scene of a checkpoint of bytes `data`, read from `path`, and its training cameras and times. Needs torch."""
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.model.model import to_scene
 
-    model, _ = checkpoint.loads(data, shown_name(path))
-    return to_scene(model)
+    model, training = checkpoint.loads(data, shown_name(path))
+    return to_scene(model), training.get("viewpoints", [])
 
 
 def write_checkpoint(path: str, scene: Scene, overwrite: bool) -> None:

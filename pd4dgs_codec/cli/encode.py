@@ -15,19 +15,23 @@ from pd4dgs_codec.format.options import CHOICES, DEFAULTS, EncodeOptions
 if TYPE_CHECKING:
     from pd4dgs_codec.format.metadata import Metadata
     from pd4dgs_codec.quality.packing import Views
-    from pd4dgs_codec.scene import Scene, SceneInfo
+    from pd4dgs_codec.scene import Scene, SceneInfo, Viewpoint
 
 DETAILS = f"""\
 A .pd4 file holds layer 0 (the scene at one instant), layer 1 (its motion) and layer 2 (motion finer in time) in this
 order; every prefix that ends with a layer or a slice can be shown. Parts without visible effect are omitted and listed
 with reasons in the report.
 
---target-size fits layers to a link with the least loss of quality: 425k for layer 0 takes 1.7 s at 2 Mbps. Fitting
-takes a minute or more, on renderings from --data or else the file's own camera, and longer with --slices.
+--target-size fits the file, or its layers, to a size with the least loss of quality: L0=425k takes 1.7 s at 2 Mbps.
+Fitting takes a minute or more, and longer with --slices.
 
 --slices 50k lets the first frame appear after 50 kB and improve with each further slice. The anchors that matter most
 in renderings come first; without target sizes others pass to a higher layer, so that motion need not wait for them.
-Ordering the anchors takes up to some minutes.
+This lowers the levels below the highest, as the report shows; --keep-levels leaves them as trained. Ordering the
+anchors takes up to some minutes.
+
+Sizes and slices are measured on renderings by cameras of --data, else by training cameras in the checkpoint, else by
+the file's own camera.
 
 In the report, payload/ΣR is the ratio of coded bits to the sum of R(a), the rate model of training.
 
@@ -37,11 +41,14 @@ examples:
   pd4dgs-encode model.pt -o scene.pd4
   pd4dgs-encode model.pt -o small.pd4 --step-scale 2
   pd4dgs-encode model.pt -o early.pd4 --slices 50k --data recordings/kitchen --downscale 2
+  pd4dgs-encode model.pt -o half.pd4 --target-size 300k
   pd4dgs-encode model.pt -o fast.pd4 --target-size L0=350k --data recordings/kitchen --downscale 2
   pd4dgs-encode model.pt -o - | pd4dgs-decode -"""
 
 #: Link rate of the time to the first frame in the report, bits per second.
 FIRST_FRAME_RATE = 2e6
+#: Loss of a level by slices, dB, from which the report names the option that avoids it.
+NOTABLE_DB = 0.1
 #: Help of the options that are fields of EncodeOptions with a few choices.
 HELP = {
     "mode": "entropy coder; the player supports ans only",
@@ -70,8 +77,10 @@ def parser() -> options.Parser:
     add("--no-verify", dest="verify", action="store_false", help="do not decode the result to verify it")
     what = "cut layers into slices: the first of at most SIZE bytes, later ones of two thirds (default: no slices)"
     add("--slices", type=options.size, default=DEFAULTS.slices, metavar="SIZE", help=what)
-    what = "byte limits of layers (layer 0 with the header), met by coarser steps and fewer anchors"
-    add("--target-size", type=options.layer_sizes, default={}, metavar="L0=425k,...", help=what)
+    what = "with --slices, leave every anchor in its layer, so that all levels look as without slices"
+    add("--keep-levels", action="store_true", help=what)
+    what = "byte limit, met by coarser steps and fewer anchors: 300k of the file, L0=... of layers (0 with the header)"
+    add("--target-size", type=options.layer_sizes, default={}, metavar="SIZE", help=what)
     about = p.add_argument_group("metadata", "shown by pd4dgs-info and kept when a .pd4 file is re-encoded")
     for name, what in (("title", "title of the scene"), ("source", "origin of the scene"), ("licence", "terms of use")):
         about.add_argument(f"--{name}", type=options.line, metavar="TEXT", help=what)
@@ -93,14 +102,18 @@ def check_usage(args: argparse.Namespace) -> None:
     """Sets conditional defaults. Raises UsageError for options that do not fit together."""
     if args.output == STDIO and args.json:
         raise UsageError("-o - and --json both write to stdout, expected -o FILE")
-    if args.layers != "auto" and (gone := [layer for layer in args.target_size if layer > args.layers]):
+    if args.output.lower().endswith(".pt"):
+        common.check_other_file(args.input, args.output)
+        raise UsageError(
+            f"-o {args.output} names a checkpoint, expected a .pd4 file; pd4dgs-decode -o writes checkpoints"
+        )
+    if args.layers != "auto" and (gone := [layer for layer in args.target_size if (layer or 0) > args.layers]):
         raise UsageError(f"--target-size L{gone[0]} has no effect with --layers {args.layers}")
     if args.mode == "lzma" and args.priors != DEFAULTS.priors:
         raise UsageError("--priors has no effect with --mode lzma")
-    downscale, holdout = options.READING["downscale"], options.READING["holdout"]
-    fits = args.slices or args.target_size
-    options.conditional(args, fits, "needs --slices or --target-size", data=None, downscale=downscale)
-    options.conditional(args, args.data, "needs --data SOURCE", holdout=holdout, views=16)
+    options.conditional(args, args.slices, "needs --slices SIZE", keep_levels=False)
+    options.conditional(args, args.slices or args.target_size, "needs --slices or --target-size", data=None)
+    options.conditional(args, args.data, "needs --data SOURCE", **options.READING, views=16)
     try:
         args.options = EncodeOptions(**{field.name: getattr(args, field.name) for field in fields(EncodeOptions)})
     except EncodeError as error:
@@ -110,17 +123,22 @@ def check_usage(args: argparse.Namespace) -> None:
 def _encode(args: argparse.Namespace, console: Console) -> int:
     check_usage(args)
     common.check_output(args.output, args.overwrite)
-    scene, metadata = _load(args)
+    scene, viewpoints, metadata = _load(args)
     size = f"{len(scene.anchor_q)} anchors, layers {list(scene.layers)}"
     console.detail(f"{shown_name(args.input)}: {size}, steps {scene.steps}")
-    from pd4dgs_codec.quality.packing import pack
+    from pd4dgs_codec.quality.packing import Views, pack
 
+    views = _views(args, scene.info, console)
+    if views is None and viewpoints:
+        views = Views.remembered(viewpoints)
+    elif views is None and scene.info.camera and (args.slices or args.target_size):
+        say(f"{shown_name(args.input)} holds no training cameras: its own camera measures; --data SOURCE gives others")
     packed = pack(
         scene,
         args.options,
         target_sizes=args.target_size,
-        views=_views(args, scene.info, console),
-        downscale=args.downscale,
+        views=views,
+        keep_levels=args.keep_levels,
         metadata=metadata,
         progress=lambda what: progress_bar(None, "pictures", what),
     )
@@ -133,16 +151,16 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
 main = common.command(parser, _encode)
 
 
-def _load(args: argparse.Namespace) -> tuple[Scene, Metadata | None]:
-    """Reads (scene, metadata) from a checkpoint or a `.pd4` file."""
+def _load(args: argparse.Namespace) -> tuple[Scene, list[Viewpoint], Metadata | None]:
+    """Reads (scene, training cameras and times, metadata) from a checkpoint or a `.pd4` file, which has no cameras."""
     data = common.read_bytes(args.input)
     if common.is_pd4(data):
         from pd4dgs_codec.format.decoder import decode
         from pd4dgs_codec.format.info import metadata_of
 
-        return decode(data), _metadata(args, metadata_of(data))
+        return decode(data), [], _metadata(args, metadata_of(data))
     common.check_other_file(args.input, args.output)
-    return common.checkpoint_scene(args.input, data), _metadata(args, None)
+    return *common.checkpoint_scene(args.input, data), _metadata(args, None)
 
 
 def _metadata(args: argparse.Namespace, had: Metadata | None) -> Metadata | None:
@@ -203,10 +221,17 @@ def _slice_lines(result: dict[str, Any]) -> list[str]:
         f"layer {layer['layer']}: slices of {', '.join(f'{size:,}' for size in own)} bytes"
         for layer, own in zip(result["layers"], sizes, strict=True)
     ]
+    if over := [row["layer"] for row, own in zip(result["layers"], sizes, strict=True) if own[0] > about["size"]]:
+        lines.append(f"first slices of layers {over} exceed {about['size']:,} bytes: networks and planes stay whole")
     seen = f" on {about['pictures']} views: {about['cameras']}" if about["pictures"] else ": the file has no camera"
     lines.append(f"anchors ordered by {about['order']}{seen}")
     if "psnr" in about:
         lines.append(f"mPSNR after each slice: {', '.join(f'{db:.2f}' for db in about['psnr'])} dB on held-out views")
+    for row in about.get("levels", ()):
+        found = f"{row['mpsnr']:.2f} dB with slices, {row['mpsnr_unsliced']:.2f} dB without"
+        lines.append(f"level {row['level']}: {found}, on {about['against']}")
+    if any(row["mpsnr_unsliced"] - row["mpsnr"] > NOTABLE_DB for row in about.get("levels", ())):
+        lines.append("lower levels have fewer anchors than without slices; --keep-levels leaves levels as trained")
     return lines
 
 
@@ -217,7 +242,8 @@ def _target_lines(target: dict[str, Any]) -> list[str]:
         where = "left out" if row["to_layer"] is None else f"moved to layer {row['to_layer']}"
         moved = [f"{row['moved']:,} anchors {where}"] if row["moved"] else []
         how = "; ".join([", ".join(coarser), *moved] if coarser else moved) or "unchanged"
-        lines.append(f"layer {row['layer']}: {row['bytes']:,} bytes, target {row['target']:,}: {how}")
+        what = "file" if row["layer"] is None else f"layer {row['layer']}"
+        lines.append(f"{what}: {row['bytes']:,} bytes, target {row['target']:,}: {how}")
     for row in target["levels"]:
         error = "none" if row["error_psnr"] == math.inf else f"{row['error_psnr']:.2f} dB PSNR"
         truth = f", {row['lost_db']:+.3f} dB loss on held-out views" if "lost_db" in row else ""

@@ -231,10 +231,12 @@ def size(text: str, expected: str = "a size in bytes such as 50k or 1.5MB") -> i
     raise argparse.ArgumentTypeError(f"found {text!r}, expected {expected}")
 
 
-def layer_sizes(text: str) -> dict[int, int]:
-    """Reads bytes by layer with k, M for 1e3, 1e6: "L0=425k,L1=80000" -> {0: 425000, 1: 80000}."""
-    layers, expected = {"L0": 0, "L1": 1, "L2": 2}, "sizes in bytes such as L0=425k,L1=120000"
-    sizes: dict[int, int] = {}
+def layer_sizes(text: str) -> dict[int | None, int]:
+    """Reads the bytes of a file or by layer: "300k" -> {None: 300000}, "L0=425k,L1=80000" -> {0: 425000, 1: 80000}."""
+    layers, expected = {"L0": 0, "L1": 1, "L2": 2}, "a size such as 300k, or sizes of layers such as L0=425k,L1=120000"
+    sizes: dict[int | None, int] = {}
+    if "=" not in text:
+        return {None: size(text, expected)}
     for part in text.split(","):
         name, _, number = part.partition("=")
         if name not in layers or layers[name] in sizes:

@@ -123,6 +123,24 @@ class Dataset:
         return remarks
 
 
+def spread(views: Sequence[View], most: int) -> list[View]:
+    """Picks at most `most` views, in an order of which every first part is spread over the cameras, time and space:
+    next comes, of the cameras that were picked least often, the view farthest from all before it."""
+    poses = np.array([view.viewmat for view in views], np.float64).reshape(-1, 4, 4)
+    eyes = -np.einsum("nji,nj->ni", poses[:, :3, :3], poses[:, :3, 3])
+    eyes /= max(float(np.ptp(eyes, axis=0).max(initial=0)), 1e-12)
+    places = np.column_stack([[view.time for view in views], eyes, poses[:, 2, :3]])
+    cameras = np.unique([view.camera_id for view in views], return_inverse=True)[1]
+    picked, far, uses = [0], np.full(len(views), np.inf), np.zeros(cameras.max() + 1)
+    while len(picked) < min(most, len(views)):
+        far = np.minimum(far, np.linalg.norm(places - places[picked[-1]], axis=1))
+        far[picked] = -1
+        uses[cameras[picked[-1]]] += 1
+        allowed = np.where(far >= 0, uses[cameras], np.inf)
+        picked.append(int(np.argmax(np.where(allowed == allowed.min(), far, -1))))
+    return [views[i] for i in picked]
+
+
 # -- lenses and poses --------------------------------------------------------------------------------------------------
 
 

@@ -18,7 +18,7 @@ from pd4dgs_codec.format.quantise import all_finite, dequantise, expect, expect_
 from pd4dgs_codec.format.registry import LAYER_KINDS
 from pd4dgs_codec.format.symbols import SceneSymbols
 from pd4dgs_codec.morton import MAX_VOXEL
-from pd4dgs_codec.scene import MASK_MIN_CODE, MAX_CLASS, MAX_FEATURE, MAX_SLOTS, Scene
+from pd4dgs_codec.scene import MASK_MIN_CODE, MAX_CLASS, MAX_FEATURE, MAX_SLOTS, Scene, SceneInfo
 
 #: Extra share of Q: |x| / Q <= 2^23 in binary64 is off by at most 2^-30, which may round a tie the other way.
 _TIES = 2.0**-29
@@ -52,7 +52,7 @@ def check_scene(scene: Scene) -> None:
         expect(largest <= MAX_CLASS, f"step classes: {largest}, expected at most {MAX_CLASS}")
         expect_array("centre of the attributes", scene.grading.centre, np.float32, (widths.channels,))
     _check_masks(scene)
-    _check_info(scene)
+    check_info(scene.info)
     for name, step in vars(scene.steps).items():
         expect(is_step(step), f"step of {name}: {step!r}, expected a positive normal binary32 value")
     for kind in LAYER_KINDS:
@@ -73,8 +73,8 @@ def _check_masks(scene: Scene) -> None:
         expect(bool((high[: low.size] >= low).all()), f"mask of layer {layer} is below the mask of the layer before")
 
 
-def _check_info(scene: Scene) -> None:
-    info = scene.info
+def check_info(info: SceneInfo) -> None:
+    """Raises EncodeError unless `info` has the shapes, dtypes and ranges that SceneInfo documents."""
     expect(is_step(info.voxel_size), f"voxel_size {info.voxel_size!r}, expected a positive normal binary32 value")
     expect_array("box", info.box, np.float32, (2, 3))
     expect(bool((info.box[0] <= info.box[1]).all()), "box: a lower corner above the upper one")

@@ -168,6 +168,12 @@ def with_metadata(data: bytes, metadata: Metadata) -> tuple[bytes, int]:
     return write_preamble(packed) + data[preamble.size :] + chunk, len(chunk)
 
 
+def header_size(symbols: SceneSymbols, bounds: dict[str, float], mode: str, chunks: int, most: int) -> int:
+    """Returns the bytes of preamble and header of a file with at most so many chunks of at most `most` bytes."""
+    header = Header(((0, most),) * chunks, mode, symbols.grid, symbols.info, bounds, bytes(DIGEST_SIZE))
+    return PREAMBLE_SIZE + len(pack_header(header))
+
+
 def _write_layers(
     symbols: SceneSymbols, bounds: dict[str, float], options: EncodeOptions, utility: Callable[[Scene], np.ndarray]
 ) -> list[list[_Slice]]:
@@ -178,9 +184,8 @@ def _write_layers(
     values = np.split(utility(symbols.scene()), ends)
     bits = sum(float(layer.bits_per_row().sum()) for layer in symbols.layers)
     most = len(values) + math.ceil(bits / 8 / (LATER * SLACK * options.slices))  # more than there will be
-    chunks = ((0, options.slices),) * most
-    header = pack_header(Header(chunks, options.mode, symbols.grid, symbols.info, bounds, bytes(DIGEST_SIZE)))
-    sizes = [options.slices - PREAMBLE_SIZE - len(header), *[LATER * options.slices] * (len(values) - 1)]
+    header = header_size(symbols, bounds, options.mode, most, options.slices)
+    sizes = [options.slices - header, *[LATER * options.slices] * (len(values) - 1)]
     written = [
         _write_slices(layer, options, size, u) for layer, size, u in zip(symbols.layers, sizes, values, strict=True)
     ]

@@ -2,7 +2,8 @@
 
 A checkpoint is a dict {"format", "version", "digest", "info", "steps", "deformations", "state": tensors, "training"}.
 Shapes come from the tensors; loading does not need the configuration that made the model. "training" is the state for
-resuming and may be empty. "digest" covers all other entries, since torch reads damaged archives without an error.
+resuming and may be empty; its "viewpoints" are a list of some training cameras and times, for packing. "digest" covers
+all other entries, since torch reads damaged archives without an error.
 """
 
 from __future__ import annotations
@@ -19,12 +20,12 @@ import torch
 
 from pd4dgs_codec.archives import read_tensors
 from pd4dgs_codec.errors import DataError, one_line
-from pd4dgs_codec.format.check import check_scene
+from pd4dgs_codec.format.check import check_info, check_scene
 from pd4dgs_codec.io import read_source, write_bytes
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model, check_finite, from_scene
 from pd4dgs_codec.model.networks import MLP
-from pd4dgs_codec.scene import SCAFFOLD_NETWORKS, Camera, Deformation, Grading, Scene, SceneInfo, Steps
+from pd4dgs_codec.scene import SCAFFOLD_NETWORKS, Camera, Deformation, Grading, Scene, SceneInfo, Steps, Viewpoint
 
 FORMAT = "pd4dgs-checkpoint"
 VERSION = 1
@@ -32,7 +33,9 @@ VERSION = 1
 
 def save(path: str | Path, model: Model, training: dict[str, Any] | None = None) -> None:
     """Writes the model and `training`, the state for resuming, whole or not at all. Raises DataError. See `target`."""
-    real = target(path)
+    real, training = target(path), dict(training or {})
+    if viewpoints := training.get("viewpoints"):
+        training["viewpoints"] = [[_camera_to_plain(camera), time] for camera, time in viewpoints]
     content = {
         "format": FORMAT,
         "version": VERSION,
@@ -43,7 +46,7 @@ def save(path: str | Path, model: Model, training: dict[str, Any] | None = None)
             for name, field in (("global", model.global_deformation), ("local", model.local_deformation))
         },
         "state": {name: tensor.detach().cpu() for name, tensor in model.state_dict().items()},
-        "training": training or {},
+        "training": training,
     }
     content["digest"] = _digest(content)
     buffer = io.BytesIO()  # torch itself reports a full disk only as "unexpected pos"
@@ -85,7 +88,10 @@ def loads(raw: bytes, path: str) -> tuple[Model, dict[str, Any]]:
         if content.get("digest") != _digest(content):
             raise DataError(f"{path}: damaged: its digest does not match its content")
         check_finite(content["state"])
-        return _build(content), dict(content["training"])
+        model, training = _build(content), dict(content["training"])
+        if "viewpoints" in training:
+            training["viewpoints"] = [_viewpoint(model.info, *row) for row in training["viewpoints"]]
+        return model, training
     except Exception as error:  # of many kinds, if the content is inconsistent
         reason = one_line(str(error))  # torch's messages have several lines
         if isinstance(error, DataError) and reason.startswith(f"{path}: damaged"):
@@ -153,16 +159,30 @@ def _build(content: dict[str, Any]) -> Model:
 def _info_to_plain(info: SceneInfo) -> dict[str, Any]:
     plain = dict(info.__dict__, box=info.box.tolist())
     if info.camera is not None:
-        camera = info.camera
-        plain["camera"] = dict(camera.__dict__, viewmat=camera.viewmat.tolist(), K=camera.K.tolist())
+        plain["camera"] = _camera_to_plain(info.camera)
     return plain
+
+
+def _camera_to_plain(camera: Camera) -> dict[str, Any]:
+    return dict(camera.__dict__, viewmat=camera.viewmat.tolist(), K=camera.K.tolist())
+
+
+def _camera_from_plain(plain: dict[str, Any]) -> Camera:
+    return Camera(**dict(plain, viewmat=np.array(plain["viewmat"], np.float32), K=np.array(plain["K"], np.float32)))
+
+
+def _viewpoint(info: SceneInfo, plain: dict[str, Any], time: float) -> Viewpoint:
+    """Reads a camera and a time. Raises an exception of any type if either is not possible."""
+    camera = _camera_from_plain(plain)
+    check_info(replace(info, camera=camera))
+    if not 0 <= time <= 1:
+        raise ValueError(f"a viewpoint at time {time}, expected 0..1")
+    return camera, time
 
 
 def _info_from_plain(plain: dict[str, Any]) -> SceneInfo:
     camera = plain["camera"]
     if camera is not None:
-        camera = Camera(
-            **dict(camera, viewmat=np.array(camera["viewmat"], np.float32), K=np.array(camera["K"], np.float32))
-        )
+        camera = _camera_from_plain(camera)
     tuples = {k: tuple(plain[k]) for k in ("time_range", "background", "up")}
     return SceneInfo(**dict(plain, box=np.array(plain["box"], np.float32), camera=camera, **tuples))

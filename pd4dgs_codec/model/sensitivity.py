@@ -18,11 +18,10 @@ from pd4dgs_codec.format.symbols import layer_symbols
 from pd4dgs_codec.model.model import Gaussians, Model, from_scene
 from pd4dgs_codec.model.networks import EXACT, Rounding
 from pd4dgs_codec.model.picture import draw, render_image
-from pd4dgs_codec.scene import ATTRIBUTES, Camera, Scene
+from pd4dgs_codec.scene import ATTRIBUTES, Camera, Scene, Viewpoint
 
 #: Share of the mean error that every direction has at least, so that invisible directions are scaled within bounds.
 LEAST_ERROR = 0.01
-Viewpoint = tuple[Camera, float]  #: a camera and a normalised time
 
 #: Random pictures of signs per view for each estimate.
 PROBES = 2

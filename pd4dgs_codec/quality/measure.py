@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -15,9 +16,9 @@ from pd4dgs_codec.format.symbols import layer_symbols
 from pd4dgs_codec.model.model import Model, from_scene
 from pd4dgs_codec.model.networks import EXACT, Rounding
 from pd4dgs_codec.model.picture import render_image
-from pd4dgs_codec.model.sensitivity import Viewpoint, omission_error, smaller, utility, without
-from pd4dgs_codec.quality.image import mean_scores, mpsnr
-from pd4dgs_codec.scene import Scene
+from pd4dgs_codec.model.sensitivity import omission_error, smaller, utility, without
+from pd4dgs_codec.quality.image import mean_scores, mpsnr, to_uint8
+from pd4dgs_codec.scene import Scene, Viewpoint
 
 #: dB of a picture at most in means: one that equals its image would decide them alone.
 MOST_DB = 100.0
@@ -34,6 +35,16 @@ def pictures(
         found.append(render_image(model, level, time, camera))
         step()
     return found
+
+
+def own_views(scene: Scene, viewpoints: Sequence[Viewpoint]) -> list[View]:
+    """Returns views that show the highest level of the scene itself, at most SIDE pixels wide and high."""
+    small = [(smaller(camera), time) for camera, time in viewpoints]
+    shown = pictures(from_scene(scene), scene.level, small)
+    return [
+        View(camera.viewmat, camera.K, camera.width, camera.height, time, to_uint8(picture), None, "", 0)
+        for (camera, time), picture in zip(small, shown, strict=True)
+    ]
 
 
 def level_psnr(
@@ -70,8 +81,13 @@ class RenderedLoss:
     """
 
     def __init__(self, scene: Scene, viewpoints: Sequence[Viewpoint], step: Callable[[], None] = lambda: None):
-        self.viewpoints, self.step, model = viewpoints, step, from_scene(scene)
-        self.references = {level: pictures(model, level, viewpoints, step) for level in scene.layers}
+        self.scene, self.viewpoints, self.step = scene, viewpoints, step
+
+    @cached_property
+    def references(self) -> dict[int, list[np.ndarray]]:
+        """The unquantised pictures by level."""
+        model = from_scene(self.scene)
+        return {level: pictures(model, level, self.viewpoints, self.step) for level in self.scene.layers}
 
     def mse(self, scene: Scene) -> dict[int, float]:
         """Returns per level the mean squared error over all pictures, colours in 0..1."""

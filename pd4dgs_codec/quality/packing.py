@@ -6,15 +6,17 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
+from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.format.decoder import every_prefix
+from pd4dgs_codec.data.view import spread
+from pd4dgs_codec.format.decoder import decode, every_prefix
 from pd4dgs_codec.format.encoder import Report, encode_with_report, with_metadata
 from pd4dgs_codec.format.metadata import Metadata
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.plan import LeftOut, plan
 from pd4dgs_codec.quality.frames import own_frames
-from pd4dgs_codec.scene import Camera, Scene
+from pd4dgs_codec.scene import Scene, SceneInfo, Viewpoint
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,7 +24,7 @@ if TYPE_CHECKING:
     from pd4dgs_codec.data.view import Dataset, View
     from pd4dgs_codec.model.model import Model
 
-#: Without views: the number of pictures by the file's own camera, and the degrees of its orbit.
+#: Without a dataset: the number of pictures that decide, and the degrees by which the file's own camera orbits.
 OWN_PICTURES, OWN_ORBIT = 16, 20.0
 
 #: The current task in two words -> a context whose value is called after each picture.
@@ -31,20 +33,32 @@ Progress = Callable[[str], AbstractContextManager[Callable[[], None]]]
 
 @dataclass(frozen=True)
 class Views:
-    """The views that packing uses. source: their dataset, for the report. fitting: for target sizes and the order of
-    slices. held_out: for the reported mPSNR; they decide nothing."""
+    """The views that packing uses. source: where they come from, for the report. fitting: for target sizes and the
+    order of slices. held_out: for the reported mPSNR; they decide nothing. checking: in their absence, for the
+    reported mPSNR against the scene's own pictures."""
 
     source: str
-    fitting: Sequence[View]
+    fitting: Sequence[Viewpoint]
     held_out: Sequence[View] = ()
+    checking: Sequence[Viewpoint] = ()
 
     @classmethod
     def of(cls, dataset: Dataset, source: str, most: int) -> Views:
         """Picks about `most` training and as many held-out views (training views if there are none), evenly spread."""
-        fitting, held_out = (
-            tuple(views[:: -(-len(views) // most)]) for views in (dataset.train, dataset.test or dataset.train)
-        )
-        return cls(source, fitting, held_out)
+        fitting = [(view.camera, view.time) for view in spread(dataset.train, most)]
+        held_out = dataset.test or dataset.train
+        return cls(f"training views of {source}", fitting, held_out[:: -(-len(held_out) // most)])
+
+    @classmethod
+    def remembered(cls, viewpoints: Sequence[Viewpoint]) -> Views:
+        """The training cameras of a checkpoint: the first ones decide, the others check."""
+        return cls("training cameras in the checkpoint", viewpoints[:OWN_PICTURES], (), viewpoints[OWN_PICTURES:])
+
+    @classmethod
+    def own(cls, info: SceneInfo) -> Views:
+        """The file's own camera. Raises RenderError if the file has none, or its pictures are too large."""
+        frames = own_frames(info, OWN_PICTURES, OWN_ORBIT)
+        return cls("the file's own camera", [(frame.camera, frame.time) for frame in frames])
 
 
 @dataclass(frozen=True)
@@ -53,8 +67,9 @@ class Packed:
 
     target: how target sizes were met, or None: cameras, pictures, layers (the fields of target.Fit) and levels (level,
     error_psnr in dB relative to the unquantised pictures, and with held-out views lost_db, their loss of mPSNR).
-    slices: of a sliced file, or None: order, the criterion by which anchors are sorted, cameras, pictures, and with
-    held-out views psnr, the mPSNR in dB after each slice.
+    slices: of a sliced file, or None: size, the limit in bytes, order, the criterion by which anchors are sorted,
+    cameras, pictures, and with held-out views psnr, the mPSNR in dB after each slice. If anchors may pass to later
+    layers also levels (level, mpsnr and mpsnr_unsliced in dB), and against, what these are measured on.
     """
 
     data: bytes
@@ -76,18 +91,19 @@ def pack(
     source: Scene | Model,
     options: EncodeOptions = DEFAULTS,
     *,
-    target_sizes: Mapping[int, int] | None = None,
+    target_sizes: Mapping[int | None, int] | None = None,
     views: Views | None = None,
-    downscale: int = 1,
+    keep_levels: bool = False,
     metadata: Metadata | None = None,
     progress: Progress = lambda _: nullcontext(lambda: None),
 ) -> Packed:
     """Packs a scene or a trained model into a file.
 
-    target_sizes: the most bytes that each layer may add to the file, by layer. views: for target sizes and the order
-    of slices. Without views the pictures are of the file's own camera, 1/downscale as wide and high. metadata: stored
-    in the file. With options.slices anchors are ordered by the pictures' gain per byte, and without target sizes some
-    pass to later layers, see `measure.in_order`. Without views or a camera the largest anchors come first.
+    target_sizes: the most bytes that each layer may add to the file, by layer, or {None: the most bytes of the file}.
+    views: for target sizes and the order of slices; without views the pictures are of the file's own camera. metadata:
+    stored in the file. With options.slices anchors are ordered by the pictures' gain per byte, and without target
+    sizes or keep_levels some pass to later layers, see `measure.in_order`. Without views or a camera the largest
+    anchors come first.
 
     Only target sizes and slices need torch. Raises EncodeError, RenderError for target sizes without a camera.
     """
@@ -96,10 +112,12 @@ def pack(
 
         source = to_scene(source)
     scene, options = options.apply_scale(source)
-    pictures = _Pictures(views, downscale, progress)
+    if views is None and (target_sizes or (options.slices and scene.info.camera)):
+        views = Views.own(scene.info)
+    pictures = _Pictures(views, progress)
     if target_sizes:
         return pictures.fit(scene, options, target_sizes, metadata)
-    data, report, slices = pictures.write(scene, options, [], metadata, passing=True)
+    data, report, slices = pictures.write(scene, options, [], metadata, passing=not keep_levels)
     return Packed(data, scene, report, None, slices)
 
 
@@ -108,28 +126,17 @@ class _Pictures:
     """The pictures that packing measures, and the parts of packing that need them."""
 
     views: Views | None
-    downscale: int
     progress: Progress
 
     @property
     def held_out(self) -> Sequence[View]:
         return () if self.views is None else self.views.held_out
 
-    @property
-    def cameras(self) -> str:
-        return "the file's own camera" if self.views is None else f"training views of {self.views.source}"
-
-    def viewpoints(self, scene: Scene) -> list[tuple[Camera, float]]:
-        if self.views is not None:
-            return [(view.camera, view.time) for view in self.views.fitting]
-        frames = own_frames(scene.info, OWN_PICTURES, OWN_ORBIT, self.downscale)
-        return [(frame.camera, frame.time) for frame in frames]
-
     def fit(
         self,
         scene: Scene,
         options: EncodeOptions,
-        target_sizes: Mapping[int, int],
+        target_sizes: Mapping[int | None, int],
         metadata: Metadata | None,
     ) -> Packed:
         """Returns the file whose layers meet the sizes."""
@@ -138,7 +145,8 @@ class _Pictures:
 
         planned = plan(scene, options)
         scene, left_out = planned.scene, planned.left_out
-        viewpoints = self.viewpoints(scene)
+        assert self.views
+        viewpoints = self.views.fitting
         with self.progress("fitting sizes") as step:
             loss = RenderedLoss(scene, viewpoints, step)
             fitter = Fitter(scene, target_sizes, loss.mean_mse, loss.omission_error, options)
@@ -146,7 +154,8 @@ class _Pictures:
             while not met:
                 fitted, dropped, fits = fitter.fit()
                 data, report, slices = self.write(fitted, options, left_out + dropped, metadata, passing=False)
-                added, met = report.added_bytes(), True
+                added = dict[int | None, int]([(None, report.bytes), *report.added_bytes().items()])
+                met = True
                 for row in fits:
                     if (size := added.get(row.layer, 0)) > row.target:  # slices in another order than measured
                         met, fitter.growth[row.layer] = False, fitter.growth[row.layer] * size / row.bytes
@@ -159,7 +168,7 @@ class _Pictures:
             lost = {"lost_db": before[level] - after[level]} if before else {}
             levels.append({"level": level, "error_psnr": -10.0 * math.log10(mse) if mse else math.inf, **lost})
         layers = [asdict(row) | {"bytes": added.get(row.layer, 0)} for row in fits]
-        target = {"cameras": self.cameras, "pictures": len(viewpoints), "layers": layers, "levels": levels}
+        target = {"cameras": self.views.source, "pictures": len(viewpoints), "layers": layers, "levels": levels}
         return Packed(data, fitted, report, target, slices)
 
     def write(
@@ -176,16 +185,16 @@ class _Pictures:
         if not options.slices:
             return *encode_with_report(scene, options, left_out=left_out, metadata=metadata), None
         from pd4dgs_codec.model.model import from_scene
-        from pd4dgs_codec.quality.measure import in_order, level_psnr
+        from pd4dgs_codec.quality.measure import in_order, level_psnr, own_views, true_psnr
 
-        about: dict[str, Any] = {"order": "gate times area", "cameras": None, "pictures": 0}
+        about: dict[str, Any] = {"order": "gate times area", "cameras": None, "pictures": 0, "size": options.slices}
         order: Callable[[Scene], np.ndarray] | None = None
-        if viewpoints := self.viewpoints(scene) if self.views is not None or scene.info.camera is not None else []:
-            about = {"order": "rendered gain per byte", "cameras": self.cameras, "pictures": len(viewpoints)}
+        if views := self.views:
             planned = plan(scene, options)
+            about |= {"order": "rendered gain per byte", "cameras": views.source, "pictures": len(views.fitting)}
             left_out = [*left_out, *planned.left_out]
             with self.progress("ordering anchors") as step:
-                scene, values = in_order(planned.scene, viewpoints, options, step, passing=passing)
+                scene, values = in_order(planned.scene, views.fitting, options, step, passing=passing)
 
             def order(_: Scene) -> np.ndarray:
                 return values
@@ -197,6 +206,19 @@ class _Pictures:
                     level_psnr(from_scene(prefix), prefix.level, self.held_out, step) for prefix in every_prefix(data)
                 ]
             metadata = replace(metadata or Metadata(), slices=tuple(about["psnr"]))
+        if views and passing:
+            with self.progress("measuring levels") as step:
+                judges = views.held_out or own_views(planned.scene, views.checking or views.fitting)
+                whole = true_psnr(planned.symbols.scene(), scene.layers, judges, step)
+                if views.held_out:
+                    ends = accumulate(len(row.slices) for row in report.layers)
+                    sliced = {row.layer: about["psnr"][end - 1] for row, end in zip(report.layers, ends, strict=True)}
+                else:
+                    sliced = true_psnr(decode(data), scene.layers, judges, step)
+            about["against"] = "held-out views" if views.held_out else "the model's own pictures"
+            about["levels"] = [
+                {"level": level, "mpsnr": sliced[level], "mpsnr_unsliced": whole[level]} for level in scene.layers
+            ]
         if metadata is not None:
             data, about_bytes = with_metadata(data, metadata)
             report = replace(report, bytes=len(data), metadata_bytes=about_bytes)

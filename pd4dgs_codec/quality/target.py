@@ -1,4 +1,4 @@
-"""Fits layers to target sizes at the least loss: grows quantisation steps, and moves anchors out of the layer.
+"""Fits layers, or a whole file, to target sizes at the least loss: grows quantisation steps, and moves anchors out.
 
 Each of a layer's parameters (its steps, the share of its anchors that leave) is tried alone at a few values. The lower
 convex hull of bytes saved and loss added gives the parameter's segments. The segments of all parameters, sorted by loss
@@ -14,18 +14,20 @@ import math
 from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from pd4dgs_codec.errors import EncodeError
+from pd4dgs_codec.format.check import rounding_bounds
 from pd4dgs_codec.format.container import write_chunk
-from pd4dgs_codec.format.encoder import encode, encode_with_report
-from pd4dgs_codec.format.info import info
+from pd4dgs_codec.format.encoder import encode_with_report, header_size
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.payload import write_layer
 from pd4dgs_codec.format.plan import LeftOut, Plan, in_file_order, passed, plan
-from pd4dgs_codec.format.registry import LAYER_KINDS
+from pd4dgs_codec.format.registry import LAYER_KINDS, MAX_PAYLOAD
+from pd4dgs_codec.format.symbols import LayerSymbols, sliced
 from pd4dgs_codec.scene import Scene
 
 #: Values tried: log2 of the factor on a step, and the share of a layer's anchors that leave it.
@@ -35,10 +37,10 @@ SHARES = (0.0, 0.03, 0.08, 0.15, 0.25, 0.4, 0.6, 0.8)
 ANCHORS = "anchors"
 #: Shares of the target size: the search aims at AIM, and accepts sizes up to SLACK below the target.
 SLACK, AIM = 0.03, 0.995
+#: Share of the estimated smallest size that no setting is below: the estimate drops the anchors of most bits.
+BOUND = 0.9
 #: Coding effort of the search, and the most encodes at the effort of the file.
 SEARCH_EFFORT, FINAL_TRIES = 1, 6
-#: Allowance in bytes for the header's lengths, which are integers of varying size.
-HEADER_MARGIN = 16
 
 Setting = Mapping[str, float]
 
@@ -170,14 +172,14 @@ def _first(holds: Callable[[float], bool], low: float, high: float) -> float:
 
 @dataclass(frozen=True)
 class Fit:
-    """How a layer met its target.
+    """How a layer, or the whole file (layer None), met its target.
 
-    bytes: size that it adds to the file, for layer 0 with the header and HEADER_MARGIN. factors: on the steps, by field
-    of Steps. steps: the resulting steps. moved: number of anchors that left the layer. to_layer: the layer that they
-    went to, None if they were dropped. omission_error: the largest among them, None without any.
+    bytes: size that it adds to the file, or a few more for layer 0, with the header. factors: on the steps, by field of
+    Steps. steps: the resulting steps. moved: number of anchors that left the layer. to_layer: the layer that they went
+    to, None if they were dropped. omission_error: the largest among them, None without any.
     """
 
-    layer: int
+    layer: int | None
     target: int
     bytes: int = 0
     factors: dict[str, float] = field(default_factory=dict)
@@ -191,33 +193,41 @@ class Fit:
 class Fitter:
     """Fits a planned scene to targets, and keeps its measurements from one fit to the next.
 
-    targets: most bytes by layer; an absent layer meets any. loss: of a decoded scene, to be minimised. omission_error:
-    float64 [N], the error of omitting each anchor of the scene at a level; anchors of least error move to the next
-    layer first, or are dropped from the highest. options: of the file to be written. growth: by layer, a factor on its
-    bytes, for slices, which are measured with the largest anchors first; the caller may change it between fits.
+    targets: most bytes by layer, or {None: most bytes of the file}; an absent layer meets any. loss: of a decoded
+    scene, to be minimised. omission_error: float64 [N], the error of omitting each anchor of the scene at a level;
+    anchors of least error move to the next layer first, or are dropped from the highest. options: of the file to be
+    written. growth: by layer, a factor on its bytes, for slices, which are measured with the largest anchors first; the
+    caller may change it between fits.
     """
 
     scene: Scene
-    targets: Mapping[int, int]
+    targets: Mapping[int | None, int]
     loss: Callable[[Scene], float]
     omission_error: Callable[[Scene, int], np.ndarray]
     options: EncodeOptions = DEFAULTS
-    growth: defaultdict[int, float] = field(default_factory=lambda: defaultdict(lambda: 1.0))
+    growth: defaultdict[int | None, float] = field(default_factory=lambda: defaultdict(lambda: 1.0))
     _layers: dict[tuple[Any, ...], "_Layer"] = field(default_factory=dict)
 
     def fit(self) -> tuple[Scene, list[LeftOut], list[Fit]]:
         """Returns the scene, the dropped anchors, and how each layer met its target. Raises EncodeError naming the
         layer and its smallest size, before any loss is measured if no setting of earlier layers helps."""
-        scene, targets, settings, fits = self.scene, self.targets, list[Setting](), list[Fit]()
+        targets, fits = self.targets, list[Fit]()
+        order = sorted(targets, key=lambda layer: layer or 0)
+        present = [layer for layer in order if layer is None or layer in self.scene.layers]
         try:
-            for layer in sorted(layer for layer in targets if layer in scene.layers):  # refuses sizes before any search
-                fitted = self._layer(scene, layer, settings)
-                # anchors that leave make later layers larger
-                settings.append({**needed(fitted.grids, fitted.final_size, targets[layer]), ANCHORS: 0.0})
-                scene = fitted.apply(settings[-1])
+            for quick in (True, False):  # refuses sizes before any search, first those that need no omission_error
+                scene, settings = self.scene, list[Setting]()
+                for layer in present:
+                    fitted, target = self._layer(scene, layer, settings), targets[layer]
+                    if quick and fitted.least_size > target:
+                        raise Unreachable(fitted.least_size)
+                    most = fitted.smallest if quick else needed(fitted.grids, fitted.final_size, target)
+                    settings.append({**most, ANCHORS: 0.0})  # anchors that leave make later layers larger
+                    scene = fitted.apply(settings[-1])
             scene, settings = self.scene, []
-            for layer, target in sorted(targets.items()):
-                if layer not in scene.layers:
+            for layer in order:
+                target = targets[layer]
+                if layer not in present:
                     fits.append(Fit(layer, target))
                     continue
                 fitted = self._layer(scene, layer, settings)
@@ -225,8 +235,9 @@ class Fitter:
                 fits.append(fitted.describe(settings[-1], target))
                 scene = fitted.apply(settings[-1])
         except Unreachable as error:
+            what = "the file" if layer is None else f"layer {layer}"
             raise EncodeError(
-                f"target size: layer {layer} takes at least {error.smallest:,} bytes "
+                f"target size: {what} takes at least {error.smallest:,} bytes "
                 f"(steps up to x{2 ** OCTAVES[-1]:g}, {SHARES[-1]:.0%} of its anchors moved out), "
                 f"expected at most {targets[layer]:,}"
             ) from None
@@ -237,7 +248,7 @@ class Fitter:
         why = "least error in the pictures, left out to reach the target size"
         return scene, [LeftOut(f"{dropped} anchors", why, anchors=dropped)], fits
 
-    def _layer(self, scene: Scene, layer: int, settings: Sequence[Setting]) -> "_Layer":
+    def _layer(self, scene: Scene, layer: int | None, settings: Sequence[Setting]) -> "_Layer":
         """Returns the layer of a scene whose earlier layers have these settings."""
         key = layer, *(tuple(setting.items()) for setting in settings)
         if key not in self._layers:
@@ -246,35 +257,58 @@ class Fitter:
 
 
 class _Layer:
-    """One layer's parameters, and the scenes, sizes and losses of their settings."""
+    """The parameters of one layer, or of all (layer None), and the scenes, sizes and losses of their settings."""
 
-    def __init__(self, fitter: Fitter, scene: Scene, layer: int):
-        self.fitter, self.scene, self.layer, self.index = fitter, scene, layer, scene.layers.index(layer)
+    def __init__(self, fitter: Fitter, scene: Scene, layer: int | None):
+        self.fitter, self.scene, self.layer = fitter, scene, layer
+        self.layers = scene.layers if layer is None else (layer,)
+        self.indices = [scene.layers.index(layer) for layer in self.layers]
         self.options = replace(fitter.options, omit="nothing")  # planning has made unread cells cheap already
-        steps = list(scene.attributes) if layer == 0 else []
-        if layer == 0 or scene.deformation(layer) is not None:
-            steps += LAYER_KINDS[layer].step_names
+        steps = list(scene.attributes) if 0 in self.layers else []
+        for number in self.layers:
+            if number == 0 or scene.deformation(number) is not None:
+                steps += LAYER_KINDS[number].step_names
         masks = scene.full_masks()
-        active = masks[self.index] > 0
-        if self.index:
-            active &= masks[self.index - 1] == 0
-        own = np.flatnonzero(active)
-        errors = fitter.omission_error(scene, layer)[own]
-        order = np.argsort(errors, kind="stable")
-        self.order, self.errors = own[order], errors[order]
-        self.grids = {**{step: OCTAVES for step in steps}, **({ANCHORS: SHARES} if len(own) else {})}
+        active = masks[self.indices[-1]] > 0
+        if self.indices[0]:
+            active &= masks[self.indices[0] - 1] == 0
+        self.own = np.flatnonzero(active)
+        self.grids = {**{step: OCTAVES for step in steps}, **({ANCHORS: SHARES} if len(self.own) else {})}
+        self.smallest = {name: grid[-1] for name, grid in self.grids.items()}
         self.header = 0
-        if layer == 0:
-            first = encode(scene, self.options, effort=SEARCH_EFFORT, verify=False)
-            self.header = info(first)["layers"][0]["offset"] + HEADER_MARGIN
+        if 0 in self.layers:
+            symbols = self._planned({}).symbols
+            number, bounds = len(symbols.layers), rounding_bounds(symbols)
+            self.header = header_size(symbols, bounds, self.options.mode, number, MAX_PAYLOAD)
         self._sizes: dict[tuple[int, frozenset[tuple[str, float]]], int] = {}
         self._losses: dict[frozenset[tuple[str, float]], float] = {}
+
+    @cached_property
+    def leaving(self) -> tuple[np.ndarray, np.ndarray]:
+        """The rows of the layer's anchors in the order in which they leave, and their errors."""
+        errors = self.fitter.omission_error(self.scene, self.layers[-1])[self.own]
+        order = np.argsort(errors, kind="stable")
+        return self.own[order], errors[order]
+
+    @cached_property
+    def least_size(self) -> int:
+        """A lower bound of the sizes, from the coarsest steps and the anchors that take the fewest bits."""
+        total = self.header
+        for symbols in self._symbols({**self.smallest, ANCHORS: 0.0}):
+            bits = symbols.bits_per_row()
+            kept = np.argsort(bits, kind="stable")[: len(bits) - round(SHARES[-1] * len(bits))]
+            total += len(write_chunk(0, 0, bytes(8), write_layer(sliced(symbols, kept, True), self.options)[0]))
+        return math.floor(BOUND * total)
 
     def apply(self, setting: Setting) -> Scene:
         """Returns the scene at a setting, not planned: steps are not rounded, rows include the anchors that left."""
         given = vars(self.scene.steps)
         steps = replace(self.scene.steps, **{k: given[k] * 2.0**v for k, v in setting.items() if k != ANCHORS})
-        return replace(passed(self.scene, self.index, self.order[: self._moved(setting)]), steps=steps)
+        scene, moved = self.scene, self._moved(setting)
+        rows = self.leaving[0][:moved] if moved else self.own[:0]
+        for index in self.indices:
+            scene = passed(scene, index, rows)
+        return replace(scene, steps=steps)
 
     def size(self, setting: Setting, effort: int = SEARCH_EFFORT) -> int:
         """Returns the bytes that the layer adds to the file, 0 if the plan leaves it out."""
@@ -286,11 +320,14 @@ class _Layer:
     def _added_bytes(self, setting: Setting, effort: int) -> int:
         if self.options.slices and effort == self.options.effort:
             report = encode_with_report(self.apply(setting), self.options, verify=False)[1]
-            return report.added_bytes().get(self.layer, 0)
-        for symbols in (layer for layer in self._planned(setting).symbols.layers if layer.kind.layer == self.layer):
-            payload, _ = write_layer(symbols, replace(self.options, effort=effort))
-            return self.header + len(write_chunk(symbols.kind.layer, 0, bytes(8), payload))
-        return 0
+            added = report.added_bytes()
+            return sum(added.get(layer, 0) for layer in self.layers)
+        options, symbols = replace(self.options, effort=effort), self._symbols(setting)
+        chunks = [len(write_chunk(0, 0, bytes(8), write_layer(layer, options)[0])) for layer in symbols]
+        return self.header + sum(chunks) if chunks else 0
+
+    def _symbols(self, setting: Setting) -> list[LayerSymbols]:
+        return [symbols for symbols in self._planned(setting).symbols.layers if symbols.kind.layer in self.layers]
 
     def final_size(self, setting: Setting) -> int:
         """`size` at the effort of the file."""
@@ -307,7 +344,7 @@ class _Layer:
         return plan(self.apply(setting), self.options)
 
     def _moved(self, setting: Setting) -> int:
-        return round(setting.get(ANCHORS, 0.0) * len(self.order))
+        return round(setting.get(ANCHORS, 0.0) * len(self.own))
 
     def describe(self, setting: Setting, target: int) -> Fit:
         """Returns the report of the chosen setting."""
@@ -319,7 +356,7 @@ class _Layer:
             bytes=self.final_size(setting),
             factors=factors,
             moved=moved,
-            to_layer=next(iter(self.scene.layers[self.index + 1 :]), None),
-            omission_error=float(self.errors[moved - 1]) if moved else None,
+            to_layer=next(iter(self.scene.layers[self.indices[-1] + 1 :]), None),
+            omission_error=float(self.leaving[1][moved - 1]) if moved else None,
             steps={k: steps[k] for k in factors},
         )

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 import torch
 
-from pd4dgs_codec.data.view import Dataset
+from pd4dgs_codec.data.view import Dataset, spread
 from pd4dgs_codec.errors import DataError, TrainError
 from pd4dgs_codec.io import finite
 from pd4dgs_codec.model import checkpoint
@@ -35,6 +35,8 @@ LATER_COST = 1.5
 #: Held-out evaluations over a run, for the curve of quality against wall time, and views in each.
 CURVE_POINTS = 12
 CURVE_VIEWS = 6
+#: Training cameras and times in a checkpoint, from which packing measures the model.
+VIEWPOINTS = 32
 
 
 class Progress(Protocol):
@@ -207,6 +209,7 @@ class Trainer:
             "source": self.dataset.name,
             "seconds": self.seconds,
             "curve": json.dumps(self.curve),
+            "viewpoints": [(view.camera, float(view.time)) for view in spread(self.dataset.train, VIEWPOINTS)],
         }
         checkpoint.save(path, self.model, training | self.learner.state())
 

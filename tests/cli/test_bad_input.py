@@ -52,7 +52,10 @@ CASES = [
     # options that would be ignored
     *((2, f"encode m.pt -o s.pd4 {option}", "needs --data") for option in ("--holdout 0", "--views 3")),
     (2, "encode m.pt -o s.pd4 --data DATA", "--data needs --slices or --target-size"),
-    (2, "encode m.pt -o s.pd4 --downscale 2", "--downscale needs --slices or --target-size"),
+    (2, "encode m.pt -o s.pd4 --downscale 2", "--downscale needs --data"),
+    (2, "encode m.pt -o s.pd4 --slices 9k --downscale 2", "--downscale needs --data"),
+    (2, "encode m.pt -o s.pd4 --keep-levels", "--keep-levels needs --slices"),
+    (2, "encode m.pt -o s.pt", "-o s.pt names a checkpoint, expected a .pd4 file"),
     *((2, f"render s.pd4 -o a.gif {option}", "needs --data") for option in ("--holdout 0", "--split test")),
     (2, "render s.pd4 -o %04d.png --fps 5", "--fps needs a .gif or .mp4"),
     (2, "render s.pd4 -o a.gif --fps 60", "found --fps 60, expected at most 50 for a .gif"),
@@ -74,8 +77,8 @@ CASES = [
     *((2, f"encode m.pt -o s.pd4 --source '{text}'", "one line of printable text") for text in ("a\nb", "\udcff")),
     *((2, f"render s.pd4 -o a.gif --fps {fps}", "a number from 0.01 to 1000") for fps in (1e-4, 1e308)),
     *(
-        (2, f"encode m.pt -o s.pd4 --target-size={text}", "expected sizes in bytes such as L0=425k")
-        for text in ("425k", "L3=1k", "L0=1k,L0=2k", "L0=", "L0=-5", "L0=0.5", "L0=1k,")
+        (2, f"encode m.pt -o s.pd4 --target-size={text}", "or sizes of layers such as L0=425k")
+        for text in ("k", "-5", "425k,L0=9k", "L3=1k", "L0=1k,L0=2k", "L0=", "L0=-5", "L0=0.5", "L0=1k,")
     ),
     (2, "encode m.pt -o s.pd4 --layers 1 --target-size L0=9k,L2=9k", "--target-size L2 has no effect with --layers 1"),
     *((2, f"encode m.pt -o s.pd4 --slices {option}", "slices ") for option in ("999", "2k --mode lzma")),

@@ -1,5 +1,6 @@
 """encode with quality in renderings: target sizes, the effect of single anchors."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -7,7 +8,8 @@ import pytest
 
 from pd4dgs_codec.data.view import View
 from pd4dgs_codec.format.plan import plan
-from pd4dgs_codec.model import sensitivity
+from pd4dgs_codec.model import checkpoint, sensitivity
+from pd4dgs_codec.model.model import from_scene
 from pd4dgs_codec.quality import packing, target
 from pd4dgs_codec.quality.frames import own_frames
 from pd4dgs_codec.quality.measure import RenderedLoss, true_psnr
@@ -39,6 +41,21 @@ def test_a_target_is_met_and_its_loss_is_reported(cli, model_pt, tmp_path):
     assert row["bytes"] == first_layer(cli, output) and row["target"] == most
     assert target["cameras"] == "the file's own camera" and [level["level"] for level in target["levels"]] == [0, 1, 2]
     assert all(10 < level["error_psnr"] < 100 for level in target["levels"])
+
+
+def test_cameras_in_a_checkpoint_measure_and_their_absence_is_said(cli, model_pt, scene, tmp_path):
+    seen = [(scene.info.camera, time) for time in (0.0, 0.5, 1.0)]
+    checkpoint.save(tmp_path / "m.pt", from_scene(scene), {"viewpoints": seen})
+    arguments = ("--slices", 2000, "--effort", 1, "-f", "-o", tmp_path / "s.pd4")
+    found, older = (cli("encode", path, *arguments) for path in (tmp_path / "m.pt", model_pt))
+    report, before = found.err, older.err
+    assert "on 2 views: training cameras in the checkpoint" in report and "no training cameras" not in report
+    assert "on 2 views: the file's own camera" in before and "holds no training cameras" in before
+    row = r"^level [012]: \d+\.\d+ dB with slices, \d+\.\d+ dB without, on the model's own pictures$"
+    assert len(re.findall(row, report, re.MULTILINE)) == 3
+    assert re.search(r"^first slices of layers \[.*\] exceed 2,000 bytes", report, re.MULTILINE)
+    kept = cli("encode", model_pt, *arguments, "--keep-levels")
+    assert kept.code == 0 and "dB with slices" not in kept.err
 
 
 def test_a_picture_that_equals_its_image_does_not_decide_a_mean(scene, monkeypatch):

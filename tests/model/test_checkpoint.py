@@ -63,6 +63,33 @@ def test_round_trip(tmp_path, layers, hidden):
     assert torch.equal(extra["state"]["moment"], torch.arange(3.0))
 
 
+def test_training_cameras_are_remembered(tmp_path):
+    scene = make_scene(3)
+    seen = [(scene.info.camera, 0.25), (replace(scene.info.camera, width=7), 1.0)]
+    checkpoint.save(tmp_path / "m.pt", from_scene(scene), {"viewpoints": seen})
+    for (camera, time), (saved, then) in zip(checkpoint.load(tmp_path / "m.pt")[1]["viewpoints"], seen, strict=True):
+        assert time == then and (camera.width, camera.height) == (saved.width, saved.height)
+        assert np.array_equal(camera.viewmat, saved.viewmat) and np.array_equal(camera.K, saved.K)
+
+
+@pytest.mark.parametrize(
+    "change", [{"width": 0}, {"width": 1 << 20}, {"K": [[1.0, 0.0, 0.0]]}, {"viewmat": [float("nan")]}, {"time": 1.5}]
+)
+def test_training_cameras_that_cannot_be_are_refused(tmp_path, change):
+    scene = make_scene(3)
+    checkpoint.save(tmp_path / "m.pt", from_scene(scene), {"viewpoints": [(scene.info.camera, 0.5)]})
+
+    def spoil(content):
+        camera, time = content["training"]["viewpoints"][0]
+        content["training"]["viewpoints"][0] = [
+            {k: change.get(k, v) for k, v in camera.items()},
+            change.get("time", time),
+        ]
+
+    rewrite(tmp_path / "m.pt", spoil)
+    refusal(tmp_path / "m.pt", "missing or misshapen content")
+
+
 def test_no_camera_and_no_anchors(tmp_path):
     scene = make_scene(0, anchors=0, with_camera=False)
     checkpoint.save(tmp_path / "m.pt", from_scene(scene))

@@ -1,21 +1,23 @@
 """pack without pictures is encode; with them slices are ordered by utility and scored."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from strategies import by_voxel, make_scene
 from tiny import camera_ahead
 
-from pd4dgs_codec.data.view import View
+from pd4dgs_codec.data.view import View, spread
 from pd4dgs_codec.format.decoder import decode
-from pd4dgs_codec.format.encoder import encode
+from pd4dgs_codec.format.encoder import encode, with_metadata
 from pd4dgs_codec.format.info import hashes, info, metadata_of
 from pd4dgs_codec.format.metadata import Metadata
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.model.sensitivity import utility, without
 from pd4dgs_codec.quality import packing, target
+from pd4dgs_codec.quality.measure import true_psnr
 from pd4dgs_codec.quality.packing import Views, pack
 
 FAST = EncodeOptions(mode="lzma", effort=1)
@@ -51,19 +53,58 @@ def scene():
 
 def test_without_a_camera_the_largest_come_first(scene):
     packed = pack(replace(scene, info=replace(scene.info, camera=None)), SLICED)
-    assert packed.slices == {"order": "gate times area", "cameras": None, "pictures": 0}
+    assert packed.slices == {"order": "gate times area", "cameras": None, "pictures": 0, "size": 1500}
 
 
 def test_the_files_own_camera_decides(scene):
     packed = pack(scene, SLICED)
-    told = {"order": "rendered gain per byte", "cameras": "the file's own camera", "pictures": 16}
-    assert packed.json()["slices"] == told
+    told = {"order": "rendered gain per byte", "cameras": "the file's own camera", "pictures": 16, "size": 1500}
+    assert told.items() <= packed.json()["slices"].items()
     whole, sliced = (decode(data) for data in (pack(scene, replace(SLICED, slices=0)).data, packed.data))
     assert sliced.rows[0] <= whole.rows[0] and sliced.rows[1] < whole.rows[1]  # anchors wait for motion
     np.testing.assert_equal(by_voxel(sliced), by_voxel(whole))
     files = [pack(scene, replace(SLICED, layers=0, slices=size)).data for size in (SLICED.slices, 0)]
     assert len(files[0]) > len(files[1]) and hashes(files[0]) == hashes(files[1])  # nothing moves: all stay
     assert metadata_of(packed.data) is None
+
+
+def test_cameras_of_a_checkpoint_decide_as_their_dataset_does(scene):
+    """The pictures are the scene's own in both: without the dataset nothing but held-out quality is missing."""
+    turned = replace(CAMERA, viewmat=CAMERA.viewmat @ np.diag(np.float32([-1, 1, -1, 1])))
+    seen = [(camera, time) for time in (0.0, 0.5, 1.0) for camera in (turned, CAMERA)]
+    picture = np.full((16, 24, 3), 90, np.uint8)
+    views = [View(c.viewmat, c.K, 24, 16, t, picture, None, "", 0) for c, t in seen]
+    dataset = SimpleNamespace(train=views, test=())
+    remembered = [(view.camera, view.time) for view in spread(views, 32)]
+    given, told = (
+        pack(scene, SLICED, views=Views.of(dataset, "made up", 16)),
+        pack(scene, SLICED, views=Views.remembered(remembered)),
+    )
+    about = metadata_of(given.data)
+    assert with_metadata(told.data, about)[0] == given.data != with_metadata(pack(scene, SLICED).data, about)[0]
+
+
+def test_levels_are_measured_without_and_with_slices_and_kept_if_asked(scene):
+    moved, kept = pack(scene, SLICED), pack(scene, SLICED, keep_levels=True)
+    assert moved.slices["against"] == "the model's own pictures" and "levels" not in kept.slices
+    rows = moved.slices["levels"]
+    assert [row["level"] for row in rows] == [0, 1, 2] and all(row["mpsnr"] > 5 for row in rows)
+    lost = [row["mpsnr_unsliced"] - row["mpsnr"] for row in rows]  # layer 1 passes anchors on, layer 0 has few
+    assert lost[1] > 0.1 and lost[2] == pytest.approx(0, abs=0.01)
+    whole = decode(pack(scene, replace(SLICED, slices=0)).data)
+    assert decode(kept.data).rows == whole.rows
+    np.testing.assert_equal(by_voxel(decode(kept.data)), by_voxel(whole))
+
+
+def test_a_sliced_file_meets_a_size_as_a_whole(scene, monkeypatch):
+    monkeypatch.setattr(target, "OCTAVES", (0.0, 1.5, 3.0))
+    monkeypatch.setattr(target, "SHARES", (0.0, 0.1, 0.5))
+    monkeypatch.setattr(packing, "OWN_PICTURES", 2)
+    size = round(0.8 * len(encode(scene, SLICED)))
+    packed = pack(scene, SLICED, target_sizes={None: size}, metadata=Metadata(title="with its metadata"))
+    (row,) = packed.target["layers"]
+    assert 0.95 * size <= len(packed.data) == row["bytes"] <= size and row["layer"] is None
+    assert all(part["end"] for layer in info(packed.data)["layers"] for part in layer["slices"])
 
 
 def test_slices_of_target_sizes_leave_anchors_in_their_layers(scene, monkeypatch):
@@ -90,8 +131,12 @@ def test_slices_meet_target_sizes_even_if_they_take_more_than_measured(scene, mo
 def test_views_held_out_are_scored_after_each_slice(scene):
     picture = np.full((16, 24, 3), 90, np.uint8)
     view = View(CAMERA.viewmat, CAMERA.K, 24, 16, 0.5, picture, None, "one", 0)
-    packed = pack(scene, SLICED, views=Views("made up", (view,), (view,)))
+    packed = pack(scene, SLICED, views=Views("made up", [(CAMERA, 0.5)], (view,)))
     slices = sum(len(row["slices"]) for row in info(packed.data)["layers"])
+    levels = packed.slices["levels"]  # of the file; level 0 is that of its first slices
+    decoded = true_psnr(decode(packed.data), (0, 1, 2), [view])
+    assert {row["level"]: row["mpsnr"] for row in levels} == pytest.approx(decoded, abs=0.01)
+    assert packed.slices["against"] == "held-out views" and len({row["mpsnr_unsliced"] for row in levels}) > 1
     assert slices > 3 and len(packed.slices["psnr"]) == slices
     np.testing.assert_allclose(metadata_of(packed.data).slices, packed.slices["psnr"], rtol=1e-6)
     assert packed.report.bytes == len(packed.data) and packed.report.metadata_bytes > 20

@@ -194,7 +194,26 @@ def test_a_target_out_of_reach_says_before_any_search_what_could_be_reached(scen
     never = Mock(side_effect=AssertionError("a loss was measured"))
     says = r"layer 2 takes at least [\d,]+ bytes \(steps up to x16.*expected at most 100$"
     with pytest.raises(EncodeError, match=says):
-        Fitter(scene, earlier | {2: 100}, never, error, EncodeOptions(**FAST)).fit()
+        Fitter(scene, earlier | {2: 100}, never, never, EncodeOptions(**FAST)).fit()
+
+
+def test_the_quick_bound_is_below_the_smallest_size_and_close(scene):
+    for layer in (0, 1, 2, None):
+        fitted = target._Layer(Fitter(scene, {}, Mock(), error, EncodeOptions(**FAST)), scene, layer)
+        smallest = fitted.final_size(fitted.smallest)
+        assert 0.75 * smallest <= fitted.least_size <= 0.95 * smallest, layer
+
+
+def test_a_file_meets_its_target_in_all_layers(scene):
+    loss, whole = coarseness(scene), len(encode(scene, **FAST))
+    most = round(0.7 * whole)
+    fitted, left_out, (row,) = Fitter(scene, {None: most}, loss, error, EncodeOptions(**FAST)).fit()
+    data = encode(fitted, **FAST, omit="nothing")
+    assert (1 - SLACK) * most - 16 <= len(data) <= row.bytes <= most
+    assert (row.layer, row.to_layer) == (None, None) and set(row.factors) == set(vars(scene.steps))
+    assert bool(row.moved) == bool(left_out) and row.moved == scene.rows[-1] - fitted.rows[-1]
+    with pytest.raises(EncodeError, match=r"the file takes at least [\d,]+ bytes .*expected at most 500$"):
+        Fitter(scene, {None: 500}, Mock(), Mock(), EncodeOptions(**FAST)).fit()
 
 
 def test_a_layer_that_is_not_there_meets_any_target(scene):

@@ -40,6 +40,9 @@ def test_a_model_without_upper_layers_is_packed_as_it_was_trained(dataset, tmp_p
     trainer_of(dataset, 40, max_layer=max_layer).run(tmp_path / "m.pt")
     model = checkpoint.load(tmp_path / "m.pt")[0]
     assert model.level == max_layer
+    seen = {(view.time, view.viewmat.tobytes()) for view in dataset.train}
+    remembered = checkpoint.load(tmp_path / "m.pt")[1]["viewpoints"]
+    assert len(remembered) == min(32, len(seen)) and {(t, c.viewmat.tobytes()) for c, t in remembered} <= seen
     own = [float((model.masks(level) - model.masks(level - 1)).detach().max()) > 1e-6 for level in (1, 2)]
     assert own == [max_layer >= 1, False], "absent levels have masks of their own"
     scene = decode(encode(to_scene(model), effort=1))
