@@ -112,7 +112,7 @@ CASES = [
     (1, "export SCENE -o out --to ply --compare missing", "missing: found nothing, expected a dataset folder"),
     (2, "export SCENE -o a.PLY --to spz", "-o a.PLY ends in .ply, but --to is spz"),
     *((2, f"serve empty --port {port}", "--port") for port in (65536, -1)),
-    *((2, f"serve empty --rate {rate}", "--rate") for rate in ("2X", "0", "nan")),
+    *((2, f"serve empty --rate {rate}", "--rate") for rate in ("2X", "0", "nan", "2")),
     (2, "serve empty --latency -1ms", "--latency"),
     (2, "serve empty --host ''", "--host"),
     (1, "serve empty --host 203.0.113.77 --port 0", "cannot listen"),
