@@ -1,8 +1,17 @@
-"""Seconds to the first pictures: over a paced link, slice by slice, and in a browser."""
+"""Seconds to the first pictures: over a paced link, slice by slice, and in a browser.
+
+    python benchmarks/delivery.py PACKAGE -o out/paint
+
+visits the page of a package over slow links: bytes and seconds on the terminal, screenshots in the folder.
+"""
 
 from __future__ import annotations
 
+import argparse
+import base64
+import gzip
 import tempfile
+import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from itertools import pairwise
@@ -10,7 +19,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from browser import TIMEOUT_MS, launched
+from browser import ELEMENT, TIMEOUT_MS, launched
 from common import ONE, TWO, Benchmark, Row, Run, Scene, command, levels, number, package, seconds_at, table
 
 from pd4dgs_codec.bench.latency import python
@@ -203,6 +212,58 @@ def player_text(rows: Sequence[Row]) -> str:
     )
 
 
+# -- a page over slow links --------------------------------------------------------------------------------------------
+
+SLOW, SHOTS = (2e5, 2e6), (0.3, 1.0, 3.0)  #: bits per second; seconds after the navigation began
+PAINTED = "performance.getEntriesByName('first-contentful-paint')[0]?.startTime / 1000"
+
+
+def measure_paint(folder: Path, out: Path, visits: int = 5) -> list[Row]:
+    """A row per rate: seconds, median and least of the visits, to the first paint and the first rendered picture of the
+    package's page. Writes the screenshots RATE-SECONDS.png, and RATE-end.png of the settled page, to `out`."""
+    rows, out_names = [], {rate: f"{rate / 1e3:g}k" for rate in SLOW}
+    out.mkdir(parents=True, exist_ok=True)
+    page_bytes = (folder / "index.html").read_bytes()
+    sizes = {"plain": len(page_bytes), "gzip": len(gzip.compress(page_bytes, 9, mtime=0))}
+    with launched() as browser:
+        for rate in SLOW:
+            with served(folder, "--rate", repr(rate), "--latency", ROUND_TRIP) as url:
+                seen = []
+                for _ in range(visits):
+                    page = opened(browser)
+                    page.add_init_script(NOTE)
+                    page.goto(f"{url}?autoplay=0", wait_until="commit")
+                    page.wait_for_function("noted.length")
+                    seen.append((page.evaluate(PAINTED), page.evaluate("noted[0].shown")))
+                    page.context.close()
+                painted, drawn = ((median(times), min(times)) for times in zip(*seen, strict=True))
+                rows.append({"rate": rate, **sizes, "painted": painted, "drawn": drawn})
+                page = opened(browser)
+                camera = page.context.new_cdp_session(page)
+                page.goto(f"{url}?autoplay=0", wait_until="commit")
+                start = page.evaluate("performance.timeOrigin / 1000")
+                for seconds in SHOTS:
+                    time.sleep(max(0.0, start + seconds - time.time()))
+                    shot = base64.b64decode(camera.send("Page.captureScreenshot")["data"])
+                    (out / f"{out_names[rate]}-{seconds:g}s.png").write_bytes(shot)
+                page.wait_for_function(f"{ELEMENT}?.player?.status.level >= 0")
+                page.evaluate(f"{ELEMENT}.player.settled()")
+                page.screenshot(path=out / f"{out_names[rate]}-end.png")
+                page.context.close()
+    return rows
+
+
+def paint_text(rows: Sequence[Row]) -> str:
+    """A row per rate."""
+    cells = [
+        (f"{r['rate'] / 1e6:g}", number(r["plain"], 0), number(r["gzip"], 0))
+        + tuple(f"{middle:.2f} ({least:.2f})" for middle, least in (r["painted"], r["drawn"]))
+        for r in rows
+    ]
+    head = ("Mbps", "bytes of the page", "gzip", "first paint s (least)", "first picture s (least)")
+    return table(head, cells)
+
+
 LATENCY = Benchmark("latency", "First picture", ONE, measure_latency, latency_text, measured=package("delivery"))
 #: Whose layer 0 is larger than a slice.
 SLICED = (*TWO, "orbit", "static", "global", "local", "fast")
@@ -215,3 +276,16 @@ PLAYER = Benchmark(
     player_text,
     measured=(*package("delivery"), "player", ":!player/test*", ":!*.md"),
 )
+
+
+def main() -> None:
+    """The page of the package that the command line names."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("package", type=Path, help="folder by pd4dgs-package")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="folder of the screenshots")
+    args = parser.parse_args()
+    print(paint_text(measure_paint(args.package, args.output)))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,4 +1,4 @@
-// The first script of index.html, and no module: a worker asks for the scene while the rest of the page arrives. It
+// The first script of index.html, behind what is painted first, and no module: a worker asks for the scene while the rest of the page arrives. It
 // becomes the loader once it is given the address of that code, by the packed page or by render/loader.js.
 
 {

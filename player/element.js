@@ -5,7 +5,8 @@
 //
 // Attributes: src; poster, a picture until there is one; controls; autoplay; loop; time, seconds to start at; level,
 // the highest to load and show; max-bytes and max-seconds, how much of the file to load, and how long beyond its first
-// slice. A change of autoplay, max-bytes or max-seconds acts on the next file.
+// slice. A change of autoplay, max-bytes or max-seconds acts on the next file. What the element contains, such as a
+// picture, covers the canvas until the first frame.
 
 import { Orbit } from "./render/orbit.js";
 import { Player } from "./render/player.js";
@@ -40,6 +41,9 @@ const STYLE = `
 canvas, img { position: absolute; inset: 0; width: 100%; height: 100%; }
 canvas:focus-visible { outline: 2px solid #6bf; outline-offset: -2px; }
 img { object-fit: contain; pointer-events: none; }
+slot { position: absolute; inset: 0; overflow: hidden; background: inherit; pointer-events: none;
+  transition: opacity .3s, visibility .3s; }
+slot.past { opacity: 0; visibility: hidden; }
 .error { position: absolute; inset: 0 0 auto; margin: 0; padding: 8px 12px; background: #611e;
   overflow-wrap: anywhere; }
 .bar { position: absolute; inset: auto 0 0; display: flex; gap: 8px; align-items: center; padding: 6px 10px;
@@ -88,6 +92,7 @@ const FULL = icon("M1 1h5v2H3v3H1zM10 1h5v5h-2V3h-3zM1 10h2v3h3v2H1zM13 10h2v5h-
 const BODY = `
 <canvas tabindex="0" role="application" aria-label="Dynamic scene"
   aria-keyshortcuts="Space ArrowLeft ArrowRight ArrowUp ArrowDown + - Home , . f"></canvas>
+<slot></slot>
 <img alt="" hidden>
 <p class="error" role="alert" hidden></p>
 <div class="status" part="status" aria-hidden="true"></div>
@@ -120,6 +125,7 @@ export class Pd4Player extends HTMLElement {
     /** @param {string} selector */
     const part = (selector) => /** @type {HTMLElement} */ (root.querySelector(selector));
     this._poster = /** @type {HTMLImageElement} */ (part("img"));
+    this._slot = part("slot");
     this._error = part(".error");
     this._statusLine = part(".status");
     this._bar = part(".bar");
@@ -281,7 +287,10 @@ export class Pd4Player extends HTMLElement {
       this._error.textContent = detail.message;
       this._error.hidden = false;
     }
-    if (name === "firstpicture") this._poster.hidden = true;
+    if (name === "firstpicture") {
+      this._poster.hidden = true;
+      this._slot.classList.add("past");
+    }
     if (name === "statechange" || name === "timeupdate") this._showState();
     if (name !== "timeupdate") this._showStatus();
   }

@@ -1,6 +1,6 @@
 // The script of index.html.
 
-import { Pd4Player } from "./element.js";
+import "./element.js";
 import { bench } from "./render/bench.js";
 
 const query = new URLSearchParams(location.search);
@@ -10,16 +10,17 @@ const held = document.getElementById("scene")?.textContent;
 const bytes = held ? Uint8Array.from(atob(held), (c) => c.charCodeAt(0)) : null;
 const source = bytes ? new Blob([bytes]) : /** @type {Begun} */ (/** @type {unknown} */ (globalThis)).early.url;
 
+const player = /** @type {import("./element.js").Pd4Player} */ (document.querySelector("pd4-player"));
+
 if (query.has("bench")) {
+  player.remove();
   bench(source, document.body, query.get("sizes") ?? undefined);
 } else {
-  const player = new Pd4Player();
   for (const name of ["controls", "autoplay", "loop"]) player.toggleAttribute(name, query.get(name) !== "0");
   for (const name of ["level", "time", "poster", "max-bytes", "max-seconds"]) {
     const value = query.get(name);
     if (value !== null) player.setAttribute(name, value);
   }
-  document.querySelector("main")?.append(player);
   player.load(source);
   document.body.addEventListener("dragover", (event) => event.preventDefault());
   document.body.addEventListener("drop", (event) => {

@@ -209,8 +209,9 @@ def background(text: str) -> tuple[float, float, float]:
 
 
 def rate(text: str) -> float:
-    """Reads a link rate in bits per second with k, M or G for 1e3, 1e6, 1e9: "2M" -> 2e6."""
-    return _scaled(text, {"k": 1e3, "M": 1e6, "G": 1e9}, "a rate in bits per second such as 2M or 500k")
+    """Reads a link rate in bits per second with k, M or G for 1e3, 1e6, 1e9: "2M" -> 2e6. 1k is the lowest."""
+    expected = "a rate in bits per second such as 2M or 500k, at least 1k"
+    return _scaled(text, {"k": 1e3, "M": 1e6, "G": 1e9}, expected, low=1e3)
 
 
 def rates(text: str) -> dict[str, float]:

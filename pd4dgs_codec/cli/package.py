@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from pd4dgs_codec.cli import options
 from pd4dgs_codec.cli.common import OK, STDIO, Console, command, number, progress_bar, read_bytes, same_file, say, table
@@ -18,15 +18,19 @@ if TYPE_CHECKING:
 
     from pd4dgs_codec.scene import Scene
     from pd4dgs_codec.web.manifests import Video
+    from pd4dgs_codec.web.page import Still
+
+T = TypeVar("T")
 
 DETAILS = """\
 DIR then holds scene.pd4 and index.html, a page that plays the scene from any static web server. For other players there
 are index.json (byte ranges and SHA-256 of the slices), scene.mp4 with scene.mpd (DASH: each slice is a fragment in an
-AdaptationSet of its own, with dependencyId) and scene.m3u8 (HLS, with index.json as session data).
+AdaptationSet of its own, which names the slice before it) and scene.m3u8 (HLS, with index.json as session data).
 
-DASH clients with support for dependencyId can fetch the layers, but need a .pd4 decoder to show them. Other DASH and
-HLS players show a 2D video, fallback.mp4, of the scene from its own camera. The video needs torch, numba and ffmpeg
-(the extra [train]) and a file with a camera; otherwise it is left out.
+DASH clients can fetch the slices, but need a .pd4 decoder to show them. DASH and HLS players without one (dash.js,
+Shaka Player, hls.js) show a 2D video, fallback.mp4, of the scene from its own camera. Video and page's picture need
+numba (the extra [train]) and a file with a camera, the video ffmpeg as well; otherwise they are left out. The picture,
+at most 3 kB, lies in the page and is shown until the player has drawn one.
 
 --immutable puts a checksum into the names of the files that others refer to, so that a CDN may cache them forever.
 index.json lists the Cache-Control header of each file. For a folder of packages, pd4dgs-package writes library.json and
@@ -40,6 +44,9 @@ examples:
 
 MAX_FRAMES = 3000
 FRAGMENT_SECONDS = 2
+#: The page's picture: pixels of the camera's longer side, how much wider and higher than the camera's picture it is,
+#: and bytes, so that it arrives within 0.2 s at 200 kbps.
+STILL_SIDE, STILL_REACH, STILL_BYTES = 160, 1.8, 3000
 
 
 def parser() -> options.Parser:
@@ -70,23 +77,30 @@ def _package(args: argparse.Namespace, console: Console) -> int:
 
     check_new([str(Path(args.output) / INDEX)], args.overwrite)  # before a video is rendered
     data = read_bytes(args.input)
-    missing = ["--no-video"] if args.no_video else []
+    missing = {"2D video": "--no-video"} if args.no_video else {}
 
-    def render(scene: Scene) -> Video | None:
+    def made(what: str, make: Callable[[], T]) -> T | None:
+        """What `make` returns; None, and a remark, if something for it is missing."""
         try:
-            return _render(scene, args.fps)
+            return make()
         except RenderError as error:
-            missing.append(str(error))
+            missing[what] = str(error)
         except ModuleNotFoundError as error:
             if (error.name or "").startswith("pd4dgs_codec"):
                 raise
-            missing.append(f"the module {error.name} is not installed")
-        say(f"pd4dgs-package: no 2D video: {missing[0]}")
+            missing[what] = f"the module {error.name} is not installed"
+        say(f"pd4dgs-package: no {what}: {missing[what]}")
         return None
 
-    files = package(data, None if args.no_video else render, immutable=args.immutable)
-    result = {"input": args.input, "output": args.output, "files": _write(args, files), "video": not missing}
-    console.result(result | {"why_no_video": missing[0] if missing else None}, _text(result))
+    files = package(
+        data,
+        lambda scene: None if args.no_video else made("2D video", lambda: _render(scene, args.fps)),
+        lambda scene: made("picture in the page", lambda: _still(scene)),
+        immutable=args.immutable,
+    )
+    why = missing.get("2D video")
+    result = {"input": args.input, "output": args.output, "files": _write(args, files), "video": why is None}
+    console.result(result | {"why_no_video": why}, _text(result))
     return OK
 
 
@@ -144,6 +158,34 @@ def _render(scene: Scene, fps: float) -> Video:
         write_mp4(pictures(), path, fps, fragment=max(1, round(FRAGMENT_SECONDS * fps)))
         size = camera.width // 2 * 2, camera.height // 2 * 2
         return Video(path.read_bytes(), *size, fps, poster.getvalue())
+
+
+def _still(scene: Scene) -> Still:
+    """The scene as the player shows it first, seen by its own camera, and what lies around that picture."""
+    from dataclasses import replace
+
+    import numpy as np
+    from PIL import Image
+
+    from pd4dgs_codec.quality.image import to_uint8
+    from pd4dgs_codec.quality.levels import level_of
+    from pd4dgs_codec.web.page import Still
+
+    camera = scene.info.camera
+    if camera is None:
+        raise RenderError("the file has no camera")
+    scale = STILL_SIDE / max(camera.width, camera.height)
+    width, height = (max(1, round(STILL_REACH * scale * side)) for side in (camera.width, camera.height))
+    K = camera.K * np.array([[scale], [scale], [1]], np.float32)
+    K[:2, 2] += (width - scale * camera.width) / 2, (height - scale * camera.height) / 2
+    picture = level_of(scene).picture(replace(camera, K=K, width=width, height=height), 0.0)
+    for quality in (70, 50, 30, 10, 0):
+        file = BytesIO()
+        Image.fromarray(to_uint8(picture)).save(file, "webp", quality=quality, method=6)
+        if file.tell() <= STILL_BYTES:
+            break
+    red, green, blue = to_uint8(np.array(scene.info.background))
+    return Still(file.getvalue(), STILL_REACH, camera.width / camera.height, f"rgb({red},{green},{blue})")
 
 
 def _text(result: dict[str, Any]) -> str:

@@ -18,7 +18,8 @@ if TYPE_CHECKING:
 
 DETAILS = """\
 Answers GET and HEAD with ranges, If-Range, ETag and CORS. Files outside DIR and names that begin with a dot are not
-served. The first line on stdout is the URL, printed when the server is ready. Ctrl-C or SIGTERM stops it.
+served. A folder shows its index.html, else the names of its scenes. The first line on stdout is the URL, printed when
+the server is ready. Ctrl-C or SIGTERM stops it.
 
 --rate is the rate of one link shared by all clients, headers not counted. --latency is its round-trip time: one
 per new connection and one per request.

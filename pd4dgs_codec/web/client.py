@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import http.client
+import io
 import math
 import socket
 import ssl
@@ -17,7 +18,7 @@ from collections.abc import Callable, Iterator
 from concurrent import futures
 from functools import partial
 from http import HTTPStatus
-from typing import TypeVar
+from typing import Any
 from urllib.parse import SplitResult, quote, urljoin, urlsplit
 
 from pd4dgs_codec.errors import (
@@ -53,8 +54,6 @@ LONGEST_HEADER = PREAMBLE_SIZE + MAX_HEADER
 #: Limit of the bytes fetched if no budget is given: a header of a few bytes may promise terabytes.
 MOST_BYTES = 1 << 28
 
-T = TypeVar("T")
-
 
 class Changed(Exception):
     """The file has changed: its earlier bytes are discarded, and the transfer restarts at byte 0."""
@@ -62,6 +61,36 @@ class Changed(Exception):
 
 class _Cut(Exception):
     """The connection ended early, or the response is invalid: a new request may help."""
+
+
+class _Reader(io.RawIOBase):
+    """Reads a response until a time.monotonic() that `until` gives: a socket limits the time of each read alone, and a
+    line may take many. raw: what it reads from, whose socket is `sock`."""
+
+    def __init__(self, raw: io.RawIOBase, sock: socket.socket, until: Callable[[], float]):
+        self._raw, self._sock, self._until = raw, sock, until
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int | None:
+        left = self._until() - time.monotonic()
+        if left <= 0:
+            raise TimeoutError
+        self._sock.settimeout(left)
+        return self._raw.readinto(buffer)
+
+    def close(self) -> None:
+        self._raw.close()
+        super().close()
+
+
+class _Response(http.client.HTTPResponse):
+    """A response with time limits, see _Reader."""
+
+    def __init__(self, sock: socket.socket, *args: Any, until: Callable[[], float], **options: Any):
+        super().__init__(sock, *args, **options)
+        self.fp: Any = io.BufferedReader(_Reader(self.fp.detach(), sock, until))
 
 
 class Transfer:
@@ -78,20 +107,21 @@ class Transfer:
         self.total: int | None = None
         self.requests = self.cuts = self.changes = 0
         self._home = self._place = _parsed(url)
-        self._validator: str | None = None
+        self._tag: str | None = None  # the file's ETag and date
+        self._date: str | None = None
         self._connection: http.client.HTTPConnection | None = None
-        self._socket: socket.socket | None = None  # http.client forgets it before the last response is read
+        self._until = math.inf  # until when the connection may be silent, time.monotonic()
         self._response: http.client.HTTPResponse | None = None
         self._at = 0  # offset in the file of the next byte of the response; bytes already in `data` are skipped
         self._response_end: int | None = None  # offset in the file where the response ends, if known
 
-    def read(self, end: int | None = None, *, reach: int | None = None) -> bytes:
+    def read(self, end: int | None = None, *, reach: int | None = None, attempts: int | None = None) -> bytes:
         """Returns the next bytes to arrive, none beyond `end` (None: the end of the file); empty if all have arrived.
 
         reach: offset up to which a request asks for bytes, so that later reads need no other; None: the file's end.
-        Raises Changed, or DeliveryError if the file is not available.
+        attempts: in place of those of the transfer. Raises Changed, or DeliveryError if the file is not available.
         """
-        failures = 0
+        failures, attempts = 0, attempts or self.attempts
         while not self._is_here(end):
             try:
                 if self._response is None:
@@ -102,7 +132,7 @@ class Transfer:
                 self.close()
                 self.cuts += 1
                 failures += 1
-                if failures >= self.attempts or isinstance(error, ssl.SSLCertVerificationError):
+                if failures >= attempts or isinstance(error, ssl.SSLCertVerificationError):
                     message = f"{self.url}: {_reason(error)} ({len(self.data):,} bytes received)"
                     raise DeliveryError(message) from None
                 if failures > 1:
@@ -122,14 +152,11 @@ class Transfer:
 
     def close(self) -> None:
         """Closes the connection. Bytes that have arrived stay; a later read connects again."""
-        if self._socket is not None:
-            with contextlib.suppress(OSError, ValueError):
-                self._socket.shutdown(socket.SHUT_RDWR)  # wakes a thread that still reads from it
         if self._response is not None:
             self._response.close()
         if self._connection is not None:
             self._connection.close()
-        self._connection = self._socket = self._response = None
+        self._connection = self._response = None
         self._place = self._home
 
     def _is_here(self, end: int | None) -> bool:
@@ -139,7 +166,7 @@ class Transfer:
     def _receive(self, end: int | None) -> bytes:
         """Reads a block of the response; returns b"" at its regular end and for bytes that are skipped."""
         response, skipped = self._response, len(self.data) - self._at
-        assert response is not None and self._socket is not None
+        assert response is not None
         limits = [BLOCK]
         if skipped:
             limits.append(skipped)
@@ -147,10 +174,8 @@ class Transfer:
             limits.append(end - self._at)
         if self._response_end is not None:
             limits.append(self._response_end - self._at)
-        self._socket.settimeout(self.stall)
-        # a chunk's length takes several reads, each with a time limit of its own
-        read = partial(response.read1, min(limits))
-        block = _within(self.stall, read) if response.chunked else read()
+        self._until = time.monotonic() + self.stall
+        block = response.read1(min(limits))
         self._at += len(block)
         if not skipped:
             self.data += block
@@ -168,13 +193,10 @@ class Transfer:
     def _request(self, reach: int | None) -> None:
         start = len(self.data)
         headers = {"Accept-Encoding": "identity", "User-Agent": "pd4dgs"}
-        if start and self._validator is None:  # the rest may belong to another file: fetch all of it again
-            headers["Cache-Control"] = "no-cache"
-        elif start:
+        if start or reach is not None:
             headers["Range"] = f"bytes={start}-" + ("" if reach is None else str(reach - 1))
-            headers["If-Range"] = str(self._validator)
-        elif reach is not None:
-            headers["Range"] = f"bytes=0-{reach - 1}"
+        if start and (validator := strong_etag(self._tag) or self._date):
+            headers["If-Range"] = validator
         for _ in range(MAX_REDIRECTS + 1):
             response = self._send(headers)
             if response.status not in REDIRECTS:
@@ -194,24 +216,16 @@ class Transfer:
             kind = http.client.HTTPSConnection if secure else http.client.HTTPConnection
             port = self._place.port or kind.default_port  # HTTPConnection would seek one in an IPv6 address
             self._connection = kind(str(self._place.hostname), port, timeout=self.stall)
-        connection, target = self._connection, _target(self._place)
+            until = partial(_Response, until=lambda: self._until)
+            self._connection.response_class = until  # type: ignore[assignment]
+        connection = self._connection
         self.requests += 1
-
-        def exchange() -> http.client.HTTPResponse:
-            if connection.sock is None:  # new, or closed by the server after its last response
-                try:
-                    connection.connect()
-                except UnicodeError:  # a label too long for a host name
-                    raise OSError(f"{connection.host} is not a host name") from None
-            if connection is not self._connection:
-                connection.close()
-                raise TimeoutError  # the caller has given up
-            self._socket = connection.sock
-            self._socket.settimeout(self.stall)
-            connection.request("GET", target, headers=headers)
-            return connection.getresponse()
-
-        return _within(self.stall, exchange)
+        self._until = time.monotonic() + self.stall
+        if connection.sock is None:  # new, or closed by the server after its last response
+            _connect(connection, self.stall)
+        connection.sock.settimeout(self.stall)
+        connection.request("GET", _target(self._place), headers=headers)
+        return connection.getresponse()
 
     def _accept(self, response: http.client.HTTPResponse, start: int, asked_range: bool) -> None:
         """Checks a response for bytes from `start` on. Raises Changed if the file is no longer the same."""
@@ -228,52 +242,57 @@ class Transfer:
         coding = response.headers.get("Content-Encoding", "identity")
         if coding.lower() != "identity":
             raise DeliveryError(f"found Content-Encoding {one_line(coding, SHOWN)}, expected identity")
-        tag = strong_etag(response.headers.get("ETag"))
-        validator = tag or response.headers.get("Last-Modified")
+        tag, date = response.headers.get("ETag"), response.headers.get("Last-Modified")
+        # what is not known of both answers does not differ; if the bytes do, the slices' checksums tell
+        same = [(tag.removeprefix("W/"), self._tag.removeprefix("W/"))] if tag and self._tag else [(date, self._date)]
         self._response, self._at = response, start
         if status == HTTPStatus.PARTIAL_CONTENT:
             if not asked_range or part is None or part[0] != start:
                 found = one_line(response.headers.get("Content-Range") or "none", SHOWN)
                 raise _Cut(f"found Content-Range {found}, expected bytes from {start}")
-            other = validator is not None and validator != self._validator
-            if start and (other or part[2] != self.total):
-                self._restart()
-            _, self._response_end, self.total = part
+            _, self._response_end, total = part
         else:
-            self._response_end = self.total = response.length
-            self._at = 0
-            if start and (tag is None or tag != self._validator):  # else a server without ranges sends the same file
-                self._restart(keep_response=True, validator=validator)
-        self._validator = validator or self._validator
+            self._response_end = total = response.length
+            self._at = 0  # a server without ranges sends all of it
+        changed = start > 0 and any(None not in pair and pair[0] != pair[1] for pair in (*same, (total, self.total)))
+        self.total = self.total if total is None and not changed else total
+        self._tag, self._date = (tag, date) if changed else (tag or self._tag, date or self._date)
+        if changed:
+            self._restart(keep_response=self._at == 0)
 
-    def _restart(self, keep_response: bool = False, validator: str | None = None) -> None:
-        """Restarts at byte 0 and raises Changed. keep_response: the response, with `validator`, begins at byte 0."""
+    def _restart(self, keep_response: bool = False) -> None:
+        """Restarts at byte 0 and raises Changed. keep_response: the response begins at byte 0."""
         self.data.clear()
         self.changes += 1
-        self._validator = validator
         if not keep_response:
             self.close()
-            self.total = None
+            self.total = self._tag = self._date = None
         if self.changes > MAX_CHANGES:
             raise DeliveryError(f"the file changed {self.changes} times during the transfer")
         raise Changed
 
 
-def _within(seconds: float, work: Callable[[], T]) -> T:
-    """Runs `work` in a thread and returns its result. Raises TimeoutError after `seconds`, since a socket limits only
-    the time of each operation and the system's resolver has no limit."""
-    result: futures.Future[T] = futures.Future()
+def _connect(connection: http.client.HTTPConnection, seconds: float) -> None:
+    """Connects in a thread, since the system's resolver has no time limit. Raises TimeoutError after `seconds`."""
+    result: futures.Future[None] = futures.Future()
 
     def run() -> None:
         try:
-            result.set_result(work())
+            connection.connect()
+            result.set_result(None)
+        except UnicodeError:  # a label too long for a host name
+            result.set_exception(OSError(f"{connection.host} is not a host name"))
         except BaseException as error:
             result.set_exception(error)
+        if abandoned.is_set():
+            connection.close()
 
+    abandoned = threading.Event()
     threading.Thread(target=run, daemon=True).start()
     try:
-        return result.result(timeout=seconds)
+        result.result(timeout=seconds)
     except futures.TimeoutError:
+        abandoned.set()
         raise TimeoutError from None
 
 
@@ -328,9 +347,9 @@ def fetch(transfer: Transfer, max_layer: int | None = None, max_bytes: int | Non
     """Fetches a file, or its prefix: the header, and the slices of layers up to max_layer that end within max_bytes.
     Returns fewer bytes if the remote file ends early.
 
-    A whole file takes one request, a prefix two (three with a long header). A whole file is fetched up to one byte
-    beyond its end, so that the decoder sees trailing data. Raises as Transfer.read does, DecodeError for an invalid
-    header, and LimitExceeded for bytes beyond MOST_BYTES without max_bytes.
+    A whole file takes one request, a prefix two (three with a long header). The header says where a file ends; of what
+    follows, one byte is fetched, so that the decoder sees trailing data. Raises as Transfer.read does, DecodeError for
+    an invalid header, and LimitExceeded for bytes beyond MOST_BYTES without max_bytes.
     """
     whole = max_layer is None and max_bytes is None
 
@@ -348,7 +367,11 @@ def fetch(transfer: Transfer, max_layer: int | None = None, max_bytes: int | Non
             end = info(header)["bytes"] if whole else prefix_end(slice_ends(header), max_layer, max_bytes)
             if max_bytes is None:
                 check_end(end)
-            return fill(end + 1 if whole else max(end, size))
+            data = fill(max(end, size))
+            if whole and len(data) == end:
+                with contextlib.suppress(DeliveryError, Changed):  # a length that is not that of the file
+                    data += transfer.read(min(end + 1, MOST_BYTES), attempts=1)
+            return data
 
 
 def _header_size(data: bytes | bytearray) -> int | None:

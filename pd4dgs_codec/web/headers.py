@@ -6,7 +6,7 @@ import re
 #: Positions of more digits belong to no file, and int() takes quadratic time for them.
 _DIGITS = r"[0-9]{1,18}"
 _RANGE = re.compile(rf"bytes=(?:({_DIGITS})-({_DIGITS})?|-({_DIGITS}))", re.IGNORECASE)
-_CONTENT_RANGE = re.compile(rf"bytes ({_DIGITS})-({_DIGITS})/({_DIGITS})", re.IGNORECASE)
+_CONTENT_RANGE = re.compile(rf"bytes ({_DIGITS})-({_DIGITS})/({_DIGITS}|\*)", re.IGNORECASE)
 #: A file whose name carries the digest of its content never changes.
 _ADDRESSED = re.compile(r"-[0-9a-f]{16}\.\w+$")
 #: Caches keep immutable files for a year, and revalidate all others on every use.
@@ -58,11 +58,14 @@ def requested_range(header: str | None, size: int) -> tuple[int, int] | None:
     return start, end
 
 
-def content_range(header: str | None) -> tuple[int, int, int] | None:
-    """Returns (start, end, file length) of a Content-Range header, end exclusive; None unless it has all three."""
+def content_range(header: str | None) -> tuple[int, int, int | None] | None:
+    """Returns (start, end, file length) of a Content-Range header, end exclusive, length None for `*`; None for no or
+    an invalid header."""
     match = _CONTENT_RANGE.fullmatch(header.strip()) if header else None
-    first, last, size = map(int, match.groups()) if match else (0, 0, 0)
-    return (first, last + 1, size) if first <= last < size else None
+    if match is None:
+        return None
+    first, last, size = int(match[1]), int(match[2]), None if match[3] == "*" else int(match[3])
+    return (first, last + 1, size) if first <= last and (size is None or last < size) else None
 
 
 def strong_etag(header: str | None) -> str | None:

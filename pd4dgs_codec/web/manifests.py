@@ -1,7 +1,9 @@
 """Writes DASH and HLS manifests of a package and the MP4 boxes that hold its slices.
 
-DASH carries the layers: one AdaptationSet per slice, whose Representation names the slices that it depends on. HLS has
-no dependent layers: its playlist plays the 2D video and links the JSON index, which lists the layers.
+DASH carries the layers: one AdaptationSet per slice, which names the slice before it; a slice needs all those before
+it. That is a property of our own: players take a dependencyId for a part of the same set, and naming all slices each
+time takes quadratic space. HLS has no dependent layers: its playlist plays the 2D video and links the JSON index, which
+lists the layers.
 """
 
 from __future__ import annotations
@@ -24,7 +26,8 @@ _SYNC = 0x02000000  # the sample depends on no other of its track
 _DEFAULT_BASE_IS_MOOF = 0x020000
 _CONTAINERS = {b"moov", b"trak", b"mdia", b"minf", b"stbl", b"mvex", b"moof", b"traf"}
 
-LAYER_SCHEME = "urn:pd4dgs:layer:2026"
+#: Of the properties of a set: its layer; the id of the Representation that holds the slice before.
+LAYER_SCHEME, AFTER_SCHEME = "urn:pd4dgs:layer:2026", "urn:pd4dgs:after:2026"
 SESSION_DATA_ID = "org.pd4dgs.layers"
 MIN_BUFFER_SECONDS = 1  #: time in which each bandwidth delivers the file up to the slice's end
 MAX_SECONDS = ((1 << 32) - 1) // TIMESCALE  #: the duration of a sample has 32 bits
@@ -50,20 +53,19 @@ def dash(slices: list[dict[str, Any]], seconds: float, video: Video | None = Non
     period = SubElement(root, "Period", id="0", start="PT0S")
     if video is not None:
         _video_set(period, video, video_name)
-    ids: list[str] = []
+    before = ""
     for row in slices:
         where = row["dash"]
         group = SubElement(
             period, "AdaptationSet", contentType="application", mimeType="application/mp4", codecs="mett"
         )
         SubElement(group, "SupplementalProperty", schemeIdUri=LAYER_SCHEME, value=str(row["layer"]))
+        if before:
+            SubElement(group, "SupplementalProperty", schemeIdUri=AFTER_SCHEME, value=before)
         bandwidth = min(math.ceil(8 * where["range"][1] / MIN_BUFFER_SECONDS), (1 << 32) - 1)
-        name = f"L{row['layer']}.{row['slice']}" if row["slice"] else f"L{row['layer']}"
-        representation = SubElement(group, "Representation", id=name, bandwidth=str(bandwidth))
-        if ids:
-            representation.set("dependencyId", " ".join(ids))
+        before = f"L{row['layer']}.{row['slice']}" if row["slice"] else f"L{row['layer']}"
+        representation = SubElement(group, "Representation", id=before, bandwidth=str(bandwidth))
         _segment_list(representation, where["file"], where["init"][1], seconds, [where["range"]])
-        ids.append(name)
     indent(root)
     text: bytes = tostring(root, encoding="utf-8", xml_declaration=True)
     return text + b"\n"

@@ -20,7 +20,7 @@ from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.web import PAGE
 from pd4dgs_codec.web.headers import cache_control
 from pd4dgs_codec.web.manifests import MAX_SECONDS, Video, dash, fragment, hls, hls_video, initialisation, ticks
-from pd4dgs_codec.web.page import page
+from pd4dgs_codec.web.page import Still, page
 
 SCENE, SEGMENTS, MPD, PLAYLIST, INDEX = "scene.pd4", "scene.mp4", "scene.mpd", "scene.m3u8", "index.json"
 VIDEO, VIDEO_PLAYLIST, POSTER = "fallback.mp4", "fallback.m3u8", "poster.jpg"
@@ -35,13 +35,18 @@ def presentation_seconds(low: float, high: float) -> float:
 
 
 def package(
-    data: bytes, render: Callable[[Scene], Video | None] | None = None, *, immutable: bool = False
+    data: bytes,
+    render: Callable[[Scene], Video | None] = lambda scene: None,
+    draw: Callable[[Scene], Still | None] = lambda scene: None,
+    *,
+    immutable: bool = False,
 ) -> dict[str, bytes]:
     """Returns name -> content of every file of the folder.
 
-    render: makes the 2D rendition of the decoded scene, or returns None. immutable: names of scene and media files
-    contain a digest of their content, so that caches may keep them forever. Raises DecodeError unless `data` is a
-    complete, valid `.pd4` file, and DeliveryError if it is too long or too large for MP4, both before rendering.
+    render, draw: make the 2D rendition and the page's still of the decoded scene, or return None. immutable: names of
+    scene and media files contain a digest of their content, so that caches may keep them forever. Raises DecodeError
+    unless `data` is a complete, valid `.pd4` file, and DeliveryError if it is too long or too large for MP4, both
+    before rendering.
     """
     scene = decode(data)
     about = info(data)
@@ -49,7 +54,7 @@ def package(
     if seconds > MAX_SECONDS:
         raise DeliveryError(f"found a scene of {seconds:g} s, expected at most {MAX_SECONDS:,} s for DASH")
     segments, slices = _segments(data, about, seconds)
-    video = render(scene) if render is not None else None
+    video = render(scene)
     media = {SCENE: data, SEGMENTS: segments}
     if video is not None:
         media |= {VIDEO: video.data} | ({POSTER: video.poster} if video.poster else {})
@@ -61,7 +66,7 @@ def package(
     if video is not None:
         files[VIDEO_PLAYLIST] = hls_video(video, names[VIDEO])
     files[PLAYLIST] = hls(INDEX, video, VIDEO_PLAYLIST)
-    files[PAGE] = (page(names[SCENE]) if immutable else page()).encode()
+    files[PAGE] = page(names[SCENE], draw(scene)).encode()
     index = {
         "file": names[SCENE],
         "format_version": about["format_version"],

@@ -1,13 +1,14 @@
 """The player as one HTML file: beside a scene on any web server, with the scene inside, or in a notebook.
 
 One file takes one request instead of one for each module, and browsers open it without a server. Workers of a page that
-is opened as a file cannot import modules, so each entry point is bundled into one script. In it, each module is a
-function that returns the module's exports, in the order in which a browser would run the modules.
+is opened as a file cannot import modules, so one script holds all modules, each as a function that returns its exports.
+Page and workers run that script, each from a module of its own. The page holds it compressed, behind what the first
+paint needs: a small picture of the scene, then the loader that requests the scene.
 """
 
 import base64
+import gzip
 import html
-import json
 import os
 import re
 from collections.abc import Callable
@@ -22,32 +23,39 @@ from pd4dgs_codec.web import PAGE, is_url
 #: The page's script, and the one that requests the scene while the rest of the page arrives.
 SCRIPT, EARLY = "page.js", "early.js"
 WORKERS = ("loader-worker.js", "sort-worker.js", "evaluate-worker.js")
+#: Which module a script of all entry points starts: a worker's address names it, except that of EARLY's worker.
+ENTRY = f'self.document?"{SCRIPT}":"render/"+(location.hash.slice(1)||"{WORKERS[0]}")'
 #: Encoder effort for a scene that is shown immediately.
 EFFORT = 1
 
 _WORKER_URL = re.compile(r'new URL\("\./([\w-]+-worker\.js)", import\.meta\.url\)')
 _COMMENTS = re.compile(r"/\*\*.*?\*/[ \t]*|^[ \t]*//[^\n]*|[ \t]+//[^\n\"`]*$", re.DOTALL | re.MULTILINE)
 _SPACE = re.compile(r"\s*\n\s*")
-_IMPORT = re.compile(r'^import \{([^}]*)\} from "([^"]+)";$', re.MULTILINE)
+_IMPORT = re.compile(r'^import (?:\{([^}]*)\} from )?"([^"]+)";$', re.MULTILINE)
 _REEXPORT = re.compile(r'^export \{([^}]*)\} from "([^"]+)";$', re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(?:async )?(?:const|function\*?|class) (\w+))", re.MULTILINE)
 
 
-def bundle(root: Path, entry: str) -> str:
-    """Bundles the module `entry` of the folder `root` and its imports into one script without indentation.
+def bundle(root: Path, *entries: str, start: str = "") -> str:
+    """Bundles modules of the folder `root` and their imports into one script without indentation.
 
-    Only the player's forms of import and export are supported; any other raises DeliveryError.
+    start: JavaScript expression for the entry that the script runs; default: the first. Only the player's forms of
+    import and export are supported; any other raises DeliveryError.
     """
-    modules: dict[Path, str] = {}  # imported ones first
+    modules: dict[str, str] = {}
 
     def add(path: Path) -> str:
-        """Adds a module after its imports and returns its variable."""
-        if path not in modules:
-            modules[path] = _module(path, lambda name: add((path.parent / name).resolve()))
-        return "m_" + re.sub(r"\W", "_", path.relative_to(root.resolve()).as_posix())
+        """Adds a module and its imports, and returns the expression for its exports."""
+        name = path.relative_to(root.resolve()).as_posix()
+        if name not in modules:
+            modules[name] = ""
+            modules[name] = _module(path, lambda other: add((path.parent / other).resolve()))
+        return f'take("{name}")'
 
-    add((root / entry).resolve())
-    return "".join(f"const {add(path)}=(()=>{{\n{body}}})();\n" for path, body in modules.items())
+    first = [add((root / entry).resolve()) for entry in entries][0]
+    bodies = "".join(f'"{name}"(){{\n{body}}},\n' for name, body in modules.items())
+    head = f'"use strict";\nconst modules={{\n{bodies}}};\nconst made={{}},take=(name)=>made[name]??=modules[name]();\n'
+    return f"{head}{f'take({start})' if start else first};\n"
 
 
 def _module(path: Path, imported: Callable[[str], str]) -> str:
@@ -55,7 +63,8 @@ def _module(path: Path, imported: Callable[[str], str]) -> str:
     exports: list[str] = []
 
     def take(match: re.Match[str]) -> str:
-        return f"const {{{match[1].replace(' as ', ':')}}}={imported(match[2])};"
+        names = f"const {{{match[1].replace(' as ', ':')}}}=" if match[1] else ""
+        return f"{names}{imported(match[2])};"
 
     def pass_on(match: re.Match[str]) -> str:
         exports.extend(f"{name.strip()}:{imported(match[2])}.{name.strip()}" for name in match[1].split(","))
@@ -84,38 +93,68 @@ def player_folder() -> Path:
     raise DataError(f"{package}: found no player, expected an installed package or a checkout")
 
 
-def page(source: bytes | str | None = None) -> str:
+@dataclass(frozen=True)
+class Still:
+    """The picture that a page shows until the player has drawn one. data: a WebP file that shows `reach` times the
+    width and height of the scene's camera around its picture, so that windows of other shapes are filled. aspect: width
+    of the camera's picture per height. background: CSS colour."""
+
+    data: bytes
+    reach: float
+    aspect: float
+    background: str
+
+
+#: Bytes of the code before the loader, a multiple of 3 for base64. A first slice of some 50 kB and the rest of the code
+#: share the link. The code is then complete first, and starts the player while the slice arrives: on a slow link the
+#: first picture takes as many bytes in any order, and what a processor does meanwhile is no extra time.
+AHEAD = 39_000
+#: Makes the player of the compressed code in the elements "code".
+UNPACK = """<script>
+{const held=[...document.querySelectorAll(".code")].map((part)=>part.textContent).join("");
+const code=Uint8Array.from(atob(held),(c)=>c.charCodeAt(0));
+const text=new Blob([code]).stream().pipeThrough(new DecompressionStream("gzip"));
+new Response(text,{headers:{"Content-Type":"text/javascript"}}).blob().then((blob)=>{
+globalThis.packed=URL.createObjectURL(blob);
+globalThis.early?.begin(packed);
+document.head.append(Object.assign(document.createElement("script"),{src:packed}));
+});}
+</script>
+"""
+
+
+def page(source: bytes | str | None = None, still: Still | None = None) -> str:
     """Returns the player as one HTML file.
 
     source: the bytes of a `.pd4` to embed, or its URL; None: `scene.pd4` beside the page, or the page's
-    `?src=address`.
+    `?src=address`. still: shown before any script has arrived.
     """
     root = player_folder()
-    workers = {name: bundle(root, f"render/{name}") for name in WORKERS}
-    code = _WORKER_URL.sub(r"new URL(workers['\1'])", bundle(root, SCRIPT))
-    # the first script is not a module, so that the loader begins while the browser still reads the player
-    script = f"""<script>
-const workers={_literal(workers)};
-for(const name in workers)workers[name]=URL.createObjectURL(new Blob([workers[name]],{{type:"text/javascript"}}));
-globalThis.early?.begin(workers["{WORKERS[0]}"]);
-</script>
-<script type="module">
-{code}</script>
-"""
+    code = bundle(root, SCRIPT, *(f"render/{name}" for name in WORKERS), start=ENTRY)
+    code = _WORKER_URL.sub(r"new URL(packed+'#\1')", code)
     text = re.sub(r"<!--.*?-->\s*", "", (root / PAGE).read_text(encoding="utf-8"), flags=re.DOTALL)
-    head, body, _ = re.split(r'(?=<p id="note")|<script type="module".*', text, maxsplit=2)
-    early = "" if isinstance(source, bytes) else f"<script>\n{packed(root / EARLY)}</script>"
-    head = head.replace(f'<script src="./{EARLY}"></script>', early)
+    head, _, _ = re.split(r'<script src="\./early\.js"></script>\s*|<p id="note".*', text, flags=re.DOTALL)
+    early = "" if isinstance(source, bytes) else f"<script>\n{packed(root / EARLY)}</script>\n"
     if isinstance(source, str):
-        head, body = head.replace("<html ", f'<html data-src="{html.escape(source)}" ', 1), ""
-    elif source is not None:
-        body = f'<script type="text/plain" id="scene">{base64.b64encode(source).decode()}</script>\n'
-    return f"{head}{body}{script}</html>\n"
+        head = head.replace("<html ", f'<html data-src="{html.escape(source)}" ', 1)
+    if still is not None:
+        head = head.replace("</pd4-player>", f"{_img(still)}</pd4-player>", 1)
+    zipped = gzip.compress(code.encode(), 9, mtime=0)
+    parts = [_held('id="scene"', source)] if isinstance(source, bytes) else []
+    parts += [_held('class="code"', zipped[:AHEAD]), early, _held('class="code"', zipped[AHEAD:]), UNPACK]
+    return f"{head}{''.join(parts)}</html>\n"
 
 
-def _literal(value: object) -> str:
-    """Returns a JavaScript literal without `</script` and `<!--`, which would end the page's script."""
-    return json.dumps(value).replace("<", "\\u003c")
+def _held(name: str, data: bytes) -> str:
+    """An element whose text is the data in base64."""
+    return f'<script type="text/plain" {name}>{base64.b64encode(data).decode()}</script>\n'
+
+
+def _img(still: Still) -> str:
+    """The picture as large as the player draws the scene, all of its camera's picture in the window."""
+    fitted = f"width:calc({still.reach}*min(100cqw,100cqh*{still.aspect:.4f}))"
+    style = f"<style>pd4-player{{background:{still.background}}}pd4-player>img{{{fitted}}}</style>"
+    return f'{style}<img alt="" src="data:image/webp;base64,{base64.b64encode(still.data).decode()}">'
 
 
 @dataclass(frozen=True)

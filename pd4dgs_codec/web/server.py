@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import gzip
+import html
 import io
 import os
 import socket
@@ -50,6 +51,7 @@ IDLE_SECONDS = 60.0
 #: Link time of a block: shorter than the times to be measured, longer than waking a thread takes.
 QUANTUM_SECONDS = 0.005
 MIN_BLOCK, MAX_BLOCK = 64, 1 << 18
+MOST_LISTED = 1000  #: entries of a folder whose page is made here
 #: A late transfer catches up by at most this; further capacity that a slow reader leaves unused is lost.
 CATCH_UP_SECONDS = 0.05
 
@@ -132,9 +134,11 @@ class Server(ThreadingTCPServer):
 
     @property
     def url(self) -> str:
-        """Address of the folder, with a final slash."""
+        """Address of the folder, with a final slash, that this machine can open: where the server listens on all
+        addresses, the loopback one."""
         host, port = self.server_address[:2]
-        return f"http://{_authority(str(host), port)}/"
+        own = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(str(host), str(host))
+        return f"http://{_authority(own, port)}/"
 
     def is_own(self, host: str | None, origin: str | None) -> bool:
         """Whether a request names this server, and comes from its own page or from none. A foreign site can point its
@@ -178,28 +182,42 @@ def _authority(host: str, port: int) -> str:
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
-def _opened(root: Path, target: str) -> BinaryIO | None:
-    """Opens the file under `root` that a request target names; returns None for missing and hidden files, folders,
-    pipes, and paths outside `root`, which is absolute and free of links.
-
-    A target that ends in a slash names the folder's page. Links are followed if they lead to a place inside `root`.
-    """
+def _found(root: Path, target: str) -> Path | None:
+    """Returns the file or folder under `root` that a request target names; None for missing and hidden ones, and paths
+    outside `root`, which is absolute and free of links. Links are followed if they lead to a place inside `root`."""
     try:
         path = unquote(urlsplit(target).path, errors="strict")
-        names = path.split("/")[1:]
-        names[-1:] = [names[-1] or PAGE] if names else []
+        names = path.removesuffix("/").split("/")[1:]
         if not path.startswith("/") or any(n.startswith(".") or not n or "\\" in n or "\0" in n for n in names):
             return None
         found = root.joinpath(*names).resolve(strict=True)
-        if not found.is_relative_to(root):
-            return None
-        file = open(found, "rb", opener=lambda name, flags: os.open(name, flags | FILE_ITSELF))
     except (OSError, ValueError, RuntimeError):  # RuntimeError: a cycle of links, before Python 3.13
+        return None
+    inside = found.is_relative_to(root) and found.is_dir() >= path.endswith("/")
+    return found if inside else None
+
+
+def _opened(found: Path | None) -> BinaryIO | None:
+    """Opens a file; returns None for all else, such as pipes."""
+    if found is None:
+        return None
+    try:
+        file = open(found, "rb", opener=lambda name, flags: os.open(name, flags | FILE_ITSELF))
+    except OSError:
         return None
     if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
         return file
     file.close()
     return None
+
+
+def _listing(folder: Path) -> bytes:
+    """A page of links to the scenes and pages in a folder without a page; empty if there are none."""
+    places = (path / PAGE if (path / PAGE).is_file() else path for path in sorted(folder.iterdir())[:MOST_LISTED])
+    shown = [path.relative_to(folder).as_posix() for path in places if path.suffix in (".pd4", ".html")]
+    links = (f'<li><a href="./{quote(n)}">{html.escape(printable(n, ""))}</a>' for n in shown if not n.startswith("."))
+    head = '<!doctype html><html lang="en"><meta charset="utf-8"><title>Scenes</title>'
+    return f"{head}<h1>Scenes</h1><ul>{''.join(links)}</ul>\n".encode() if shown else b""
 
 
 def _etag(file: BinaryIO) -> str:
@@ -255,12 +273,21 @@ class _Handler(BaseHTTPRequestHandler):
     do_POST = do_PUT = do_PATCH = do_DELETE = _refuse
 
     def do_GET(self) -> None:
-        file = _opened(self.server.root, self.path)
-        if file is None:
-            self._fail(HTTPStatus.NOT_FOUND)
+        found = _found(self.server.root, self.path)
+        is_folder = found is not None and found.is_dir()
+        place = urlsplit(self.path if is_folder else "")
+        if is_folder and not place.path.endswith("/"):
+            query = f"?{place.query}" if place.query else ""
+            self._begin(HTTPStatus.FOUND, {"Location": f"{place.path}/{query}", "Content-Length": "0"})
             return
-        with file:
-            self._send_file(file)
+        file = _opened(_found(self.server.root, place.path + PAGE) if is_folder else found)
+        if file is not None:
+            with file:
+                self._send_file(file)
+        elif found is not None and is_folder and not self.server.private and (text := _listing(found)):
+            self._answer(HTTPStatus.OK, text, {"Content-Type": media_type(PAGE)})
+        else:
+            self._fail(HTTPStatus.NOT_FOUND)
 
     do_HEAD = do_GET
 
@@ -312,9 +339,11 @@ class _Handler(BaseHTTPRequestHandler):
                 left -= len(block)
 
     def _fail(self, status: HTTPStatus, headers: dict[str, str] | None = None) -> None:
-        text = f"{status.value} {status.phrase}\n".encode()
-        kind = {"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(text))}
-        self._begin(status, {**(headers or {}), **kind})
+        kind = {"Content-Type": "text/plain; charset=utf-8"}
+        self._answer(status, f"{status.value} {status.phrase}\n".encode(), {**(headers or {}), **kind})
+
+    def _answer(self, status: HTTPStatus, text: bytes, headers: dict[str, str]) -> None:
+        self._begin(status, {**headers, "Content-Length": str(len(text))})
         if self.command != "HEAD":
             self.wfile.write(text)
 

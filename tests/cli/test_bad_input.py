@@ -132,7 +132,7 @@ CASES = [
     (1, "view empty --no-browser", "empty: found no .pd4 file in this folder"),
     (1, "view . --no-browser", "cut.pd4: "),
     *((2, f"serve empty --port {port}", "--port") for port in (65536, -1)),
-    *((2, f"serve empty --rate {rate}", "--rate") for rate in ("2X", "0", "nan")),
+    *((2, f"serve empty --rate {rate}", "--rate") for rate in ("2X", "0", "nan", "2")),
     (2, "serve empty --latency -1ms", "--latency"),
     (2, "serve empty --host ''", "--host"),
     (1, "serve empty --host 203.0.113.77 --port 0", "cannot listen"),

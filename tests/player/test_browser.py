@@ -37,6 +37,7 @@ from browser import (
     wait_for_level,
 )
 from pictures import Rasterised, cameras, decibels, resized, shots
+from PIL import Image
 from strategies import flipped, make_scene
 from tiny import random_deformation, random_network
 
@@ -873,6 +874,34 @@ def test_the_scene_is_asked_for_while_the_page_arrives(page, folder, small):
         wait_for_level(page, 2)
     arrived = page.evaluate("performance.timeOrigin + performance.getEntriesByType('navigation')[0].responseEnd")
     assert len(asked) == 1 and asked[0] < arrived / 1000
+
+
+def test_a_page_shows_its_scene_before_any_script(browser, lively, tmp_path):
+    """What the player then draws is the same picture in the same place, also beside what the camera saw."""
+    window = (520, 300)
+    (tmp_path / "scene.pd4").write_bytes(lively)
+    done = subprocess.run(
+        [sys.executable, "-m", "pd4dgs_codec", "package", tmp_path / "scene.pd4", "-o", tmp_path / "out", "--no-video"],
+        capture_output=True, text=True, timeout=280,
+    )  # fmt: skip
+    assert done.returncode == 0 and "no picture" not in done.stderr, done.stderr
+    shown = {}
+    with Server(tmp_path / "out") as server, server.running():
+        for scripts in (False, True):
+            size = {"width": window[0], "height": window[1]}
+            context = browser.new_context(viewport=size, java_script_enabled=scripts)
+            page = context.new_page()
+            page.set_default_timeout(TIMEOUT_MS)
+            page.goto(f"{server.url}?controls=0&autoplay=0")
+            if scripts:
+                wait_for_level(page, 2)
+                page.evaluate(f"{ELEMENT}.player.settled()")
+            shown[scripts] = screenshot(page) / 255
+            context.close()
+    smaller = np.array(Image.fromarray((255 * shown[False]).astype(np.uint8)).resize((window[0] * 9 // 10, window[1])))
+    moved = np.pad(smaller / 255, ((0, 0), (0, window[0] - smaller.shape[1]), (0, 0)), mode="edge")
+    there, elsewhere = decibels(shown[True], shown[False]), decibels(shown[True], moved)
+    assert there > 20 and there > elsewhere + 3, (there, elsewhere)
 
 
 @pytest.mark.parametrize("place", ["notebook", "file"])

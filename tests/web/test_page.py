@@ -1,5 +1,7 @@
 """The one-file page: it needs nothing else, and a notebook gets it in a frame."""
 
+import base64
+import gzip
 import html
 import re
 import shutil
@@ -13,8 +15,15 @@ from pd4dgs_codec.errors import DataError, DecodeError, DeliveryError
 from pd4dgs_codec.web import page
 
 
+def code_of(text: str) -> str:
+    """The player's code in a page."""
+    parts = re.findall(r'class="code">([^<]*)<', text)
+    return gzip.decompress(b"".join(map(base64.b64decode, parts))).decode()
+
+
 def test_a_page_asks_for_nothing_but_a_scene():
     text = page.page()
+    text += code_of(text)
     asked = re.findall(r'(?:\b(?:import|from)|URL\(|import\() ?"([^"]+)"', text) + re.findall(
         r' (?:src|href)="([^"]+)"', text
     )
@@ -26,13 +35,22 @@ def test_a_notebook_gets_a_frame_that_holds_everything(tmp_path):
     data = encode(scene, effort=1)
     (tmp_path / "scene.pd4").write_bytes(data)
     pages = [show(given).page for given in (data, tmp_path / "scene.pd4", str(tmp_path / "scene.pd4"), scene)]
-    assert pages[0] == pages[1] == pages[2] and "import.meta" not in pages[0]
-    assert len(re.findall("</script", pages[0])) == 3  # scene, workers and player
+    assert pages[0] == pages[1] == pages[2] and "import.meta" not in code_of(pages[0])
+    assert len(re.findall("</script", pages[0])) == 4  # scene, code in two parts, what unpacks it
     frame = show(data, width='50%" x="', height=200)._repr_html_()
     (source,) = re.findall(r'srcdoc="([^"]*)"', frame)
     assert html.unescape(source) == pages[0] and "height:200px" in frame and 'x="' not in frame
     remote = show('https://example.org/a.pd4?b=">').page
     assert 'data-src="https://example.org/a.pd4?b=&quot;&gt;"' in remote and len(remote) < len(pages[0])
+
+
+def test_a_page_begins_with_its_picture():
+    """Then comes the loader, and the player without what it says twice: 204 kB once."""
+    text = page.page("a.pd4", page.Still(b"RIFF" + bytes(2900), 1.8, 4 / 3, "rgb(1,2,3)"))
+    picture, loader, last = text.index("</pd4-player>"), text.index("new Worker("), text.rindex('class="code"')
+    assert picture < 6000 and picture < loader < last and len(text) < 84_000 and "background:rgb(1,2,3)" in text
+    code = code_of(text)
+    assert len(re.findall(r"^class DecodeError", code, re.MULTILINE)) == 1
 
 
 @pytest.mark.parametrize("cut", [0, 100, -1])

@@ -5,6 +5,7 @@ import gzip
 import http.client
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -113,7 +114,7 @@ def test_other_methods_are_refused(server, method):
     [
         *("/../secret.txt", "/%2e%2e/secret.txt", "/..%2fsecret.txt", "/%2E%2E%2Fsecret.txt", "/sub/../../secret.txt"),
         *("/sub/%2e%2e/%2e%2e/secret.txt", "/..\\secret.txt", "//secret.txt", "/%00", "/bytes.bin%00.txt", "/%ff"),
-        *("/out.txt", "/outside/secret.txt", "/loop", "/.hidden", "/pipe", "/sub", "/", "/bytes.bin/", "/%5b"),
+        *("/out.txt", "/outside/secret.txt", "/loop", "/.hidden", "/pipe", "/sub/", "/bytes.bin/", "/%5b"),
         *("http://[/bytes.bin", "*"),
     ],
 )
@@ -135,6 +136,43 @@ def test_a_folder_shows_its_page(server, folder):
         (place / "index.html").write_text(f"page of {place.name}")
     assert ask(server, "/").body == b"page of www" and ask(server, "/sub/?level=1").body == b"page of sub"
     assert ask(server, "/").headers["Content-Type"].startswith("text/html")
+
+
+def test_the_name_of_a_folder_leads_to_its_page(server, folder):
+    (folder / "a b").mkdir()
+    (folder / "a b" / "index.html").write_text("page")
+    for query in ("", "?level=1&x=%2F"):
+        answer = ask(server, f"/a%20b{query}")
+        assert answer.status == 302 and answer.headers["Location"] == f"/a%20b/{query}"
+    assert ask(server, "/a%20b/").body == b"page"
+    for target in ("//a%20b", "//evil.example/..", "/..", "/missing", "http://evil.example"):
+        assert ask(server, target).headers["Location"] in (None, "/a%20b/")
+
+
+def test_a_folder_without_a_page_names_its_scenes(server, folder):
+    (folder / "<b>&.pd4").write_bytes(b"")
+    (folder / ".hidden.pd4").write_bytes(b"")
+    for name in ("packed", "empty", "scenes"):
+        (folder / name).mkdir()
+    (folder / "packed" / "index.html").write_text("page")
+    answer = ask(server, "/")
+    assert answer.status == 200 and answer.headers["Content-Type"].startswith("text/html")
+    links = re.findall(r'href="([^"]*)">([^<]*)<', answer.body.decode())
+    assert links == [("./%3Cb%3E%26.pd4", "&lt;b&gt;&amp;.pd4"), ("./packed/index.html", "packed/index.html"),
+                     ("./scene.pd4", "scene.pd4")]  # fmt: skip
+    assert ask(server, "/", "HEAD").body == b"" and ask(server, "/empty/").status == 404
+
+
+@pytest.mark.parametrize(("host", "shown"), [("0.0.0.0", "127.0.0.1"), ("::", "[::1]")])
+def test_the_address_that_is_told_can_be_opened(folder, host, shown):
+    try:
+        server = Server(folder, host)
+    except DeliveryError:
+        pytest.skip(f"no network with {host}")
+    with server, server.running():
+        assert server.url == f"http://{shown}:{server.server_address[1]}/"
+        with urllib.request.urlopen(server.url + "bytes.bin", timeout=10) as response:
+            assert response.read() == CONTENT
 
 
 def test_pages_and_scripts_are_compressed_for_who_takes_that(server, folder):
