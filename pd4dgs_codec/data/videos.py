@@ -23,7 +23,7 @@ from typing import IO, Any
 import numpy as np
 
 from pd4dgs_codec.data.files import check_downscale, check_pixels, check_regular, shrink_image, shrink_mask
-from pd4dgs_codec.data.view import Dataset, UnreadView, View, geometry, rectify, without_first_camera
+from pd4dgs_codec.data.view import Dataset, Origin, UnreadView, View, geometry, rectify, without_first_camera
 from pd4dgs_codec.errors import DamageWarning, DataError, one_line
 from pd4dgs_codec.io import temporary_folder
 
@@ -292,13 +292,14 @@ def synchronised_dataset(
     folder: Path,
     cameras: Sequence[UnreadView],
     points: np.ndarray | None,
+    source: str,
     downscale: int,
     holdout: int,
     depth: tuple[float, float] | None = None,
 ) -> Dataset:
     """The dataset of fixed cameras, each with its video as `image`.
 
-    The first camera is held out, unless holdout is 0. depth: near and far, if known.
+    source: of the points. The first camera is held out, unless holdout is 0. depth: near and far, if known.
     """
     views: list[StoredView] = []
     count, fps = 0, 0.0
@@ -320,6 +321,7 @@ def synchronised_dataset(
         test=tuple(test),
         background=(0.0, 0.0, 0.0),
         time_range=(0.0, (count - 1) / fps if count > 1 else 1.0),
+        origin=Origin(f"the videos, {fps:g} a second", points=source, posed=f"{len(cameras)} videos with a pose"),
         **geometry(cameras, points, depth),
     )
 

@@ -54,7 +54,7 @@ def test_views_without_a_valid_pixel_are_left_out(blender):
     change_frames(folder, lambda i: BLIND if i in (1, 4) else {})
     dataset = load(folder)
     assert dataset.left_out == ("r_001", "r_004") and [len(dataset.train), len(dataset.test)] == [7, 0]
-    assert dataset.remarks() == ["2 of 9 views left out, no valid pixel in the mask: r_001, r_004"]
+    assert dataset.remarks() == ["views left out, no valid pixel in the mask (2): r_001, r_004"]
     assert dataset.train[1].time == pytest.approx(2 / 8)  # the others keep their instants
 
 
