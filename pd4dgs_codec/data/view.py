@@ -2,7 +2,7 @@
 lens distortion; for all readers, a dataset of frames: split, times, scene box, depth range and background."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -48,6 +48,7 @@ BOX_OVER_DISTANCE = 1.3 / 4.0
 BORDER_SHARE, BORDER_LEVELS = 0.99, 3
 #: A lens is scaled to a picture that is larger or smaller by this share; one that is cropped a little is refused.
 RESIZED = 0.1
+BAND_PIXELS = 1 << 18  #: resampled at once, some 100 bytes each
 USES = 4  #: of a picture at most, such as for training and for testing
 #: Views whose pixels count in a fingerprint, evenly spread, and the step between such pixels in lines and columns.
 SAMPLED, STEP = 16, 16
@@ -303,27 +304,44 @@ def _turning_point(k: Sequence[float]) -> float:
     return float(np.sqrt(real.min(initial=np.inf)))
 
 
-@lru_cache(maxsize=8)
-def _warp(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(u, v float64 [H, W], the place of each ideal pinhole pixel in the stored image; bool [H, W]: it is valid)."""
-    u, v = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
-    x, y = (u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy
-    with np.errstate(all="ignore"):
-        xd, yd, single = distort(x, y, lens)
-    u, v = lens.fx * xd + lens.skew * yd + lens.cx, lens.fy * yd + lens.cy
-    inside = (u >= 0.5) & (v >= 0.5) & (u <= lens.width - 0.5) & (v <= lens.height - 0.5)
-    return u, v, single & inside
+@lru_cache(maxsize=1)
+def _warp(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
+    """(u, v) float32 [H, W]: the place of each ideal pinhole pixel in the stored image, u -1 where it shows none."""
+    places = np.empty((2, lens.height, lens.width), np.float32)
+    columns = np.arange(lens.width) + 0.5
+    for rows in _bands(lens, 1):
+        u, v = np.meshgrid(columns, np.arange(rows.start, rows.stop) + 0.5)
+        x, y = (u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy
+        with np.errstate(all="ignore"):
+            xd, yd, single = distort(x, y, lens)
+            u, v = lens.fx * xd + lens.skew * yd + lens.cx, lens.fy * yd + lens.cy
+            inside = (u >= 0.5) & (v >= 0.5) & (u <= lens.width - 0.5) & (v <= lens.height - 0.5)
+            places[:, rows] = np.where(single & inside, (u, v), -1)
+    return places[0], places[1]
 
 
-def rectify(image: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
-    """(uint8 [H, W, 3] resampled bilinearly to the ideal pinhole; bool [H, W]: False for unseen pixels, black)."""
-    u, v, seen = _warp(lens)
-    fu, fv = np.where(seen, u, 0.5) - 0.5, np.where(seen, v, 0.5) - 0.5
-    u0, v0 = np.minimum(fu.astype(int), lens.width - 2), np.minimum(fv.astype(int), lens.height - 2)
-    a, b = (fu - u0)[..., None], (fv - v0)[..., None]
-    top = image[v0, u0] * (1 - a) + image[v0, u0 + 1] * a
-    bottom = image[v0 + 1, u0] * (1 - a) + image[v0 + 1, u0 + 1] * a
-    return np.where(seen[..., None], top * (1 - b) + bottom * b + 0.5, 0).astype(np.uint8), seen
+def _bands(lens: Lens, k: int) -> Iterator[slice]:
+    """Bands of lines of a picture, of whole blocks of k lines, that bound what resampling it takes."""
+    step = max(1, BAND_PIXELS // (lens.width * k)) * k
+    return (slice(start, min(start + step, lens.height)) for start in range(0, lens.height, step))
+
+
+def rectify(image: np.ndarray, lens: Lens, k: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """(uint8 [H // k, W // k, 3] resampled bilinearly to the ideal pinhole, then the mean of each block of k x k; bool
+    [H // k, W // k]: False for blocks with unseen pixels, which are black)."""
+    u, v = _warp(lens)
+    pictures, masks = [], []
+    for rows in _bands(lens, k):
+        seen = u[rows] >= 0
+        fu, fv = np.where(seen, u[rows] - 0.5, 0), np.where(seen, v[rows] - 0.5, 0)
+        u0, v0 = np.minimum(fu.astype(int), lens.width - 2), np.minimum(fv.astype(int), lens.height - 2)
+        a, b = (fu - u0)[..., None], (fv - v0)[..., None]
+        top = image[v0, u0] * (1 - a) + image[v0, u0 + 1] * a
+        bottom = image[v0 + 1, u0] * (1 - a) + image[v0 + 1, u0 + 1] * a
+        whole = np.where(seen[..., None], top * (1 - b) + bottom * b + 0.5, 0).astype(np.uint8)
+        pictures.append(shrink_image(whole, k))
+        masks.append(shrink_mask(seen, k))
+    return np.concatenate(pictures), np.concatenate(masks)
 
 
 def shrunk_view(view: View, k: int) -> View:
@@ -344,11 +362,11 @@ def read_view(frame: UnreadView, time: float, downscale: int, under: Color | Non
         mask = None if frame.mask is None else read_mask(frame.mask, size, downscale=downscale)
     else:
         check_downscale(size, downscale, str(frame.image))
-        image, seen = rectify(read_image(frame.image, size, under=under), lens)
+        image, mask = rectify(read_image(frame.image, size, under=under), lens, downscale)
         if frame.mask is not None:
             valid = np.where(read_mask(frame.mask, size), 255, 0)[..., None].astype(np.uint8)
-            seen = seen & (rectify(valid, lens)[0][..., 0] == 255)  # all pixels between which a place lies
-        image, mask = shrink_image(image, downscale), shrink_mask(seen, downscale)
+            whole = rectify(valid, lens)[0][..., 0] == 255  # all pixels between which a place lies
+            mask &= shrink_mask(whole, downscale)
     height, width = image.shape[:2]
     viewmat = frame.viewmat.astype(np.float32)
     return View(viewmat, lens.matrix(downscale), width, height, time, image, mask, frame.name, frame.camera_id)
