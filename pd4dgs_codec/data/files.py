@@ -39,7 +39,8 @@ LOSSY = ("JPEG", "MPO", "WEBP")  #: formats whose black may come back as dark gr
 GREY16_MODES = {"I;16", "I;16L", "I;16B"}
 READABLE_MODES = {"1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX"} | GREY16_MODES
 ORIENTATION, UPRIGHT = 0x0112, 1  #: EXIF's orientation tag, and its value for pixels stored upright
-TURNS = {5: 5, 6: 4, 7: 6, 8: 2}  #: its values that swap width and height, as Pillow's `Transpose`
+TURNS = {2: 0, 3: 3, 4: 1, 5: 5, 6: 4, 7: 6, 8: 2}  #: its other values as Pillow's `Transpose`
+SWAPS = (5, 6, 7, 8)  #: those that swap width and height
 TILE_WIDTH, TILE_LENGTH = 322, 323  #: TIFF's tags
 GAMMA = (0.40, 0.51)  #: exponents that PNG files give for sRGB: 1/2.2 as encoders round it
 
@@ -296,10 +297,19 @@ def _open(path: Path) -> Picture:
     return picture
 
 
-def image_info(path: Path) -> tuple[int, int, bool]:
-    """Width, height and whether there is an alpha channel, from the file's header."""
+def image_info(path: Path, *, upright: bool = False) -> tuple[int, int, bool]:
+    """Width, height and whether there is an alpha channel, from the file's header. upright: turned as EXIF says."""
     with _open(path) as image:
-        return image.width, image.height, _has_alpha(image)
+        swapped = upright and _turn(image) in SWAPS
+        return (*(image.size[::-1] if swapped else image.size), _has_alpha(image))
+
+
+def _turn(image: Picture) -> int:
+    """EXIF's orientation, UPRIGHT if it has none that is valid."""
+    with contextlib.suppress(Exception):  # Pillow raises many kinds
+        flag = image.getexif().get(ORIENTATION, UPRIGHT)
+        return flag if flag in TURNS else UPRIGHT
+    return UPRIGHT
 
 
 def _has_alpha(image: Picture) -> bool:
@@ -357,23 +367,25 @@ def _rgb(image: Picture, where: str, under: Color | None) -> Picture:
     return image.convert("RGB")
 
 
-def read_image(path: Path, size: tuple[int, int], *, downscale: int = 1, under: Color | None = WHITE) -> np.ndarray:
+def read_image(
+    path: Path, size: tuple[int, int], *, downscale: int = 1, under: Color | None = WHITE, upright: bool = False
+) -> np.ndarray:
     """uint8 [H // downscale, W // downscale, 3], the mean of each block; the file must measure `size` = (W, H).
 
     under: RGB 0..1 on which a transparent image is laid; None drops its alpha (photographs). A picture whose EXIF data
-    say to turn it is turned only if `size` is that of the turned one.
+    say to turn it is turned only if `size` is that of the turned one, or with `upright`.
     """
     from PIL import Image
 
     with _open(path) as image:
         check_downscale(size, downscale, str(path))
         try:
-            flag = image.getexif().get(ORIENTATION, UPRIGHT)
-            if image.size != size and not (flag in TURNS and image.size == size[::-1]):
+            flag, stored = _turn(image), image.size == size
+            if not stored and not (flag in SWAPS and image.size == size[::-1]):
                 found = f"is {image.width}x{image.height}, expected {size[0]}x{size[1]}"
                 raise DataError(f"{path}: image {found} as the camera has; correct one of them")
             rgb = _rgb(image, str(path), under)
-            if flag != UPRIGHT and image.size == size:  # COLMAP, too, takes the pixels as they are stored
+            if flag != UPRIGHT and stored and not upright:  # COLMAP, too, takes the pixels as they are stored
                 note("not turned as EXIF says, since the camera has the stored size", path.name)
             elif flag != UPRIGHT:
                 rgb = rgb.transpose(Image.Transpose(TURNS[flag]))

@@ -24,15 +24,10 @@ from typing import IO, Any
 
 import numpy as np
 
-try:
-    import fcntl
-except ImportError:  # on Windows, where an open file cannot be removed
-    fcntl = None  # type: ignore[assignment]
-
 from pd4dgs_codec.data.files import check_downscale, check_pixels, check_regular, shrink_image
 from pd4dgs_codec.data.view import Dataset, Origin, UnreadView, View, geometry, rectify, without_first_camera
 from pd4dgs_codec.errors import DamageWarning, DataError, one_line
-from pd4dgs_codec.io import PREFIX, temporary_folder
+from pd4dgs_codec.io import PREFIX, lock, temporary_folder
 
 #: ffmpeg's readers of videos that are one file; others open further files, such as a playlist's, or draw pictures.
 CONTAINERS = "mov,matroska,avi,mpegts,mpeg,asf,flv"
@@ -249,7 +244,7 @@ def _compress(video: Video, file: Path, cache: Path, treat: Callable[[np.ndarray
     compress, limit = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress, _limit()
     offsets, shape = [0], list[int]()
     with file.open("wb") as stream:
-        _lock(stream)
+        lock(stream)
         others = _make_room(cache, file, math.inf)
         for picture in video.pictures:
             frame = np.ascontiguousarray(treat(picture))
@@ -304,17 +299,11 @@ def _removed_stale(file: Path, changed: float) -> bool:
         return False
     try:
         with file.open("rb+") as stream:
-            _lock(stream)
+            lock(stream)
     except OSError:
         return False
     shutil.rmtree(file.parent, ignore_errors=True)
     return not file.exists()
-
-
-def _lock(stream: IO[bytes]) -> None:
-    """Locks an open file until it is closed. Raises OSError if another process has locked it."""
-    if fcntl is not None:
-        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 # -- datasets ----------------------------------------------------------------------------------------------------------
