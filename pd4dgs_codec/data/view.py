@@ -48,6 +48,7 @@ BOX_OVER_DISTANCE = 1.3 / 4.0
 BORDER_SHARE, BORDER_LEVELS = 0.99, 3
 #: A lens is scaled to a picture that is larger or smaller by this share; one that is cropped a little is refused.
 RESIZED = 0.1
+NO_TERM = 1e-30  #: a distortion coefficient up to which it changes no pixel, and by which roots cannot be divided
 BAND_PIXELS = 1 << 18  #: resampled at once, some 100 bytes each
 USES = 4  #: of a picture at most, such as for training and for testing
 #: Views whose pixels count in a fingerprint, evenly spread, and the step between such pixels in lines and columns.
@@ -299,7 +300,8 @@ def _growth(r: np.ndarray, k: Sequence[float]) -> np.ndarray:
 
 def _turning_point(k: Sequence[float]) -> float:
     """The least r > 0 at which r times `_growth` stops growing; beyond it, the lens would show points twice."""
-    roots = np.roots([(2 * i + 1) * c for i, c in enumerate((1.0, *k))][::-1])  # of the derivative, by r^2
+    terms = [(2 * i + 1) * c if abs(c) > NO_TERM else 0.0 for i, c in enumerate((1.0, *k))]  # of the derivative, by r^2
+    roots = np.roots(terms[::-1])
     real = roots.real[(roots.imag == 0) & (roots.real > 0)]
     return float(np.sqrt(real.min(initial=np.inf)))
 

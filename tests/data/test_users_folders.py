@@ -217,6 +217,24 @@ def test_a_lens_is_scaled_to_smaller_pictures_and_refused_for_cropped_ones(blend
     refused(folder, "r_000.png: image is 12x8, expected 13x8 as the camera has; correct one of them")
 
 
+@pytest.mark.parametrize("lens", [{"k1": 1e-320}, {"k1": 1, "k3": 1e-310}, {"k1": -1e-300, "k2": 5e-324}])
+def test_coefficients_of_almost_nothing_are_none(blender, lens):
+    """Numbers that cannot be divided by."""
+    view = load(blender(n=1, fl_x=10, **lens), holdout=0).train[0]
+    np.testing.assert_allclose(view.K[0, 0], 10)
+
+
+def test_warnings_of_libraries_do_not_reach_the_terminal(blender, recwarn):
+    folder = blender(n=1)
+    (folder / "r_000.png").unlink()
+    tags = {256: 12, 257: 8, 258: 8, 259: 1, 262: 1, 273: 8, 277: 1, 278: 8, 279: 96}
+    rows = b"".join(struct.pack("<HHII", tag, 3, 2 if tag == 278 else 1, value) for tag, value in tags.items())
+    (folder / "r_000.tif").write_bytes(b"II*\0" + struct.pack("<IH", 8, len(tags)) + rows + bytes(200))
+    with pytest.warns(UserWarning, match="too many entries"):
+        Image.open(folder / "r_000.tif").load()
+    assert load(folder, holdout=0).train[0].image.shape == (8, 12, 3) and not recwarn.list
+
+
 # -- what is told ------------------------------------------------------------------------------------------------------
 
 
