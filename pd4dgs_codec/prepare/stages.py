@@ -86,40 +86,27 @@ def prepare(
     recording = open_recording(source, options.fps)
     work = output.with_name(f"{output.name}.partial")
     with _begun(work, recording, options):
-        return _prepared(work, recording, output, options, progress, overwrite, tell)
-
-
-def _prepared(
-    work: Path,
-    recording: Recording,
-    output: Path,
-    options: Options,
-    progress: Progress,
-    overwrite: bool,
-    tell: Callable[[str], None],
-) -> dict[str, Any]:
-    """The rest of `prepare`, in the folder `work`."""
-    try:
-        looks, choice, times = _frames(work, recording, options, progress)
-        cores = options.threads if options.threads > 0 else available()
-        width, height = (side // options.downscale for side in recording.size)
-        seconds = poses.estimate(len(times), (width, height), cores)
-        tell(f"the poses of {len(times)} frames take up to {max(1, round(seconds / 60))} min on {cores} cores")
-        findings = _poses(work, times, options, progress)
-        result = _finish(work, findings, looks, choice, times, recording.path)
-    except (DataError, OSError):
-        shutil.rmtree(work, ignore_errors=True)
-        raise
-    except (RuntimeError, ValueError) as error:  # of pycolmap and SQLite, on a full disk for example
-        shutil.rmtree(work, ignore_errors=True)
-        raise DataError(f"{recording.path}: COLMAP failed: {one_line(str(error), 160)}") from None
-    check_folder(output, overwrite)  # it may have appeared meanwhile
-    with held():
-        if output.exists():
-            os.chmod(work, stat.S_IMODE(output.stat().st_mode))
-            shutil.rmtree(output)
-        os.replace(work, output)
-    return result
+        try:
+            looks, choice, times = _frames(work, recording, options, progress)
+            cores = options.threads if options.threads > 0 else available()
+            width, height = (side // options.downscale for side in recording.size)
+            seconds = poses.estimate(len(times), (width, height), cores)
+            tell(f"the poses of {len(times)} frames take up to {max(1, round(seconds / 60))} min on {cores} cores")
+            findings = _poses(work, times, options, progress)
+            result = _finish(work, findings, looks, choice, times, recording.path)
+        except (DataError, OSError):
+            shutil.rmtree(work, ignore_errors=True)
+            raise
+        except (RuntimeError, ValueError) as error:  # of pycolmap and SQLite, on a full disk for example
+            shutil.rmtree(work, ignore_errors=True)
+            raise DataError(f"{recording.path}: COLMAP failed: {one_line(str(error), 160)}") from None
+        check_folder(output, overwrite)  # it may have appeared meanwhile
+        with held():
+            if output.exists():
+                os.chmod(work, stat.S_IMODE(output.stat().st_mode))
+                shutil.rmtree(output)
+            os.replace(work, output)
+        return result
 
 
 def check_folder(output: Path, overwrite: bool) -> None:
