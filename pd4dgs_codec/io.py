@@ -15,7 +15,12 @@ import stat
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
+
+try:
+    import fcntl
+except ImportError:  # on Windows, where an open file cannot be removed
+    fcntl = None  # type: ignore[assignment]
 
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.signals import held
@@ -136,6 +141,12 @@ def remove_leftovers(path: str | Path) -> None:
     for folder in target.parent.glob(f"{PREFIX}*"):
         if (folder / target.name).is_file():
             shutil.rmtree(folder, ignore_errors=True)
+
+
+def lock(stream: IO[bytes]) -> None:
+    """Locks an open file until it is closed. Raises OSError if another process has locked it."""
+    if fcntl is not None:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 def is_device(path: Path) -> bool:

@@ -7,11 +7,13 @@ the package, runs on each source. Invalid lines are reported, and the others run
 import json
 import os
 import posixpath
+import re
 import resource
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from itertools import chain, count
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -173,8 +175,16 @@ def scan(folder: str, verb: str | None) -> Iterator[dict[str, str]]:
     if not kinds or not found[kinds[0]]:
         wanted = OPS[verb].finds if verb else [suffix for op in OPS.values() for suffix in op.finds]
         raise DataError(f"{folder}: found no sources, expected {', '.join(dict.fromkeys(wanted)) or 'dataset folders'}")
+    op, taken = OPS[kinds[0]], set[str]()
     for name in found[kinds[0]]:
-        output = posixpath.join(posixpath.dirname(name), default_output(name, OPS[kinds[0]]))
+        usual = default_output(name, op)
+        whole = posixpath.basename(name) + op.suffix  # kitchen.mov beside kitchen.mp4
+        for short in chain((usual, whole), (f"{n}-{usual}" for n in count(2))):
+            output = re.sub(r"\\|\.done(?=\.json$)", "_", posixpath.join(posixpath.dirname(name), short))
+            output = "".join(c if c.isprintable() else "_" for c in output)
+            if output not in taken:
+                break
+        taken.add(output)
         yield {"source": posixpath.join(folder, name), "output": output}
 
 
@@ -252,7 +262,12 @@ def _done_once(job: Job, command: Command) -> Outcome:
     record = root.record(line.output, job.overwrite)
     inputs = {"": line.source} | {name: line.options[name] for name in OPS[job.verb].inputs if name in line.options}
     options = {name: value for name, value in line.options.items() if name not in inputs}
-    stamps = {name: place if place.startswith(SYNTHETIC) else store.stamp(place) for name, place in inputs.items()}
+    stamps = {
+        name: place
+        if place.startswith(SYNTHETIC)
+        else store.stamp(place, dataset=bool(name) or not OPS[job.verb].finds)
+        for name, place in inputs.items()
+    }
     made_of = {"op": job.verb, "options": options, "inputs": stamps, "version": __version__}
     same = record is not None and made_of.items() <= record.items()
     if record and same and root.holds(line.output, record):

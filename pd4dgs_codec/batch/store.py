@@ -15,6 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
+from pd4dgs_codec.data.dataset import READERS
 from pd4dgs_codec.errors import DataError, one_line, required
 from pd4dgs_codec.io import URI, check_source, is_device, write_bytes
 from pd4dgs_codec.web.headers import media_type
@@ -38,6 +39,8 @@ def absolute(place: str) -> str:
     from fsspec import available_protocols
     from fsspec.core import split_protocol
 
+    if place.startswith("/") or os.path.lexists(place):  # also a name with colons
+        return os.path.abspath(place)
     first, chained, _ = place.partition("::")
     scheme = split_protocol(first)[0] or (first if chained else "file")
     if scheme in ("file", "local"):
@@ -56,6 +59,8 @@ def _system(place: str) -> tuple[Any, str, bool]:
     try:
         if not _ABSOLUTE.match(place) or (URI.match(place) and not re.match("(?:file|local):|.*://", place)):
             raise ValueError("expected a path, or a URI like file:///FOLDER or s3://BUCKET/FOLDER")
+        if place.startswith("/"):  # url_to_fs would split a name with colons
+            return LocalFileSystem(), LocalFileSystem._strip_protocol(place), True
         system, path = url_to_fs(place)
     except Exception as error:  # each store has its own
         raise DataError(f"{place}: {one_line(str(error))}") from None
@@ -96,20 +101,23 @@ def names(folder: str) -> list[str]:
     return sorted(name for name in below if not any(part.startswith(".") for part in name.split("/")))
 
 
-def stamp(place: str) -> str:
-    """Returns a text that changes with a file, or any file of a folder, without reading them. Raises OSError, and
-    DataError for a pipe or a device."""
+def stamp(place: str, *, dataset: bool = False) -> str:
+    """Returns a text that changes with a file, or any file of a folder, without reading them: of a dataset's folder in
+    all its folders, of another one in itself. Raises OSError, and DataError for a pipe or a device, and for a folder on
+    this machine that is no dataset, before it looks at all its files."""
     system, path, local = _system(place)
     if local and is_device(Path(path)):
         raise DataError(f"{place}: is a pipe or a device, expected a file or a folder")
+    if dataset and local and Path(path).is_dir() and not any(each.recognises(Path(path)) for each in READERS):
+        raise DataError(f"{place}: found a folder that holds no dataset, expected one that pd4dgs-train reads")
     with _naming(place):
         entry = system.info(path)
-        found = {"": entry} if entry["type"] == "file" else system.find(path, detail=True)
+        found = {"": entry} if entry["type"] == "file" else system.find(path, None if dataset else 1, detail=True)
     rows = []
     for name, entry in sorted(found.items()):
         known = next((f"{key} {entry[key]}" for key in STAMPS if entry.get(key)), "")
         rows.append(f"{name.removeprefix(path)} {entry.get('size')} bytes {known}".strip())
-    return rows[0] if "" in found else hashlib.sha256("\n".join(rows).encode()).hexdigest()
+    return rows[0] if "" in found else hashlib.sha256(os.fsencode("\n".join(rows))).hexdigest()
 
 
 def fetch(place: str, folder: Path) -> Path:

@@ -110,7 +110,8 @@ def _train(args: argparse.Namespace, console: Console) -> int:
     config = _stored_config(args) if args.resume else _fresh_config(args)
     workers.start(device, config.views_per_step)
     first = workers.rank() == 0
-    dataset = load_source(args.source, downscale=config.downscale, holdout=config.holdout, background=config.background)
+    reading = {name: getattr(config, name) for name in ("downscale", "holdout", "background", "fps")}
+    dataset = load_source(args.source, **reading)
     trainer = Trainer(config, dataset, device)
     if args.resume:
         trainer.resume(Path(args.resume))
@@ -254,18 +255,17 @@ def _progress(args: argparse.Namespace, trainer: Trainer) -> TrainingProgress:
 
 
 def _announce(trainer: Trainer, console: Console) -> None:
-    """Prints preset, views, device and time limit of the run."""
+    """Prints preset, device and time limit of the run, and what was read."""
     from pd4dgs_codec.train import workers
 
     config, dataset = trainer.config, trainer.dataset
     limit = f", at most {config.max_seconds:g} s" if config.max_seconds else ""
-    held_out = f"{len(dataset.test)} held out" if dataset.test else "none held out"
     start = f", from step {trainer.iteration}" if trainer.iteration else ""
     several = f", {workers.count()} workers" if workers.count() > 1 else ""
     device = trainer.learner.device
-    say(f"training {config.preset} on {len(dataset.train)} views ({held_out}), {device}{several}{limit}{start}")
-    for remark in dataset.remarks():
-        say(f"note: {remark}")
+    say(f"training {config.preset} on {device}{several}{limit}{start}")
+    for line in (*dataset.summary(), *(f"note: {remark}" for remark in dataset.remarks())):
+        say(line)
     console.detail(f"{config}")
 
 

@@ -21,7 +21,9 @@ from pd4dgs_codec.data.files import (
     Color,
     array,
     find_image,
+    image_info,
     inside,
+    is_there,
     number,
     read_file,
     read_json,
@@ -32,10 +34,12 @@ from pd4dgs_codec.data.files import (
 )
 from pd4dgs_codec.data.videos import open_video, synchronised_dataset
 from pd4dgs_codec.data.view import (
+    FPS,
     LARGEST_TIME,
     OPENGL_TO_OPENCV,
     Dataset,
     Lens,
+    Origin,
     UnreadView,
     View,
     cameras_box,
@@ -44,7 +48,6 @@ from pd4dgs_codec.data.view import (
     held_out,
     points_box,
     posed_dataset,
-    seconds_range,
     without_first_camera,
     world_to_camera,
 )
@@ -159,29 +162,28 @@ def read_cameras(folder: Path) -> CameraFiles:
 def read_iphone(folder: Path, downscale: int, holdout: int, background: Color | None) -> Dataset:
     """Reads rgb/{factor}x (see `dataset.load`). The dataset's split decides, and `holdout` is ignored."""
     files = read_cameras(folder)
-    frames = [*files.train, *files.test]
-    box, depth = _box_and_depth(files, frames, folder)
-    where, (start, stop) = f"{folder / 'extra.json'}: ", (pick(f.time for f in frames) for pick in (min, max))
+    box, depth = _box_and_depth(files, [*files.train, *files.test], folder)
+    where = f"{folder / 'extra.json'}: "
     r, g, b = array(files.extra.get("background", [0.0] * 3), (3,), f"{where}background").tolist()
+    fps = FPS if files.extra.get("fps") is None else number(files.extra["fps"], f"{where}fps", positive=True)
+    counts = len(files.train) + len(files.test), sum(1 for _ in (folder / "camera").glob("*.json"))
+    origin = Origin(
+        "warp_id of metadata.json", fps, "points.npy", "{} of {} posed pictures are in the split".format(*counts)
+    )
     dataset = posed_dataset(
-        folder, files.train, files.test, files.points, downscale, depth, (r, g, b), box, composite=False
+        folder, files.train, files.test, files.points, downscale, depth, (r, g, b), box, composite=False, origin=origin
     )
     test, covisible = dataset.test, folder / "covisible" / f"{files.factor}x" / "val"
     masked = bool(test) and covisible.is_dir()
     if masked:
-        test = tuple(_covisible(v, f, covisible, downscale) for v, f in zip(test, files.test, strict=True))
-    time_range, up = (0.0, 1.0), dataset.up
-    if files.extra.get("fps") is not None:
-        fps = number(files.extra["fps"], f"{where}fps", positive=True)
-        if not stop / fps <= LARGEST_TIME:
-            found = f"{fps:g}, with which the last frame is at {stop / fps:g} s"
-            raise DataError(f"{where}fps is {found}, expected {LARGEST_TIME:.2g} s at most")
-        time_range = seconds_range(start / fps, stop / fps)
+        sizes = {frame.name: image_info(frame.image)[:2] for frame in files.test if is_there(frame.image)}
+        test = tuple(_covisible(view, sizes[view.name], covisible, downscale) for view in test)
+    up = dataset.up
     if files.extra.get("up") is not None:
         x, y, z = array(files.extra["up"], (3,), f"{where}up")
         norm = max(np.linalg.norm((x, y, z)), 1e-12)
         up = (float(x / norm), float(y / norm), float(z / norm))
-    return replace(dataset, test=test, masked=masked, time_range=time_range, up=up)
+    return replace(dataset, test=test, masked=masked, up=up)
 
 
 def _box_and_depth(
@@ -203,12 +205,12 @@ def _box_and_depth(
     return box, (near, far)
 
 
-def _covisible(view: View, frame: UnreadView, folder: Path, downscale: int) -> View:
-    """The view with its covisibility mask."""
-    path = inside(folder, f"{frame.name}.png")
+def _covisible(view: View, size: tuple[int, int], folder: Path, downscale: int) -> View:
+    """The view of a picture of `size` with its covisibility mask."""
+    path = inside(folder, f"{view.name}.png")
     if not path.is_file():
         raise DataError(f"{path}: covisibility mask is missing, but its folder has others")
-    mask = read_mask(path, (frame.lens.width, frame.lens.height), downscale=downscale)
+    mask = read_mask(path, size, downscale=downscale)
     return replace(view, mask=mask if view.mask is None else mask & view.mask)
 
 
@@ -238,7 +240,10 @@ def read_record3d(folder: Path, downscale: int, holdout: int, background: Color 
         rotation = checked_rotation(pose[[3, 0, 1, 2]], f"{path}: pose {i}")
         viewmat = world_to_camera(OPENGL_TO_OPENCV @ rotation.T, pose[4:])
         frames.append(UnreadView(str(i), 0, time, viewmat, lens, find_image(pictures, str(i))))
-    return posed_dataset(folder, *held_out(frames, holdout), None, downscale, background=background)
+    source = "frameTimestamps" if meta.get("frameTimestamps") is not None else "the frame rate in the metadata"
+    return posed_dataset(
+        folder, *held_out(frames, holdout), None, downscale, background=background, origin=Origin(source)
+    )
 
 
 def _record3d_lenses(meta: dict[str, object], size: tuple[int, int], count: int, path: Path) -> list[Lens]:
@@ -284,7 +289,8 @@ def read_neu3d(folder: Path, downscale: int, holdout: int, background: Color | N
     pairs = enumerate(zip(videos, poses, strict=True))
     cameras = [_neu3d_camera(row, i, open_video(video).size, video) for i, (video, row) in pairs]
     near, far = 0.5 * float(poses[:, 15].min()), float(poses[:, 16].max())
-    return synchronised_dataset(folder, cameras, read_only_ply(folder), downscale, holdout, (near, far))
+    points = read_only_ply(folder)
+    return synchronised_dataset(folder, cameras, points, "the PLY file", downscale, holdout, (near, far))
 
 
 def _poses(path: Path) -> np.ndarray:
@@ -313,8 +319,6 @@ def _neu3d_camera(row: np.ndarray, i: int, size: tuple[int, int], video: Path) -
 
 # -- Panoptic Studio ---------------------------------------------------------------------------------------------------
 
-FPS = 30.0
-
 
 def read_panoptic(folder: Path, downscale: int, holdout: int, background: Color | None) -> Dataset:
     """Reads Panoptic Studio in the layout of Dynamic 3D Gaussians (see `dataset.load`).
@@ -329,7 +333,8 @@ def read_panoptic(folder: Path, downscale: int, holdout: int, background: Color 
     else:
         train, test = without_first_camera(folder, train, holdout)
     points = _panoptic_points(folder / "init_pt_cld.npz")
-    return posed_dataset(folder, train, test, points, downscale, background=background)
+    origin = Origin("the instants of the meta files", FPS, "init_pt_cld.npz")
+    return posed_dataset(folder, train, test, points, downscale, background=background, origin=origin)
 
 
 def _panoptic_frames(path: Path) -> list[UnreadView]:
@@ -351,7 +356,7 @@ def _panoptic_frames(path: Path) -> list[UnreadView]:
             viewmat = world_to_camera(pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3])
             camera, image = whole_number(key, f"{where}: cam_id"), find_image(path.parent / "ims", name)
             stem = str(Path(name).with_suffix("")).replace("/", "_")
-            frames.append(UnreadView(stem, camera, t / FPS, viewmat, lens, image))
+            frames.append(UnreadView(stem, camera, float(t), viewmat, lens, image))
     return frames
 
 

@@ -2,13 +2,15 @@
 
 Poses are world to camera with OpenCV axes, pixel centres at +0.5. Pictures are in `images/`, else in the folder itself;
 videos, named as the pictures of the model (`cam00.png` and `cam00.mp4`), in `videos/`, else in the folder itself.
-Times come from `times.txt`, with a line `NAME SECONDS` per picture, else from the last number in each name, else from
-the order of the names.
+Times come from `times.txt`, with a line `NAME SECONDS` per picture, else from the names. `masks/` may hold a mask per
+picture, black where pixels are not valid: `NAME.png` for the picture NAME, as COLMAP has it, or the same name.
 """
 
+from __future__ import annotations
+
+import os
 import struct
 from collections.abc import Iterator
-from contextlib import suppress
 from dataclasses import replace
 from itertools import dropwhile, islice
 from pathlib import Path
@@ -17,16 +19,31 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.data.dataset import COLMAP
-from pd4dgs_codec.data.files import LARGEST, Color, files_of, inside, last_numbers, number, read_file, whole_number
+from pd4dgs_codec.data.files import (
+    LARGEST,
+    PICTURES,
+    Color,
+    files_of,
+    find_image,
+    inside,
+    is_there,
+    note,
+    number,
+    read_file,
+    similar,
+    whole_number,
+)
 from pd4dgs_codec.data.videos import open_video, synchronised_dataset
 from pd4dgs_codec.data.view import (
     LARGEST_TIME,
     Dataset,
     Lens,
+    Origin,
     UnreadView,
     checked_rotation,
     held_out,
     posed_dataset,
+    present,
     world_to_camera,
 )
 from pd4dgs_codec.errors import DataError
@@ -50,22 +67,56 @@ Image = tuple[str, int, list[float]]
 
 def read_colmap(folder: Path, downscale: int, holdout: int, background: Color | None) -> Dataset:
     """Reads a folder with a COLMAP model (see `dataset.load`). With videos, the first camera is held out."""
-    places = ((folder / place, kind) for place in COLMAP for kind in (".bin", ".txt"))
-    model, kind = next((p, k) for p, k in places if all((p / f"{n}{k}").exists() for n in ("cameras", "images")))
+    model, kind = _largest(folder)
     cameras, points = _registered(model, kind)
+    source = str((model / f"points3D{kind}").relative_to(folder))
     if videos := _videos(folder):
-        return synchronised_dataset(folder, _rig(model, cameras, videos), points, downscale, holdout)
+        return synchronised_dataset(folder, _rig(model, cameras, videos), points, source, downscale, holdout)
     pictures = folder / "images" if (folder / "images").is_dir() else folder
     times = _times(folder, [camera.name for camera in cameras])
     frames = []
     for camera, time in zip(cameras, times, strict=True):
-        path = inside(pictures, camera.name)
-        with suppress(OSError):  # a name too long for the system
-            if path.is_file():
-                frames.append(replace(camera, name=camera.image.stem, time=time, image=path))
-                continue
-        raise DataError(f"{model / f'images{kind}'}: {camera.name}: there is no such picture in {pictures}")
-    return posed_dataset(folder, *held_out(frames, holdout), points, downscale, background=background)
+        image = find_image(pictures, camera.name)
+        mask = _mask(folder / "masks", camera.name)
+        frames.append(replace(camera, name=camera.image.stem, time=time, image=image, mask=mask))
+    posed = {frame.image for frame in frames if is_there(frame.image)}
+    places = pictures.rglob("*") if pictures != folder else (p for f in {i.parent for i in posed} for p in f.iterdir())
+    found = sum(1 for path in places if path.suffix.lower() in PICTURES and not path.name.startswith("."))
+    origin = Origin(
+        "times.txt", None, source, f"{len(posed)} of {found} pictures have a pose in {model.relative_to(folder)}"
+    )
+    return posed_dataset(
+        folder, *held_out(present(folder, frames), holdout), points, downscale, background=background, origin=origin
+    )
+
+
+def _largest(folder: Path) -> tuple[Path, str]:
+    """The model with the most registered pictures, and the suffix of its files. COLMAP numbers models in the order in
+    which it made them, and the first may hold three pictures."""
+    models = {}
+    for pattern in COLMAP:
+        for kind in (".txt", ".bin"):  # the binary one if both are there
+            for cameras in sorted(folder.glob(f"{pattern}/cameras{kind}")):
+                if cameras.with_name(f"images{kind}").exists():
+                    models[cameras.parent] = kind
+    if len(models) == 1:
+        return next(iter(models.items()))
+    counts = {place: sum(1 for _ in _reader(kind)(place / f"images{kind}").images()) for place, kind in models.items()}
+    model = max(counts, key=lambda place: counts[place])
+    others = [f"{place.relative_to(folder)} with {count} pictures" for place, count in counts.items() if place != model]
+    note(f"models besides {model.relative_to(folder)}, which has the most pictures", ", ".join(others))
+    return model, models[model]
+
+
+def _mask(folder: Path, name: str) -> Path | None:
+    """The mask of a picture: NAME.png as COLMAP has it, else a picture of the same name."""
+    if not folder.is_dir():
+        return None
+    inside(folder, name)
+    found = similar(folder, f"{name}.png") or similar(folder, name)
+    if found is None:
+        note("pictures without a mask in masks/", name)
+    return found
 
 
 def _videos(folder: Path) -> dict[str, Path]:
@@ -99,7 +150,7 @@ def _rig(model: Path, cameras: list[UnreadView], videos: dict[str, Path]) -> lis
 def _registered(model: Path, kind: str) -> tuple[list[UnreadView], np.ndarray | None]:
     """(the pictures of a model, sorted by name, with that name as `image` and time 0; points float32 [M, 3], or
     None)."""
-    read = _Binary if kind == ".bin" else _Text
+    read = _reader(kind)
     lenses = dict(read(model / f"cameras{kind}").cameras())
     images = sorted(read(model / f"images{kind}").images())
     if not images:
@@ -119,13 +170,17 @@ def _registered(model: Path, kind: str) -> tuple[list[UnreadView], np.ndarray | 
     return frames, points[(np.abs(points) <= LARGEST).all(axis=1)].astype(np.float32)  # also false of NaN
 
 
-def _times(folder: Path, names: list[str]) -> list[float]:
-    """The time of each picture: from times.txt, else the last number in its name, else its index."""
+def _reader(kind: str) -> type[_Binary] | type[_Text]:
+    return _Binary if kind == ".bin" else _Text
+
+
+def _times(folder: Path, names: list[str]) -> list[float] | list[None]:
+    """The time of each picture from times.txt; None without this file."""
     path = folder / "times.txt"
     if not path.is_file():
-        return [float(n) for n in last_numbers(map(Path, names)) or range(len(names))]
+        return [None] * len(names)
     known: dict[str, float] = {}
-    for i, line in enumerate(map(str.strip, read_file(path).decode("utf-8", "replace").splitlines()), 1):
+    for i, line in enumerate(map(str.strip, os.fsdecode(read_file(path)).splitlines()), 1):
         name, _, text = line.rpartition(" ")
         try:
             if line:
@@ -174,7 +229,7 @@ class _Binary:
             end = self.data.find(b"\0", self.at)
             if end < 0:
                 raise DataError(f"{self.path}: ends at byte {len(self.data)}, in the middle of a name")
-            name = self.data[self.at : end].decode("utf-8", "replace")
+            name = os.fsdecode(self.data[self.at : end])  # as the file system has it
             self.at = end + 1
             self._skip(24 * self._take("Q")[0])
             yield name, camera, pose
@@ -203,7 +258,7 @@ class _Text:
 
     def __init__(self, path: Path):
         self.path = path
-        self.raw = read_file(path).decode("utf-8", "replace").splitlines()
+        self.raw = os.fsdecode(read_file(path)).splitlines()
 
     @property
     def lines(self) -> Iterator[tuple[int, str]]:

@@ -42,8 +42,8 @@ class Reader:
         return any(all(any(folder.glob(mark)) for mark in marks) for marks in self.marks)
 
 
-#: The places of a COLMAP model in a folder, in the order of the search.
-COLMAP = ("sparse/0", "sparse", "colmap/sparse/0", ".")
+#: The places of COLMAP models in a folder, as patterns.
+COLMAP = ("sparse/*", "sparse", "colmap/sparse/*", ".")
 READERS = (
     Reader(
         "iPhone/DyCheck, Nerfies, HyperNeRF", "captures:read_iphone", (("camera",),), "camera/ and rgb/",
@@ -63,7 +63,7 @@ READERS = (
     Reader(
         "COLMAP", "colmap:read_colmap",
         tuple((f"{place}/cameras{kind}", f"{place}/images{kind}") for place in COLMAP for kind in (".bin", ".txt")),
-        "sparse/0 and images/ or videos/", "optional times.txt; the first video is held out",
+        "sparse/ and images/ or videos/", "optional times.txt and masks/; the first video is held out",
     ),
 )  # fmt: skip
 #: A line of help for each layout.
@@ -72,7 +72,14 @@ FOLDERS = tuple(
 )
 
 
-def load(source: str | Path, *, downscale: int = 1, holdout: int = 8, background: Color | None = None) -> Dataset:
+def load(
+    source: str | Path,
+    *,
+    downscale: int = 1,
+    holdout: int = 8,
+    background: Color | None = None,
+    fps: float | None = None,
+) -> Dataset:
     """Read a dataset.
 
     source: a folder that one of READERS recognises, or `synthetic:NAME[?key=value&...]` (see `synthetic`).
@@ -80,11 +87,20 @@ def load(source: str | Path, *, downscale: int = 1, holdout: int = 8, background
     holdout: without split files, frames with i % holdout == holdout // 2 are the test frames; 0 = none.
     background: RGB 0..1 of the scene's background, on which pictures with alpha are laid; opaque ones stay as they are.
     None: white if a training picture has alpha, else the dataset's own or the colour of the pictures' border.
+    fps: frames per second, where times are numbers of frames; None for those of the dataset, or 30.
     Views whose masks hold no valid pixel are left out, see `Dataset.left_out`.
     Raises DataError, one line, for anything missing or broken.
     """
     dataset = _without_blind_views(_read(source, downscale, holdout, background), source)
-    return dataset if background is None else replace(dataset, background=background)
+    if background is not None:
+        dataset = replace(dataset, background=background)
+    if fps and (stored := dataset.origin.fps):
+        start, stop = (time * stored / fps for time in dataset.time_range)
+        dataset = replace(dataset, time_range=(start, stop), origin=replace(dataset.origin, fps=fps))
+    elif fps:
+        remark = f"--fps {fps:g} has no effect, since times are known otherwise"
+        dataset = replace(dataset, origin=replace(dataset.origin, notes=(*dataset.origin.notes, remark)))
+    return dataset
 
 
 def color(text: str) -> Color:
@@ -124,14 +140,15 @@ def _read(source: str | Path, downscale: int, holdout: int, background: Color | 
     if not folder.is_dir():
         found = "a file" if folder.exists() else "nothing"
         raise DataError(f"{folder}: found {found}, expected a dataset folder or {SYNTHETIC}NAME")
-    staying_inside = resolve_name("pd4dgs_codec.data.files:staying_inside")
+    reading_folder = resolve_name("pd4dgs_codec.data.files:reading_folder")
     for reader in READERS:
         if reader.recognises(folder):
             try:
-                with staying_inside(folder):
+                with reading_folder(folder) as reading:
                     read = resolve_name(f"pd4dgs_codec.data.{reader.function}")
                     dataset: Dataset = read(folder, downscale, holdout, background)
-                    return dataset
+                    notes = (*dataset.origin.notes, *reading.remarks())
+                    return replace(dataset, origin=replace(dataset.origin, notes=notes))
             except (DataError, ImportError, MemoryError):
                 raise
             except Exception as error:  # faults of foreign files that no check foresaw

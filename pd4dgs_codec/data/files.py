@@ -5,16 +5,18 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import re
 import warnings
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextvars import ContextVar
-from pathlib import Path
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pd4dgs_codec.errors import DataError, one_line
+from pd4dgs_codec.errors import DamageWarning, DataError, one_line
 from pd4dgs_codec.io import reading
 
 if TYPE_CHECKING:
@@ -24,7 +26,8 @@ if TYPE_CHECKING:
 LARGEST = 1e9
 Color = tuple[float, float, float]  #: RGB 0..1
 WHITE = (1.0, 1.0, 1.0)
-IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff")
+REMARKED = 4  #: names that a remark lists
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")  #: of pictures; another format of Pillow runs programs
 #: A compressed file may unpack to FREE_BYTES, and INFLATES more for each of its bytes.
 FREE_BYTES, INFLATES = 1 << 20, 16
@@ -32,25 +35,58 @@ FREE_BYTES, INFLATES = 1 << 20, 16
 FREE_PIXELS, PIXELS_PER_BYTE = 1 << 24, 256
 #: Scans of a progressive JPEG, each over all pixels: ten are usual, and a few bytes add one.
 MAX_SCANS, SCAN = 100, b"\xff\xda"
+LOSSY = ("JPEG", "MPO", "WEBP")  #: formats whose black may come back as dark grey
 #: Pillow's pixel modes with one obvious conversion to RGB; others (CMYK, LAB, floats) are refused.
 GREY16_MODES = {"I;16", "I;16L", "I;16B"}
 READABLE_MODES = {"1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX"} | GREY16_MODES
 ORIENTATION, UPRIGHT = 0x0112, 1  #: EXIF's orientation tag, and its value for pixels stored upright
+TURNS = {2: 0, 3: 3, 4: 1, 5: 5, 6: 4, 7: 6, 8: 2}  #: its other values as Pillow's `Transpose`
+SWAPS = (5, 6, 7, 8)  #: those that swap width and height
+TILE_WIDTH, TILE_LENGTH = 322, 323  #: TIFF's tags
 GAMMA = (0.40, 0.51)  #: exponents that PNG files give for sRGB: 1/2.2 as encoders round it
 
 
-#: The folder of the dataset that is being read, with links resolved.
-_FOLDER: ContextVar[Path | None] = ContextVar("_FOLDER", default=None)
+@dataclass(frozen=True)
+class Reading:
+    """The folder that is being read, with links resolved; by what was assumed or left out, the names that it concerns;
+    by folder, the names of its files by these names in lower case."""
+
+    folder: Path
+    notes: dict[str, list[str]] = field(default_factory=dict)
+    listed: dict[Path, dict[str, str]] = field(default_factory=dict)
+
+    def remarks(self) -> list[str]:
+        """What was assumed or left out, a line each."""
+        return [counted(what, names) for what, names in self.notes.items()]
+
+
+_READING: ContextVar[Reading | None] = ContextVar("_READING", default=None)
 
 
 @contextlib.contextmanager
-def staying_inside(folder: Path) -> Iterator[None]:
-    """Within the block, `check_regular` refuses files outside this folder, also behind links."""
-    before = _FOLDER.set(folder.resolve())
+def reading_folder(folder: Path) -> Iterator[Reading]:
+    """Within the block, `check_regular` refuses files outside this folder, also behind links, `note` collects remarks,
+    and warnings of libraries about damaged files, which an error or a remark replaces, are not shown."""
+    reading = Reading(folder.resolve())
+    before = _READING.set(reading)
     try:
-        yield
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            warnings.simplefilter("always", DamageWarning)
+            yield reading
     finally:
-        _FOLDER.reset(before)
+        _READING.reset(before)
+
+
+def note(what: str, name: str) -> None:
+    """Adds a name to the remark `what` on the folder that is being read."""
+    if reading := _READING.get():
+        reading.notes.setdefault(what, []).append(name)
+
+
+def counted(what: str, names: Collection[str]) -> str:
+    """A remark on so many things, with the names of the first."""
+    return f"{what} ({len(names)}): {', '.join(list(names)[:REMARKED])}{', ...' * (len(names) > REMARKED)}"
 
 
 def check_regular(path: Path) -> None:
@@ -58,9 +94,9 @@ def check_regular(path: Path) -> None:
     read; OSError or ValueError for invalid names."""
     if path.exists() and not path.is_file():
         raise DataError(f"{path}: is not a regular file")
-    folder = _FOLDER.get()
-    if folder is not None and folder not in path.resolve().parents:
-        raise DataError(f"{path}: leads out of {folder}, expected the name of a file in this folder")
+    reading = _READING.get()
+    if reading and reading.folder not in Path(os.path.realpath(path)).parents:  # resolve() raises in a circle of links
+        raise DataError(f"{path}: leads out of {reading.folder}, expected the name of a file in this folder")
 
 
 def read_file(path: Path) -> bytes:
@@ -176,13 +212,52 @@ def last_numbers(paths: Iterable[Path]) -> list[int] | None:
 
 
 def find_image(folder: Path, name: str) -> Path:
-    """The image file of a `file_path` written with or without its extension. Raises DataError if it is missing."""
-    for suffix in IMAGE_SUFFIXES:
-        path = inside(folder, name + suffix)
-        with contextlib.suppress(OSError):  # a name too long for the system
-            if path.is_file():
-                return path
-    raise DataError(f"{folder / name}: image is missing (tried the name alone, .png, .jpg and .jpeg)")
+    """The picture that a file of the dataset names, also if the name lacks the suffix or has backslashes, letters in
+    the wrong case or another picture's suffix, which is noted; the path that it would have if it is missing. Raises
+    DataError for a name that leads out of the folder."""
+    path = inside(folder, name)
+    if is_there(path):
+        return path
+    if PureWindowsPath(name).drive:
+        raise DataError(f"{folder}: {one_line(repr(name), 120)} is not the name of a file in this folder")
+    plain = name.replace("\\", "/")
+    inside(folder, plain)
+    found = similar(folder, plain)
+    if found is None:
+        return path
+    if not found.name.startswith(PurePosixPath(plain).name):
+        note("found under another name", f"{found.relative_to(folder)} for {name}")
+    return inside(folder, str(found.relative_to(folder)))
+
+
+def similar(folder: Path, name: str) -> Path | None:
+    """The file of this name in any case, with the suffix of a picture added or replaced; None if there is none."""
+    *parents, last = PurePosixPath(name).parts or (name,)
+    for parent in parents:
+        folder /= parent if (folder / parent).is_dir() else _listed(folder).get(parent.casefold(), parent)
+    names, stem = _listed(folder), PurePosixPath(last)
+    bases = (last, stem.stem) if stem.suffix.casefold() in PICTURES else (last,)
+    wanted = ((base + suffix).casefold() for base in bases for suffix in ("", *PICTURES))
+    return next((folder / names[each] for each in wanted if each in names and is_there(folder / names[each])), None)
+
+
+def _listed(folder: Path) -> dict[str, str]:
+    """The names in a folder by these names in lower case; a folder is listed once per reading."""
+    reading = _READING.get()
+    listed = reading.listed if reading else {}
+    if folder not in listed:
+        names: list[str] = []
+        with contextlib.suppress(OSError, ValueError):
+            names = sorted(path.name for path in folder.iterdir())
+        listed[folder] = {name.casefold(): name for name in names}
+    return listed[folder]
+
+
+def is_there(path: Path) -> bool:
+    """Whether there is anything but a folder; false for a name that the system does not take."""
+    with contextlib.suppress(OSError, ValueError):
+        return path.exists() and not path.is_dir()
+    return False
 
 
 def check_pixels(count: int, files: Iterable[Path], where: str) -> None:
@@ -195,8 +270,8 @@ def check_pixels(count: int, files: Iterable[Path], where: str) -> None:
         raise DataError(f"{where}: {count:,} pixels, expected {held:,} at most for files of this size")
 
 
-def _open(path: Path, what: str = "image", size: tuple[int, int] | None = None) -> Picture:
-    """Opens a picture without decoding its pixels. size: the expected (W, H). Raises DataError."""
+def _open(path: Path) -> Picture:
+    """Opens a picture without decoding its pixels. Raises DataError."""
     from PIL import Image  # of the extra `train`
 
     try:
@@ -204,6 +279,8 @@ def _open(path: Path, what: str = "image", size: tuple[int, int] | None = None) 
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of Pillow, about sizes
             picture = Image.open(path, formats=FORMATS)
+        tags: Any = getattr(picture, "tag_v2", {})  # of TIFF, whose tiles are decoded whole however small the picture
+        tile = int(tags.get(TILE_WIDTH, 0)) * int(tags.get(TILE_LENGTH, 1))
     except FileNotFoundError:
         raise DataError(f"{path}: image is missing") from None
     except DataError:
@@ -213,19 +290,27 @@ def _open(path: Path, what: str = "image", size: tuple[int, int] | None = None) 
     with contextlib.ExitStack() as refused:
         refused.callback(picture.close)
         check_pixels(picture.width * picture.height, [path], str(path))
+        check_pixels(tile, [path], f"{path}: a tile")
         scans = path.read_bytes().count(SCAN) if picture.format in ("JPEG", "MPO") else 0
         if scans > MAX_SCANS:
             raise DataError(f"{path}: {scans:,} scans, expected {MAX_SCANS} at most in a JPEG")
-        if size is not None and picture.size != size:
-            raise DataError(f"{path}: {what} is {picture.width}x{picture.height}, expected {size[0]}x{size[1]}")
         refused.pop_all()
     return picture
 
 
-def image_info(path: Path) -> tuple[int, int, bool]:
-    """Width, height and whether there is an alpha channel, from the file's header."""
+def image_info(path: Path, *, upright: bool = False) -> tuple[int, int, bool]:
+    """Width, height and whether there is an alpha channel, from the file's header. upright: turned as EXIF says."""
     with _open(path) as image:
-        return image.width, image.height, _has_alpha(image)
+        swapped = upright and _turn(image) in SWAPS
+        return (*(image.size[::-1] if swapped else image.size), _has_alpha(image))
+
+
+def _turn(image: Picture) -> int:
+    """EXIF's orientation, UPRIGHT if it has none that is valid."""
+    with contextlib.suppress(Exception):  # Pillow raises many kinds
+        flag = image.getexif().get(ORIENTATION, UPRIGHT)
+        return flag if flag in TURNS else UPRIGHT
+    return UPRIGHT
 
 
 def _has_alpha(image: Picture) -> bool:
@@ -241,9 +326,6 @@ def _check_readable(image: Picture, where: str) -> None:
         found = f"has pixels of kind {image.mode}, expected grey of 8 or 16 bits, a palette, RGB or RGBA"
     elif image.mode in GREY16_MODES and _has_alpha(image):
         found = "has 16-bit grey with a transparent value, expected 8 bits or an alpha channel"
-    elif image.getexif().get(ORIENTATION, UPRIGHT) != UPRIGHT:  # some tools rotate, some do not
-        flag = image.getexif()[ORIENTATION]
-        found = f"is stored rotated (orientation flag {flag}), expected upright pixels as the camera has"
     elif not GAMMA[0] <= image.info.get("gamma", GAMMA[0]) <= GAMMA[1]:
         found = f"has a gamma of {image.info['gamma']:g}, expected that of sRGB (0.455)"
     if found:
@@ -286,15 +368,28 @@ def _rgb(image: Picture, where: str, under: Color | None) -> Picture:
     return image.convert("RGB")
 
 
-def read_image(path: Path, size: tuple[int, int], *, downscale: int = 1, under: Color | None = WHITE) -> np.ndarray:
+def read_image(
+    path: Path, size: tuple[int, int], *, downscale: int = 1, under: Color | None = WHITE, upright: bool = False
+) -> np.ndarray:
     """uint8 [H // downscale, W // downscale, 3], the mean of each block; the file must measure `size` = (W, H).
 
-    under: RGB 0..1 on which a transparent image is laid; None drops its alpha (photographs).
+    under: RGB 0..1 on which a transparent image is laid; None drops its alpha (photographs). A picture whose EXIF data
+    say to turn it is turned only if `size` is that of the turned one, or with `upright`.
     """
-    with _open(path, size=size) as image:
+    from PIL import Image
+
+    with _open(path) as image:
         check_downscale(size, downscale, str(path))
         try:
+            flag, stored = _turn(image), image.size == size
+            if not stored and not (flag in SWAPS and image.size == size[::-1]):
+                found = f"is {image.width}x{image.height}, expected {size[0]}x{size[1]}"
+                raise DataError(f"{path}: image {found} as the camera has; correct one of them")
             rgb = _rgb(image, str(path), under)
+            if flag != UPRIGHT and stored and not upright:  # COLMAP, too, takes the pixels as they are stored
+                note("not turned as EXIF says, since the camera has the stored size", path.name)
+            elif flag != UPRIGHT:
+                rgb = rgb.transpose(Image.Transpose(TURNS[flag]))
         except DataError:
             raise
         except Exception as e:
@@ -306,12 +401,35 @@ def read_image(path: Path, size: tuple[int, int], *, downscale: int = 1, under: 
 
 
 def read_mask(path: Path, size: tuple[int, int], *, downscale: int = 1) -> np.ndarray:
-    """bool [H // downscale, W // downscale]: True where every pixel of the block is non-zero."""
-    with _open(path, "mask", size) as image:
+    """bool [H // downscale, W // downscale]: True where every pixel of the block is valid.
+
+    Levels from 128 on are valid, in a lossless file that has none all above 0. If the colours are constant, the alpha
+    channel is the mask. A mask of another size and the shape of `size` = (W, H) is scaled.
+    """
+    from PIL import Image
+
+    with _open(path) as image:
         try:
-            return shrink_mask(np.array(image.convert("L")) > 0, downscale)
+            levels = np.array(image.convert("L"))
+            if _has_alpha(image) and levels.min() == levels.max():
+                alpha = np.array(image.convert("RGBA"))[..., 3]
+                levels = alpha if alpha.min() < alpha.max() else levels
+            valid = levels >= 128 if image.format in LOSSY or levels.max() >= 128 else levels > 0
         except Exception as e:
             raise DataError(f"{path}: mask data is broken: {e}") from None
+    if valid.shape != size[::-1]:
+        found = f"{image.width}x{image.height}"
+        if not same_shape(image.size, size):
+            raise DataError(f"{path}: mask is {found}, expected {size[0]}x{size[1]} or a multiple or fraction of it")
+        note(f"masks scaled to {size[0]}x{size[1]}", f"{path.name} of {found}")
+        valid = np.array(Image.fromarray(valid).resize(size, Image.Resampling.NEAREST))
+    return shrink_mask(valid, downscale)
+
+
+def same_shape(size: tuple[int, int], other: tuple[int, int]) -> bool:
+    """Whether two sizes (W, H) have one ratio, but for rounding."""
+    scale = other[0] / size[0]
+    return abs(size[1] * scale - other[1]) <= max(1.0, scale)
 
 
 def check_downscale(size: tuple[int, int], downscale: int, where: str) -> None:

@@ -13,6 +13,8 @@ from pd4dgs_codec.data.files import (
     find_image,
     image_info,
     inside,
+    is_there,
+    note,
     number,
     read_json,
     read_only_ply,
@@ -25,10 +27,12 @@ from pd4dgs_codec.data.view import (
     ROTATION_TOLERANCE,
     Dataset,
     Lens,
+    Origin,
     UnreadView,
     check_rotation,
     held_out,
     posed_dataset,
+    present,
     world_to_camera,
 )
 from pd4dgs_codec.errors import DataError, one_line
@@ -37,15 +41,15 @@ PINHOLE_MODELS = {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIA
 FISHEYE_MODEL = "OPENCV_FISHEYE"
 
 
-def _choose(folder: Path) -> tuple[Path, Path | None]:
-    """The file with the training frames, and the one with the test frames if the folder is split."""
+def _choose(folder: Path) -> tuple[Path, list[Path]]:
+    """The file with the training frames, and those that may have test frames if the folder is split."""
     train = folder / "transforms_train.json"
     if train.is_file():
         others = (folder / "transforms_test.json", folder / "transforms_val.json")
-        return train, next((p for p in others if p.is_file()), None)
+        return train, [path for path in others if path.is_file()]
     found = {path.name: path for path in sorted(folder.glob("transforms*.json"))}
     if "transforms.json" in found or len(found) == 1:
-        return found.get("transforms.json") or next(iter(found.values())), None
+        return found.get("transforms.json") or next(iter(found.values())), []
     raise DataError(
         f"{folder}: found {', '.join(found)}; expected transforms.json, transforms_train.json or a single file"
     )
@@ -115,16 +119,16 @@ def _frames(folder: Path, path: Path) -> tuple[list[UnreadView], dict[str, Any]]
     if not isinstance(listed, list) or not listed:
         raise DataError(f"{path}: found no frames, expected a list of at least 1")
     frames = []
-    size = cache(lambda image: image_info(image)[:2])  # each image is opened once
+    size = cache(lambda image: image_info(image)[:2] if is_there(image) else (1, 1))  # a missing one is left out later
     for i, frame in enumerate(listed):
         where = f"{path}: frame {i}"
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
             raise DataError(f"{where} has no file_path, expected an object with file_path and transform_matrix")
         viewmat = _viewmat(frame.get("transform_matrix"), f"{where}: transform_matrix")
         image = find_image(folder, frame["file_path"])
-        time = i / max(len(listed) - 1, 1)
-        if frame.get("time") is not None:
-            time = number(frame["time"], f"{where}: time", largest=LARGEST_TIME)
+        time = frame.get("time")
+        if time is not None:
+            time = number(time, f"{where}: time", largest=LARGEST_TIME)
         lens = _lens(file, frame, partial(size, image), where)
         frames.append(UnreadView(image.stem, 0, time, viewmat, lens, image, _mask(folder, frame, where)))
     return frames, file
@@ -172,12 +176,18 @@ def _listed_split(
 
 def read_transforms(folder: Path, downscale: int, holdout: int, background: Color | None) -> Dataset:
     """Reads a folder with transforms*.json (see `dataset.load`); a split by files or lists overrides `holdout`."""
-    train_file, test_file = _choose(folder)
+    train_file, test_files = _choose(folder)
     frames, file = _frames(folder, train_file)
-    if test_file is not None:
-        train, test = frames, _frames(folder, test_file)[0]
-    else:
-        train, test = _listed_split(train_file, file, frames) or held_out(frames, holdout)
+    train, test = frames, list[UnreadView]()
+    for path in test_files:
+        test = _frames(folder, path)[0] if read_json(path).get("frames") != [] else []
+        if any(is_there(frame.image) for frame in test):
+            break
+        note("no picture of these test frames is there, so that they count as none", f"{len(test)} of {path.name}")
+        test = []
+    if not test:
+        train, test = _listed_split(train_file, file, frames) or held_out(present(folder, frames), holdout)
     named = file.get("ply_file_path")
     points = read_ply(inside(folder, named)) if isinstance(named, str) else read_only_ply(folder)
-    return posed_dataset(folder, train, test, points, downscale, _stored_depth(folder, file), background)
+    origin = Origin("`time` of each frame", points=named if isinstance(named, str) else "the PLY file")
+    return posed_dataset(folder, train, test, points, downscale, _stored_depth(folder, file), background, origin=origin)

@@ -11,8 +11,10 @@ import json
 import logging
 import math
 import os
+import shutil
 import subprocess
 import tempfile
+import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
@@ -22,11 +24,14 @@ from typing import IO, Any
 
 import numpy as np
 
-from pd4dgs_codec.data.files import check_downscale, check_pixels, check_regular, shrink_image, shrink_mask
-from pd4dgs_codec.data.view import Dataset, UnreadView, View, geometry, rectify, without_first_camera
+from pd4dgs_codec.data.files import check_downscale, check_pixels, check_regular, shrink_image
+from pd4dgs_codec.data.view import Dataset, Origin, UnreadView, View, geometry, rectify, without_first_camera
 from pd4dgs_codec.errors import DamageWarning, DataError, one_line
-from pd4dgs_codec.io import temporary_folder
+from pd4dgs_codec.io import PREFIX, lock, temporary_folder
 
+#: ffmpeg's readers of videos that are one file; others open further files, such as a playlist's, or draw pictures.
+CONTAINERS = "mov,matroska,avi,mpegts,mpeg,asf,flv"
+ONE_FILE = ("-protocol_whitelist", "file", "-format_whitelist", CONTAINERS)
 #: Largest width or height, and frames per second: beyond them the header is wrong.
 MAX_SIDE, MAX_FPS = 16_384, 10_000.0
 #: A damaged video is refused if it lacks more than this share of the frames that its header promises, and one.
@@ -36,6 +41,8 @@ FOLDER, SIZE, DEFAULT_GIB = "PD4DGS_CACHE", "PD4DGS_CACHE_GIB", 20.0
 #: Version of the layout of cache files: frames, the index as JSON, and the length of the index in LENGTH bytes.
 VERSION, LENGTH = 2, 8
 ZSTD_LEVEL = 1  #: higher levels gain little on pictures
+#: A file of frames in its temporary folder, and the seconds after its last change in which nothing removes it.
+UNFINISHED, JUST_NOW = "frames", 60.0
 #: Cache files that this process reads from; they are not removed.
 _IN_USE: set[Path] = set()
 
@@ -69,14 +76,15 @@ def open_video(path: Path, *, grey: bool = False, output: Sequence[str] = ()) ->
     from imageio_ffmpeg import read_frames  # of the extra `train`
 
     logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)  # else it warns of rotated and scaled videos
-    reader = read_frames(file_url(path), output_params=list(output))
+    reader = read_frames(file_url(path), input_params=list(ONE_FILE), output_params=list(output))
     try:
         with closing(reader):
             meta: dict[str, Any] = next(reader, {})
         (width, height), fps, seconds = meta["size"], float(meta["fps"]), float(meta["duration"])
     except Exception as error:  # of any type, with all that ffmpeg prints; the last line names the cause
         said = str(error).strip().rpartition("\n")[2]
-        raise DataError(f"{path}: cannot be decoded: {one_line(said, 120)}") from None
+        expected = f"expected a whole video in a container among {CONTAINERS.replace(',', ', ')}"
+        raise DataError(f"{path}: cannot be decoded: {one_line(said, 120)}; {expected}") from None
     if not (1 <= min(width, height) <= max(width, height) <= MAX_SIDE and 0 < fps < MAX_FPS):
         found = f"{width}x{height} at {fps:g} frames per second"
         raise DataError(f"{path}: {found}, expected at most {MAX_SIDE} a side and {MAX_FPS:g}")
@@ -88,7 +96,7 @@ def open_video(path: Path, *, grey: bool = False, output: Sequence[str] = ()) ->
 def _pictures(path: Path, shape: tuple[int, ...], output: Sequence[str], promised: float) -> Iterator[np.ndarray]:
     """Decodes the pictures. promised: about how many frames the header promises; 0 if unknown."""
     pixels, size, count = "gray" if len(shape) == 2 else "rgb24", math.prod(shape), 0
-    arguments = ["-i", file_url(path), "-pix_fmt", pixels, *output, "-f", "rawvideo", "-"]
+    arguments = [*ONE_FILE, "-i", file_url(path), "-pix_fmt", pixels, *output, "-f", "rawvideo", "-"]
     with ffmpeg(arguments, stdout=subprocess.PIPE) as run:
         assert run.process.stdout is not None
         while len(data := run.process.stdout.read(size)) == size:
@@ -220,7 +228,7 @@ def _store(video: Video, target: Path, treat: Callable[[np.ndarray], np.ndarray]
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         with temporary_folder(target.parent) as folder:
-            file = folder / "frames"
+            file = folder / UNFINISHED
             frames = _compress(video, file, target.parent, treat)
             os.replace(file, target)
     except OSError as error:
@@ -235,15 +243,16 @@ def _compress(video: Video, file: Path, cache: Path, treat: Callable[[np.ndarray
 
     compress, limit = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress, _limit()
     offsets, shape = [0], list[int]()
-    others = sum(stat.st_size for stat in _cached(cache).values())
     with file.open("wb") as stream:
+        lock(stream)
+        others = _make_room(cache, file, math.inf)
         for picture in video.pictures:
             frame = np.ascontiguousarray(treat(picture))
             shape, steps = list(frame.shape), frame.copy()
             steps[:, 1:] -= frame[:, :-1]
             offsets.append(offsets[-1] + stream.write(compress(steps)))
             if others + offsets[-1] > limit:
-                others = _make_room(cache, limit - offsets[-1])
+                others = _make_room(cache, file, limit - offsets[-1])
             if others + offsets[-1] > limit:
                 found = f"its first {len(offsets) - 1} frames take {limit / 2**30:g} GiB"
                 raise DataError(f"{video.path}: {found}; expected a larger {SIZE} or a larger --downscale")
@@ -265,24 +274,36 @@ def _limit() -> float:
     return gib * 2**30
 
 
-def _make_room(cache: Path, limit: float) -> int:
-    """Removes the least recently used files until the rest takes `limit` bytes or is in use. Returns its bytes."""
-    files = _cached(cache)
-    total = sum(stat.st_size for stat in files.values())
-    for file, stat in sorted(files.items(), key=lambda item: item[1].st_mtime):
-        if total > limit and file not in _IN_USE:
-            total -= stat.st_size
+def _make_room(cache: Path, own: Path, limit: float) -> int:
+    """Removes what killed processes left, and the least recently used files until the rest takes `limit` bytes or is in
+    use. Returns its bytes, without the file `own` that is being written."""
+    total, stored = 0, []
+    for file in (*cache.glob("*.frames"), *cache.glob(f"{PREFIX}*/{UNFINISHED}")):
+        with suppress(FileNotFoundError):  # another process has removed it meanwhile
+            stat = file.stat()
+            if file == own or (file.name == UNFINISHED and _removed_stale(file, stat.st_mtime)):
+                continue
+            total += stat.st_size
+            if file.name != UNFINISHED and file not in _IN_USE:
+                stored.append((stat.st_mtime, stat.st_size, file))
+    for _, size, file in sorted(stored):
+        if total > limit:
+            total -= size
             file.unlink(missing_ok=True)
     return total
 
 
-def _cached(cache: Path) -> dict[Path, os.stat_result]:
-    """The files of the cache. Other processes may remove some meanwhile."""
-    found = {}
-    for file in cache.glob("*.frames"):
-        with suppress(FileNotFoundError):
-            found[file] = file.stat()
-    return found
+def _removed_stale(file: Path, changed: float) -> bool:
+    """Removes an unfinished file with its folder, unless another process may be writing it."""
+    if time.time() - changed < JUST_NOW:  # a new one is locked in a moment
+        return False
+    try:
+        with file.open("rb+") as stream:
+            lock(stream)
+    except OSError:
+        return False
+    shutil.rmtree(file.parent, ignore_errors=True)
+    return not file.exists()
 
 
 # -- datasets ----------------------------------------------------------------------------------------------------------
@@ -292,13 +313,14 @@ def synchronised_dataset(
     folder: Path,
     cameras: Sequence[UnreadView],
     points: np.ndarray | None,
+    source: str,
     downscale: int,
     holdout: int,
     depth: tuple[float, float] | None = None,
 ) -> Dataset:
     """The dataset of fixed cameras, each with its video as `image`.
 
-    The first camera is held out, unless holdout is 0. depth: near and far, if known.
+    source: of the points. The first camera is held out, unless holdout is 0. depth: near and far, if known.
     """
     views: list[StoredView] = []
     count, fps = 0, 0.0
@@ -320,6 +342,7 @@ def synchronised_dataset(
         test=tuple(test),
         background=(0.0, 0.0, 0.0),
         time_range=(0.0, (count - 1) / fps if count > 1 else 1.0),
+        origin=Origin(f"the videos, {fps:g} a second", points=source, posed=f"{len(cameras)} videos with a pose"),
         **geometry(cameras, points, depth),
     )
 
@@ -329,9 +352,9 @@ def _frames_of(camera: UnreadView, downscale: int) -> tuple[StoredFrames, np.nda
     lens, mask = camera.lens, None
     check_downscale((lens.width, lens.height), downscale, str(camera.image))
     if not lens.is_pinhole:
-        mask = shrink_mask(rectify(np.zeros((lens.height, lens.width, 3), np.uint8), lens)[1], downscale)
+        mask = rectify(np.zeros((lens.height, lens.width, 1), np.uint8), lens, downscale)[1]
 
     def ideal(picture: np.ndarray) -> np.ndarray:
-        return shrink_image(picture if lens.is_pinhole else rectify(picture, lens)[0], downscale)
+        return shrink_image(picture, downscale) if lens.is_pinhole else rectify(picture, lens, downscale)[0]
 
     return stored_frames(camera.image, f"{downscale} {'' if lens.is_pinhole else lens}", ideal), mask

@@ -1,8 +1,9 @@
 """Posed pictures: the dataset that training and evaluation use; lenses and poses as files describe them, and removal of
 lens distortion; for all readers, a dataset of frames: split, times, scene box, depth range and background."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+import hashlib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -10,32 +11,48 @@ from typing import Any, TypeVar
 import numpy as np
 
 from pd4dgs_codec.data.files import (
+    PICTURES,
     WHITE,
     Color,
     check_downscale,
     check_pixels,
+    counted,
+    files_of,
     image_info,
+    is_there,
+    last_numbers,
+    note,
     read_image,
     read_mask,
+    same_shape,
     shrink_image,
     shrink_mask,
 )
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.scene import Camera
 
-#: Names of left-out views that a remark lists.
-REMARKED = 4
+#: Frames per second of pictures that have numbers and no times.
+FPS = 30.0
 #: Largest |R Rᵀ - I| of a rotation, and | |q| - 1 | of a quaternion: files round to 3 or more decimals.
 ROTATION_TOLERANCE = UNIT_TOLERANCE = 1e-3
 #: OpenGL's camera looks along -z with y up; OpenCV's along +z with y down.
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 #: Files hold the first and the last time as binary32; their difference may change by SPAN_TOLERANCE.
 LARGEST_TIME, SPAN_TOLERANCE = float(np.finfo(np.float32).max), 1e-3
+#: Where up follows from the cameras' right vectors, see `up_direction`: the least mean square of these along a second
+#: direction (1.8° of turn), the largest share of it along up, and the least cosine of an up vector that tells the sign.
+LEVEL_SPREAD, LEVEL_ROLL, UPSIDE = 1e-3, 0.25, 0.1
 #: Half the side of D-NeRF's box of initial points (1.3) over the distance of its cameras (4).
 BOX_OVER_DISTANCE = 1.3 / 4.0
 #: A border is one colour if this share of it lies within this many 8-bit levels of its median.
 BORDER_SHARE, BORDER_LEVELS = 0.99, 3
+#: A lens is scaled to a picture that is larger or smaller by this share; one that is cropped a little is refused.
+RESIZED = 0.1
+NO_TERM = 1e-30  #: a distortion coefficient up to which it changes no pixel, and by which roots cannot be divided
+BAND_PIXELS = 1 << 18  #: resampled at once, some 100 bytes each
 USES = 4  #: of a picture at most, such as for training and for testing
+#: Views whose pixels count in a fingerprint, evenly spread, and the step between such pixels in lines and columns.
+SAMPLED, STEP = 16, 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +94,23 @@ class View:
         return line, column, inside
 
 
+@dataclass(frozen=True)
+class Origin:
+    """What a dataset was read from, in words for people.
+
+    times: where times come from. fps: frames per second, if times are numbers of frames. points: where the points come
+    from. posed: how many pictures of how many have a pose. alpha: whether pictures have alpha. notes: what was assumed
+    or left out, a line each.
+    """
+
+    times: str = ""
+    fps: float | None = None
+    points: str = ""
+    posed: str = ""
+    alpha: bool = False
+    notes: tuple[str, ...] = ()
+
+
 @dataclass(frozen=True, eq=False)
 class Dataset:
     """A scene's images, split into training and test views, with its geometry.
@@ -102,19 +136,51 @@ class Dataset:
     up: tuple[float, float, float]
     masked: bool
     left_out: tuple[str, ...] = ()
+    origin: Origin = Origin()
 
     @property
     def camera(self) -> Camera:
         """The default camera: that of the first training view."""
         return self.train[0].camera
 
+    def fingerprint(self) -> str:
+        """16 hexadecimal digits that change with the training views: their poses, intrinsics, sizes and times, and a
+        sample of their pixels. A name or a folder does not count."""
+        digest = hashlib.sha256()
+        for view in self.train:
+            digest.update(view.viewmat.tobytes() + view.K.tobytes())
+            digest.update(repr((view.width, view.height, float(view.time))).encode())
+        for view in self.train[:: -(-len(self.train) // SAMPLED)]:
+            digest.update(view.image[::STEP, ::STEP].tobytes())
+        return digest.hexdigest()[:16]
+
+    def summary(self) -> list[str]:
+        """What was read, a line each: views and pictures, times, colours, start points."""
+        views, origin = [*self.train, *self.test], self.origin
+        held = [view for view in views if "image" in vars(view)]  # others are read from the cache of video frames
+        size = sum(3 * view.width * view.height for view in held) + sum(v.mask.size for v in held if v.mask is not None)
+        sizes = sorted({(view.width, view.height) for view in views})
+        shown = " to ".join(f"{w}x{h}" for w, h in ([sizes[0], sizes[-1]] if sizes[1:] else sizes))
+        where = f"{size / 1e6:.1f} MB in memory" if held else "frames in the cache"
+        counts = f"{len(self.train)} to train on, {len(self.test) or 'none'} held out, of {shown}"
+        lines = [", ".join(part for part in (f"views: {counts}", origin.posed, where) if part)]
+        instants, (start, stop) = len({view.time for view in views}), self.time_range
+        rate = f", {origin.fps:g} a second" if origin.fps else ""
+        source = f", from {origin.times}" if origin.times else ""
+        lines.append(f"times: {instants} instants, {start:.3g} to {stop:.3g} s{rate}{source}")
+        masks = [view.mask.mean() for view in self.train if view.mask is not None]
+        unseen = f", masks leave out {100 * (len(masks) - sum(masks)) / len(self.train):.0f} % of the pixels"
+        color = ",".join(f"{value:.3g}" for value in self.background)
+        lines.append(f"colours: {'' if origin.alpha else 'no '}alpha, background {color}{unseen if masks else ''}")
+        count = 0 if self.points is None else len(self.points)
+        lines.append(f"start points: {count:,}{f' of {origin.points}' if count and origin.points else ''}")
+        return lines
+
     def remarks(self) -> list[str]:
         """Limits of this data for training and evaluation, a line each."""
-        remarks = []
+        remarks = list(self.origin.notes)
         if self.left_out:
-            names = ", ".join(self.left_out[:REMARKED]) + (", ..." if len(self.left_out) > REMARKED else "")
-            count = f"{len(self.left_out)} of {len(self.train) + len(self.test) + len(self.left_out)} views"
-            remarks.append(f"{count} left out, no valid pixel in the mask: {names}")
+            remarks.append(counted("views left out, no valid pixel in the mask", self.left_out))
         if len({view.time for view in self.train}) == 1:
             remarks.append("all training views show one instant: levels 1 and 2 cannot learn motion")
         first = self.train[0].viewmat
@@ -182,12 +248,12 @@ def downscaled_matrix(K: np.ndarray, downscale: int) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class UnreadView:
-    """A frame of a dataset before its pixels are read. viewmat: float64 [4, 4] world to camera; time: as stored; mask:
-    a picture of the size of `image` that is black where pixels are not valid."""
+    """A frame of a dataset before its pixels are read. viewmat: float64 [4, 4] world to camera; time: as stored, None
+    if it is not; mask: a picture of the shape of `image` that is black where pixels are not valid."""
 
     name: str
     camera_id: int
-    time: float
+    time: float | None
     viewmat: np.ndarray
     lens: Lens
     image: Path
@@ -252,32 +318,50 @@ def _growth(r: np.ndarray, k: Sequence[float]) -> np.ndarray:
 
 def _turning_point(k: Sequence[float]) -> float:
     """The least r > 0 at which r times `_growth` stops growing; beyond it, the lens would show points twice."""
-    roots = np.roots([(2 * i + 1) * c for i, c in enumerate((1.0, *k))][::-1])  # of the derivative, by r^2
+    terms = [(2 * i + 1) * c if abs(c) > NO_TERM else 0.0 for i, c in enumerate((1.0, *k))]  # of the derivative, by r^2
+    roots = np.roots(terms[::-1])
     real = roots.real[(roots.imag == 0) & (roots.real > 0)]
     return float(np.sqrt(real.min(initial=np.inf)))
 
 
-@lru_cache(maxsize=8)
-def _warp(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(u, v float64 [H, W], the place of each ideal pinhole pixel in the stored image; bool [H, W]: it is valid)."""
-    u, v = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
-    x, y = (u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy
-    with np.errstate(all="ignore"):
-        xd, yd, single = distort(x, y, lens)
-    u, v = lens.fx * xd + lens.skew * yd + lens.cx, lens.fy * yd + lens.cy
-    inside = (u >= 0.5) & (v >= 0.5) & (u <= lens.width - 0.5) & (v <= lens.height - 0.5)
-    return u, v, single & inside
+@lru_cache(maxsize=1)
+def _warp(lens: Lens) -> tuple[np.ndarray, np.ndarray]:
+    """(u, v) float32 [H, W]: the place of each ideal pinhole pixel in the stored image, u -1 where it shows none."""
+    places = np.empty((2, lens.height, lens.width), np.float32)
+    columns = np.arange(lens.width) + 0.5
+    for rows in _bands(lens, 1):
+        u, v = np.meshgrid(columns, np.arange(rows.start, rows.stop) + 0.5)
+        x, y = (u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy
+        with np.errstate(all="ignore"):
+            xd, yd, single = distort(x, y, lens)
+            u, v = lens.fx * xd + lens.skew * yd + lens.cx, lens.fy * yd + lens.cy
+            inside = (u >= 0.5) & (v >= 0.5) & (u <= lens.width - 0.5) & (v <= lens.height - 0.5)
+            places[:, rows] = np.where(single & inside, (u, v), -1)
+    return places[0], places[1]
 
 
-def rectify(image: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
-    """(uint8 [H, W, 3] resampled bilinearly to the ideal pinhole; bool [H, W]: False for unseen pixels, black)."""
-    u, v, seen = _warp(lens)
-    fu, fv = np.where(seen, u, 0.5) - 0.5, np.where(seen, v, 0.5) - 0.5
-    u0, v0 = np.minimum(fu.astype(int), lens.width - 2), np.minimum(fv.astype(int), lens.height - 2)
-    a, b = (fu - u0)[..., None], (fv - v0)[..., None]
-    top = image[v0, u0] * (1 - a) + image[v0, u0 + 1] * a
-    bottom = image[v0 + 1, u0] * (1 - a) + image[v0 + 1, u0 + 1] * a
-    return np.where(seen[..., None], top * (1 - b) + bottom * b + 0.5, 0).astype(np.uint8), seen
+def _bands(lens: Lens, k: int) -> Iterator[slice]:
+    """Bands of lines of a picture, of whole blocks of k lines, that bound what resampling it takes."""
+    step = max(1, BAND_PIXELS // (lens.width * k)) * k
+    return (slice(start, min(start + step, lens.height)) for start in range(0, lens.height, step))
+
+
+def rectify(image: np.ndarray, lens: Lens, k: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    """(uint8 [H // k, W // k, 3] resampled bilinearly to the ideal pinhole, then the mean of each block of k x k; bool
+    [H // k, W // k]: False for blocks with unseen pixels, which are black)."""
+    u, v = _warp(lens)
+    pictures, masks = [], []
+    for rows in _bands(lens, k):
+        seen = u[rows] >= 0
+        fu, fv = np.where(seen, u[rows] - 0.5, 0), np.where(seen, v[rows] - 0.5, 0)
+        u0, v0 = np.minimum(fu.astype(int), lens.width - 2), np.minimum(fv.astype(int), lens.height - 2)
+        a, b = (fu - u0)[..., None], (fv - v0)[..., None]
+        top = image[v0, u0] * (1 - a) + image[v0, u0 + 1] * a
+        bottom = image[v0 + 1, u0] * (1 - a) + image[v0 + 1, u0 + 1] * a
+        whole = np.where(seen[..., None], top * (1 - b) + bottom * b + 0.5, 0).astype(np.uint8)
+        pictures.append(shrink_image(whole, k))
+        masks.append(shrink_mask(seen, k))
+    return np.concatenate(pictures), np.concatenate(masks)
 
 
 def shrunk_view(view: View, k: int) -> View:
@@ -298,11 +382,11 @@ def read_view(frame: UnreadView, time: float, downscale: int, under: Color | Non
         mask = None if frame.mask is None else read_mask(frame.mask, size, downscale=downscale)
     else:
         check_downscale(size, downscale, str(frame.image))
-        image, seen = rectify(read_image(frame.image, size, under=under), lens)
+        image, mask = rectify(read_image(frame.image, size, under=under), lens, downscale)
         if frame.mask is not None:
             valid = np.where(read_mask(frame.mask, size), 255, 0)[..., None].astype(np.uint8)
-            seen = seen & (rectify(valid, lens)[0][..., 0] == 255)  # all pixels between which a place lies
-        image, mask = shrink_image(image, downscale), shrink_mask(seen, downscale)
+            whole = rectify(valid, lens)[0][..., 0] == 255  # all pixels between which a place lies
+            mask &= shrink_mask(whole, downscale)
     height, width = image.shape[:2]
     viewmat = frame.viewmat.astype(np.float32)
     return View(viewmat, lens.matrix(downscale), width, height, time, image, mask, frame.name, frame.camera_id)
@@ -340,29 +424,79 @@ def posed_dataset(
     box: np.ndarray | None = None,
     *,
     composite: bool = True,
+    origin: Origin = Origin(),
 ) -> Dataset:
-    """The dataset of these frames.
+    """The dataset of these frames. Those whose picture is missing are left out.
 
     points: float32 [M, 3], or None. depth: near and far, box: float32 [2, 3], if known. background: RGB 0..1 of the
     scene, and behind pictures with alpha; None for white if a training picture has alpha, else for the colour of their
-    border. composite: False drops alpha (photographs).
+    border. composite: False drops alpha (photographs). origin: of the times and points; with fps, the times of the
+    frames are numbers of frames. If frames have no times, the last number in the name of their picture is theirs, or
+    the place of the name among all names.
     """
+    train, test = list(map(fitted, present(folder, train))), list(map(fitted, present(folder, test, needed=False)))
     frames, under = [*train, *test], (background or WHITE) if composite else None
     files = {frame.image for frame in frames}
     if len(frames) > USES * len(files):
         raise DataError(f"{folder}: {len(frames)} frames of {len(files)} pictures, expected at most {USES} per picture")
     check_pixels(sum(frame.lens.width * frame.lens.height for frame in frames), files, str(folder))
-    white = composite and background is None and any(image_info(frame.image)[2] for frame in train)
-    times, start, stop = normalised_times([f.time for f in frames], str(folder))
+    alpha = composite and any(image_info(frame.image)[2] for frame in train)
+    if untimed := [frame.name for frame in frames if frame.time is None]:
+        if len(untimed) < len(frames):
+            origin = replace(origin, notes=(*origin.notes, counted("no time counts, as frames have none", untimed)))
+        raw, source = frame_numbers([frame.image for frame in frames])
+        origin = replace(origin, times=source, fps=FPS)
+    else:
+        raw = [float(frame.time or 0.0) for frame in frames]
+    times, start, stop = normalised_times([t / (origin.fps or 1.0) for t in raw], str(folder))
+    pictures = sum(len(files_of(place, PICTURES)) for place in {frame.image.parent for frame in frames})
+    posed = origin.posed or f"{len(files)} of {pictures} pictures have a pose"
     views = [read_view(f, t, downscale, under) for f, t in zip(frames, times, strict=True)]
     return Dataset(
         name=folder.resolve().name,
         train=tuple(views[: len(train)]),
         test=tuple(views[len(train) :]),
-        background=background or (WHITE if white else border_color(views[: len(train)])),
+        background=background or (WHITE if alpha else border_color(views[: len(train)])),
         time_range=seconds_range(start, stop),
+        origin=replace(origin, posed=posed, alpha=alpha),
         **geometry(frames, points, depth, box),
     )
+
+
+def present(folder: Path, frames: Sequence[UnreadView], *, needed: bool = True) -> list[UnreadView]:
+    """The frames whose picture is there; the others are noted. Raises DataError if some are `needed` and none is."""
+    found = []
+    for frame in frames:
+        if is_there(frame.image):
+            found.append(frame)
+        else:
+            note("views left out, as their picture is missing", str(frame.image.relative_to(folder)))
+    if frames and not found and needed:
+        raise DataError(f"{frames[0].image}: image is missing, and so are the others ({len(frames)} in all)")
+    return found
+
+
+def fitted(frame: UnreadView) -> UnreadView:
+    """The frame with the lens scaled to the size of its picture, if the two clearly differ in size and not in shape."""
+    lens, size = frame.lens, image_info(frame.image)[:2]
+    x, y = size[0] / lens.width, size[1] / lens.height
+    if abs(x - 1) < RESIZED or not same_shape((lens.width, lens.height), size):
+        return frame
+    note(
+        "lens scaled to the size of the picture",
+        f"{frame.image.name} of {size[0]}x{size[1]}, not as the camera {lens.width}x{lens.height}",
+    )
+    focal, middle = (lens.fx * x, lens.fy * y), (lens.cx * x, lens.cy * y)
+    return replace(frame, lens=Lens(*size, *focal, *middle, lens.skew * x, lens.radial, lens.tangential, lens.fisheye))
+
+
+def frame_numbers(pictures: Sequence[Path]) -> tuple[list[float], str]:
+    """The number of each picture's frame, and where it comes from."""
+    numbers = last_numbers(pictures)
+    if numbers is not None:
+        return [float(n) for n in numbers], "the last number of each name"
+    rank = {name: float(i) for i, name in enumerate(sorted(set(pictures)))}
+    return [rank[name] for name in pictures], "the order of the names"
 
 
 def geometry(
@@ -377,7 +511,14 @@ def geometry(
     if box is None:
         box = cameras_box(frames, depth) if points is None else points_box(points)
     near, far = depth or depth_range([f.viewmat for f in frames], box, points)
-    return {"points": points, "box": box, "near": near, "far": far, "up": mean_up(frames), "masked": False}
+    return {
+        "points": points,
+        "box": box,
+        "near": near,
+        "far": far,
+        "up": up_direction([f.viewmat for f in frames]),
+        "masked": False,
+    }
 
 
 def border_pixels(views: Sequence[View]) -> np.ndarray:
@@ -395,9 +536,21 @@ def border_color(views: Sequence[View]) -> tuple[float, float, float]:
     return float(r), float(g), float(b)
 
 
-def mean_up(frames: Sequence[UnreadView | Camera]) -> tuple[float, float, float]:
-    """Unit mean of the cameras' up directions (minus OpenCV's y axis)."""
-    up = -np.mean([f.viewmat[1, :3] for f in frames], axis=0)
+def up_direction(views: Sequence[np.ndarray]) -> tuple[float, float, float]:
+    """Unit vector, world: up, from world-to-camera matrices [3 or 4, 3 or 4] of level cameras.
+
+    A level camera's right vector r is horizontal, so up is the eigenvector of the least eigenvalue of the mean of
+    r rᵀ, with the sign of the cameras' mean up vector; if this one is nearly horizontal, as of cameras that all look
+    straight down, the sign that lets them look down. Cameras on a row that face one way have parallel right vectors,
+    and cameras that roll have right vectors in all directions. Then, if the second eigenvalue is below LEVEL_SPREAD
+    or the least one above LEVEL_ROLL of it, up is the mean of the up vectors.
+    """
+    right, down, ahead = (np.stack([view[i, :3] for view in views]).astype(np.float64) for i in range(3))
+    (least, second, _), axes = np.linalg.eigh(right.T @ right / len(right))
+    up, level = -down.mean(axis=0), axes[:, 0]
+    if second >= LEVEL_SPREAD and least <= LEVEL_ROLL * second:
+        along = up @ level
+        up = level * np.sign(along if abs(along) > UPSIDE else -ahead.mean(axis=0) @ level or 1.0)
     norm = np.linalg.norm(up)
     x, y, z = up / norm if norm > 1e-6 else (0.0, 0.0, 1.0)
     return float(x), float(y), float(z)

@@ -30,7 +30,7 @@ import numpy as np
 
 from pd4dgs_codec.archives import read_tensors
 from pd4dgs_codec.data.files import LARGEST, WHITE, Color, array, number, read_file, whole_number
-from pd4dgs_codec.data.view import check_rotation, mean_up, rotation_matrix, world_to_camera
+from pd4dgs_codec.data.view import check_rotation, rotation_matrix, up_direction, world_to_camera
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.splats import (
     Splats,
@@ -161,7 +161,7 @@ class State:
 
 
 def read_cameras(path: Path) -> tuple[list[Camera], tuple[float, float, float]]:
-    """Reads (cameras, their mean up direction) from a cameras.json of 3D Gaussian splatting. Raises DataError."""
+    """Reads (cameras, their up direction) from a cameras.json of 3D Gaussian splatting. Raises DataError."""
     try:
         rows = json.loads(read_file(path))
     except (ValueError, RecursionError) as error:
@@ -178,7 +178,7 @@ def read_cameras(path: Path) -> tuple[list[Camera], tuple[float, float, float]]:
         width, height = (whole_number(row.get(key), f"{where} {key}", 1, 65535) for key in ("width", "height"))
         K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], np.float32)
         cameras.append(Camera(world_to_camera(turn.T, place).astype(np.float32), K, width, height))
-    return cameras, mean_up(cameras)
+    return cameras, up_direction([camera.viewmat for camera in cameras])
 
 
 # -- Gaussians that a network moves ------------------------------------------------------------------------------------

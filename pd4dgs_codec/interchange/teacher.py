@@ -84,14 +84,21 @@ class Options:
     up: Triple = (0.0, -1.0, 0.0)
 
 
-def load_source(source: str, *, downscale: int = 1, holdout: int = 8, background: Triple | None = None) -> Dataset:
+def load_source(
+    source: str,
+    *,
+    downscale: int = 1,
+    holdout: int = 8,
+    background: Triple | None = None,
+    fps: float | None = None,
+) -> Dataset:
     """Loads a `teacher:` source, or any other as `data.dataset.load` does. Raises DataError."""
     if not source.startswith(PREFIX):
-        return load(source, downscale=downscale, holdout=holdout, background=background)
+        return load(source, downscale=downscale, holdout=holdout, background=background, fps=fps)
     place, values = split_options(source.removeprefix(PREFIX), source, _value, EXAMPLES)
     if not place:
         raise DataError(f"{source}: names no teacher; expected {PREFIX}FOLDER, {PREFIX}FILE or {PREFIX}module:function")
-    options = Options(**values)
+    options = Options(**({"fps": fps} if fps else {}) | values)
     if background is not None:
         options = replace(options, background=background)
     teacher = read_model(place, options.fps)

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from pd4dgs_codec.data.view import up_direction
 from pd4dgs_codec.errors import DataError, required
 from pd4dgs_codec.signals import ENDING
 
@@ -141,15 +142,11 @@ def write(model: Any, folder: Path) -> None:
 
 
 def upright(model: Any) -> None:
-    """Rotates the mean up direction of the model to -y and moves its median point to 0: boxes and planes along the axes
+    """Rotates the up direction of the model to -y and moves its median point to 0: boxes and planes along the axes
     fit better, and numbers stay small."""
     pycolmap = colmap()
     views = [image.cam_from_world().rotation.matrix() for image in model.images.values() if image.has_pose]
-    down = np.mean([view[1] for view in views], axis=0)
-    ahead = np.mean([view[2] for view in views], axis=0)
-    if np.linalg.norm(down) < 1e-6:
-        return
-    down /= np.linalg.norm(down)
+    down, ahead = -np.array(up_direction(views)), np.mean([view[2] for view in views], axis=0)
     ahead -= down * (down @ ahead)
     if np.linalg.norm(ahead) < 1e-6:  # the views face all around: any direction will do
         ahead = np.cross(down, np.eye(3)[np.argmin(np.abs(down))])

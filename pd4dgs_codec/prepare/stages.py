@@ -13,7 +13,7 @@ import os
 import shutil
 import stat
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict, astuple, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -21,10 +21,18 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.data.files import check_downscale, files_of, image_info, last_numbers, read_image, shrink_image
+from pd4dgs_codec.data.files import (
+    PICTURES,
+    check_downscale,
+    files_of,
+    image_info,
+    last_numbers,
+    read_image,
+    shrink_image,
+)
 from pd4dgs_codec.data.videos import open_video
 from pd4dgs_codec.errors import DataError, one_line
-from pd4dgs_codec.io import check_path, finite, write_bytes
+from pd4dgs_codec.io import check_path, finite, lock, write_bytes
 from pd4dgs_codec.prepare import FEWEST_FRAMES, poses
 from pd4dgs_codec.prepare.poses import Advance, Features
 from pd4dgs_codec.signals import held
@@ -41,7 +49,6 @@ BLURRED, AROUND = 0.4, 15
 SAME = 0.3
 #: Most frames of a recording, an hour at 60 per second.
 MOST_FRAMES = 216_000
-PICTURES = {".png", ".jpg", ".jpeg"}
 STATE, REPORT = "prepare.json", "report.json"
 #: Thresholds of advice: share of frames, pixels of a picture 1000 wide, points a picture, degrees, share of features.
 MANY_BLURRED, MANY_LOST, LARGE_ERROR, FEW_POINTS, SMALL_ANGLE, MUCH_MOVES = 0.2, 0.05, 2.0, 50, 4.0, 0.4
@@ -78,28 +85,28 @@ def prepare(
     check_folder(output, overwrite)
     recording = open_recording(source, options.fps)
     work = output.with_name(f"{output.name}.partial")
-    _begin(work, recording, options)
-    try:
-        looks, choice, times = _frames(work, recording, options, progress)
-        cores = options.threads if options.threads > 0 else available()
-        width, height = (side // options.downscale for side in recording.size)
-        seconds = poses.estimate(len(times), (width, height), cores)
-        tell(f"the poses of {len(times)} frames take up to {max(1, round(seconds / 60))} min on {cores} cores")
-        findings = _poses(work, times, options, progress)
-        result = _finish(work, findings, looks, choice, times, source)
-    except (DataError, OSError):
-        shutil.rmtree(work, ignore_errors=True)
-        raise
-    except (RuntimeError, ValueError) as error:  # of pycolmap and SQLite, on a full disk for example
-        shutil.rmtree(work, ignore_errors=True)
-        raise DataError(f"{source}: COLMAP failed: {one_line(str(error), 160)}") from None
-    check_folder(output, overwrite)  # it may have appeared meanwhile
-    with held():
-        if output.exists():
-            os.chmod(work, stat.S_IMODE(output.stat().st_mode))
-            shutil.rmtree(output)
-        os.replace(work, output)
-    return result
+    with _begun(work, recording, options):
+        try:
+            looks, choice, times = _frames(work, recording, options, progress)
+            cores = options.threads if options.threads > 0 else available()
+            width, height = (side // options.downscale for side in recording.size)
+            seconds = poses.estimate(len(times), (width, height), cores)
+            tell(f"the poses of {len(times)} frames take up to {max(1, round(seconds / 60))} min on {cores} cores")
+            findings = _poses(work, times, options, progress)
+            result = _finish(work, findings, looks, choice, times, recording.path)
+        except (DataError, OSError):
+            shutil.rmtree(work, ignore_errors=True)
+            raise
+        except (RuntimeError, ValueError) as error:  # of pycolmap and SQLite, on a full disk for example
+            shutil.rmtree(work, ignore_errors=True)
+            raise DataError(f"{recording.path}: COLMAP failed: {one_line(str(error), 160)}") from None
+        check_folder(output, overwrite)  # it may have appeared meanwhile
+        with held():
+            if output.exists():
+                os.chmod(work, stat.S_IMODE(output.stat().st_mode))
+                shutil.rmtree(output)
+            os.replace(work, output)
+        return result
 
 
 def check_folder(output: Path, overwrite: bool) -> None:
@@ -118,24 +125,37 @@ def check_folder(output: Path, overwrite: bool) -> None:
         raise DataError(f"{output}: no permission to write here")
 
 
-def _begin(work: Path, recording: Recording, options: Options) -> None:
-    """Keeps the work of an earlier run with the same recording and options, else begins anew."""
+@contextmanager
+def _begun(work: Path, recording: Recording, options: Options) -> Iterator[None]:
+    """Keeps the work of an earlier run with the same recording and options, else begins anew. Raises DataError if
+    another process is at work in the folder."""
     stats = [path.stat() for path in {recording.path, *recording.files}]  # a folder's own time is that of its names
     asked = {"source": str(recording.path.resolve()), "size": sum(each.st_size for each in stats)}
     asked |= {"changed": max(each.st_mtime_ns for each in stats)}
     asked |= {name: value for name, value in asdict(options).items() if name != "threads"}
     state = work / STATE
-    if work.exists():
-        if not state.is_file():
-            raise DataError(f"{work}: exists already, expected nothing here or the partial output of an earlier run")
+    if work.exists() and not state.is_file():
+        raise DataError(f"{work}: exists already, expected nothing here or the partial output of an earlier run")
+    work.mkdir(exist_ok=True)
+    with state.open("a+b") as stream:
         try:
-            if json.loads(state.read_text()) == asked:
-                return
-        except ValueError:
-            pass
-        shutil.rmtree(work)
-    work.mkdir()
-    write_bytes(state, json.dumps(asked).encode(), overwrite=True)
+            lock(stream)
+        except OSError:
+            raise DataError(f"{work}: another process is at work here, expected another output or its end") from None
+        stream.seek(0)
+        try:
+            same = json.loads(stream.read()) == asked
+        except ValueError:  # empty, if it is new
+            same = False
+        if not same:
+            for path in set(work.iterdir()) - {state}:
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+            stream.truncate(0)
+            stream.write(json.dumps(asked).encode())
+            stream.flush()
+        if os.name == "nt":
+            stream.close()  # else the folder could not be renamed
+        yield
 
 
 def _frames(
@@ -276,23 +296,23 @@ class FrameFolder:
     def __init__(self, path: Path, fps: float):
         files = files_of(path, PICTURES)
         if not files:
-            raise DataError(f"{path}: found no picture, expected frames as {', '.join(sorted(PICTURES))}")
+            raise DataError(f"{path}: found no picture, expected frames as {', '.join(PICTURES)}")
         numbered = dict(zip(last_numbers(files) or range(len(files)), files, strict=True))
         if len(numbered) < len(files):
             raise DataError(f"{path}: two pictures have the same number, expected one per frame")
         self.numbers = sorted(numbered)
         self.path, self.files, self.fps = path, [numbered[number] for number in self.numbers], fps
-        self.size = image_info(self.files[0])[:2]
+        self.size = image_info(self.files[0], upright=True)[:2]
 
     def looks(self) -> Iterator[np.ndarray]:
         k = max(1, -(-self.size[0] // LOOK_WIDTH))
         for file in self.files:
-            yield read_image(file, self.size, downscale=k).mean(axis=2).astype(np.uint8)
+            yield read_image(file, self.size, downscale=k, upright=True).mean(axis=2).astype(np.uint8)
 
     def pictures(self, indices: Sequence[int]) -> Iterator[np.ndarray]:
         """Yields uint8 [H, W, 3] of these frames."""
         for k in indices:
-            yield read_image(self.files[k], self.size)
+            yield read_image(self.files[k], self.size, upright=True)
 
     def time(self, index: int) -> float:
         """The time of a frame after the first one, seconds."""

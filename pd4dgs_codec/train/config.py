@@ -145,6 +145,14 @@ class TrainConfig:
     view_dependent: str = option("color", help="networks that take the view direction", choices=VIEW_DEPENDENT)
     downscale: int = option(1)
     holdout: int = option(8)
+    #: of pictures whose times are numbers of frames; None: the dataset's, or 30
+    fps: float | None = option(
+        None,
+        help="frames per second of numbered pictures without times (default: 30)",
+        metavar="F",
+        least=0.01,
+        most=1000,
+    )
     #: RGB of the scene's background and behind pictures with alpha; None: see `dataset.load`
     background: tuple[float, float, float] | None = option(None, least=0, most=1, count=3)
     #: None: the preset's default, or as many as `max_seconds` allows

@@ -3,6 +3,7 @@
 import json
 import os
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -225,6 +226,53 @@ def test_scan_finds_sources_of_one_kind(tmp_path):
     assert [line["output"] for line in scan(str(tmp_path), "train")] == ["set.pt"]
     with pytest.raises(DataError, match="found no sources"):
         list(scan(str(tmp_path), "prepare"))
+
+
+@pytest.mark.parametrize("op", ["prepare", "train", "encode", "package"])
+@pytest.mark.parametrize("root", ["{}", ".", "file://{}"])
+def test_scan_writes_only_lines_that_a_batch_takes(tmp_path, monkeypatch, op, root):
+    """Of sources whose names are not printable, are not UTF-8, or differ in their suffix alone."""
+    end = (OPS[op].finds or ("",))[0]
+    names = [
+        b"a\\b",
+        b"new\nline",
+        b"esc\x1b[2J",
+        b"esc\x1b[2K",
+        "厨房".encode("gbk"),
+        "\u202e".encode(),
+        b"x.done.json",
+    ]
+    names += [b"a::b"] * (root[0] != "f") + [b"-dash", b"s3:x", b"12:30", b"q?x=1"]
+    twice = f"twice{end}".encode(), f"twice{end.upper() or '.2'}".encode()
+    for name in (*(name + end.encode() for name in names), *twice):
+        path = Path(os.fsdecode(bytes(tmp_path) + b"/" + name))
+        if op == "train":
+            path.mkdir()
+            path = path / "transforms.json"
+        path.touch()
+    monkeypatch.chdir(tmp_path)
+    lines = list(scan(root.format(tmp_path), op))
+    assert len(lines) == len(names) + 2 and all(line["output"].isprintable() for line in lines)
+    manifest = tmp_path.parent / f"{tmp_path.name}.jsonl"
+    manifest.write_text("".join(json.dumps(line) + "\n" for line in lines))
+    found, faults = read_manifest(str(manifest), OPS[op], lambda source, options: None)
+    assert len(found) == len(lines) and not faults
+    for line in found:
+        assert store.stamp(line.source, dataset=op == "train") and store.fetch(line.source, tmp_path).exists()
+
+
+def test_a_folder_that_is_no_dataset_is_refused_before_its_files_are_listed(tmp_path, monkeypatch):
+    from fsspec.implementations.local import LocalFileSystem
+
+    (tmp_path / "x" / "y").mkdir(parents=True)
+    (tmp_path / "x" / "y" / "z").touch()
+    monkeypatch.setattr(LocalFileSystem, "walk", Mock(side_effect=AssertionError("walked")))
+    with pytest.raises(DataError, match="found a folder that holds no dataset"):
+        store.stamp(str(tmp_path), dataset=True)
+    monkeypatch.undo()
+    before = store.stamp(str(tmp_path))
+    (tmp_path / "x" / "y" / "z").write_bytes(b"deeper")
+    assert store.stamp(str(tmp_path)) == before
 
 
 def test_outputs_are_named_after_their_sources():

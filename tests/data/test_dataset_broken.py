@@ -9,7 +9,8 @@ from typing import Any
 import pytest
 from folders import changed
 
-from pd4dgs_codec.data.dataset import READERS, dataset_folders
+from pd4dgs_codec.data.dataset import READERS, dataset_folders, load
+from pd4dgs_codec.errors import DataError
 
 #: The tests of each reader. Their LAYOUTS write a synthetic scene into whole folders. Each of their FAULTS is a file of
 #: such a folder, its change (see `folders.changed`), and a part of the error.
@@ -49,6 +50,21 @@ def test_no_file_of_a_folder_is_a_link_out_of_it(layout, scene, tmp_path, refuse
         path.rename(elsewhere)
         path.symlink_to(elsewhere)
         refused(folder, "the name of a file in this folder")
+        path.unlink()
+        elsewhere.rename(path)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_a_file_that_is_a_circle_of_links_is_named(layout, scene, tmp_path):
+    """Or it counts as missing."""
+    folder, elsewhere = LAYOUTS[layout](scene, tmp_path / "set"), tmp_path / "elsewhere"
+    for path in sorted(path for path in folder.rglob("*") if path.suffix not in (".png", ".jpg") and path.is_file()):
+        path.rename(elsewhere)
+        path.symlink_to(path.name)
+        try:
+            load(folder)
+        except DataError as error:
+            assert "cannot be read as" not in str(error), path
         path.unlink()
         elsewhere.rename(path)
 

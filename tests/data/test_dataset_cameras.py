@@ -1,8 +1,12 @@
 """The lens model and the robust geometry."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 
+from pd4dgs_codec.data import view
+from pd4dgs_codec.data.files import shrink_image, shrink_mask
 from pd4dgs_codec.data.view import (
     Lens,
     UnreadView,
@@ -45,6 +49,31 @@ def test_skew_moves_along_x():
     image, seen = rectify(ramp, lens)
     assert image[14, 15, 0] == 6 * 15 + round(6 * 5.0 * 0.45) and seen[14, 15]
     assert not seen[19, 39] and seen[0, 39]
+
+
+@pytest.mark.parametrize("k", [1, 3, 7])
+def test_pictures_are_resampled_in_bands_and_reduced(monkeypatch, k):
+    lens, picture = Lens(97, 61, 80.0, 80.0, 48.0, 30.0, radial=(0.2, 0.0, 0.0)), np.random.default_rng(0)
+    picture = picture.integers(0, 256, (61, 97, 3), dtype=np.uint8)
+    whole, seen = rectify(picture, lens)
+    monkeypatch.setattr(view, "BAND_PIXELS", 500)
+    view._warp.cache_clear()
+    image, mask = rectify(picture, lens, k)
+    np.testing.assert_array_equal(image, shrink_image(whole, k))
+    np.testing.assert_array_equal(mask, shrink_mask(seen, k))
+
+
+def test_resampling_takes_few_bytes_a_pixel():
+    """A blank picture of 16 megapixels has 2 kB, and took 160 bytes a pixel."""
+    lens, picture = (
+        Lens(1024, 1024, 1e3, 1e3, 512.0, 512.0, radial=(0.1, 0.0, 0.0)),
+        np.zeros((1024, 1024, 3), np.uint8),
+    )
+    tracemalloc.start()
+    rectify(picture, lens, 64)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 8 * picture[..., 0].size + 40e6
 
 
 def test_box_ignores_strays():

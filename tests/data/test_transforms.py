@@ -40,6 +40,11 @@ def frame(**keys: Any) -> Callable[[dict], dict]:
     return lambda value: value | {"frames": [value["frames"][0] | keys, *value["frames"][1:]]}
 
 
+def gone(name: str) -> dict:
+    """A frame whose picture is missing."""
+    return FRAMES[0] | {"file_path": name}
+
+
 def entry(i: int, j: int, value: float) -> list:
     """A pose with another number."""
     matrix = np.array(pose())
@@ -78,7 +83,7 @@ FAULTS = {
         ("transforms.json", frame(transform_matrix=[[1, 0], [0, 1]]), "has shape"),
         ("transforms.json", frame(transform_matrix=None), "transform_matrix"),
         ("transforms.json", frame(file_path=None), "frame 0 has no file_path"),
-        ("transforms.json", frame(file_path="gone/r_0"), "gone/r_0: image is missing"),
+        ("transforms.json", {"frames": [gone("gone/r_0")], "near_far_per_frame": None}, "gone/r_0: image is missing"),
         ("transforms.json", dict(w=16, h=8), "r_0.png: image is 12x8, expected 16x8"),
         ("transforms.json", frame(time=NAN), "frame 0: time is nan"),
         ("transforms.json", dict(frames=[]), "found no frames, expected a list of at least 1"),
@@ -117,8 +122,10 @@ FAULTS = {
             ("transforms.json", frame(file_path=name), "is not the name of a file in")
             for name in ("../r_0", "/r_0", "a/../../r_0", "out/r_0", "r\0", "", ".")
         ),
-        ("transforms.json", frame(file_path="x" * 300), "image is missing"),
-        ("transforms.json", frame(file_path="\x1b]0;x\x07" * 40), "image is missing"),
+        *(
+            ("transforms.json", {"frames": [gone(name)], "near_far_per_frame": None}, "image is missing")
+            for name in ("x" * 300, "\x1b]0;x\x07" * 40)
+        ),
         ("transforms.json", {"frames": FRAMES * 5, "near_far_per_frame": None}, "15 frames of 3 pictures"),
         ("r_0.png", lambda _: blank(), "33,554,432 pixels, expected"),
         ("r_0.png", lambda _: scans(), "scans, expected 100 at most in a JPEG"),
@@ -171,10 +178,33 @@ def test_holdout_and_times(blender):
     assert len(load(blender(n=14), holdout=0).test) == 0
 
 
-def test_missing_times_go_by_index(blender):
+@pytest.mark.parametrize("partly", [False, True])
+def test_missing_times_are_the_numbers_of_the_names_in_any_order(blender, partly):
     folder = blender(n=5)
-    change_frames(folder, lambda i: {"time": None})
-    assert [v.time for v in load(folder, holdout=0).train] == [0, 0.25, 0.5, 0.75, 1]
+    change_frames(folder, lambda i: {} if partly and i else {"time": None})
+    file = json.loads((folder / "transforms.json").read_text())
+    save(folder / "transforms.json", file | {"frames": [file["frames"][i] for i in (3, 0, 4, 1, 2)]})
+    d = load(folder, holdout=0)
+    assert [(v.name, v.time) for v in d.train] == [(f"r_{i:03d}", i / 4) for i in (3, 0, 4, 1, 2)]
+    assert d.time_range == (0.0, pytest.approx(4 / 30)) and d.origin.times == "the last number of each name"
+    assert [r for r in d.remarks() if "no time counts" in r] == [
+        "no time counts, as frames have none (1): r_000"
+    ] * partly
+    slow = load(folder, holdout=0, fps=2.0)
+    assert slow.time_range == (0.0, pytest.approx(2)) and slow.origin.fps == 2
+
+
+def test_names_without_numbers_go_by_their_order(blender):
+    folder = blender(n=3)
+    for i, name in enumerate("cab"):
+        (folder / f"r_00{i}.png").rename(folder / f"{name}.png")
+    change_frames(folder, lambda i: {"time": None, "file_path": "cab"[i]})
+    d = load(folder, holdout=0)
+    assert [v.time for v in d.train] == [1, 0, 0.5] and d.origin.times == "the order of the names"
+
+
+def test_a_rate_that_has_no_effect_is_told(blender):
+    assert load(blender(), fps=10.0).remarks() == ["--fps 10 has no effect, since times are known otherwise"]
 
 
 def test_split_files_decide(blender):

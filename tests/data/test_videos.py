@@ -1,13 +1,18 @@
 """The cache of video frames: decoded once, bounded, and made anew when it is lost."""
 
 import errno
+import io
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from folders import CAMERAS, FPS, INSTANTS, rig_views
+from PIL import Image
 from test_colmap import write_synchronised
 from videos import write_video
 
@@ -17,6 +22,12 @@ from pd4dgs_codec.errors import DamageWarning, DataError
 from pd4dgs_codec.train.state import TrainingViews
 
 pytest.importorskip("imageio_ffmpeg")
+
+
+def png() -> bytes:
+    stream = io.BytesIO()
+    Image.new("RGB", (64, 48)).save(stream, "png")
+    return stream.getvalue()
 
 
 @pytest.fixture(scope="module")
@@ -74,6 +85,36 @@ def test_the_cache_stays_within_its_size(stored, monkeypatch, cache):
     monkeypatch.setenv(cached.SIZE, "much")
     with pytest.raises(DataError, match="PD4DGS_CACHE_GIB is 'much', expected GiB > 0"):
         stored(0, 3)
+
+
+WRITER = """
+import fcntl, sys, time
+stream = open(sys.argv[1], "wb")
+fcntl.flock(stream, fcntl.LOCK_EX)
+stream.write(bytes(100_000))
+stream.flush()
+print("written", flush=True)
+time.sleep(60)
+"""
+
+
+def test_what_a_killed_process_left_in_the_cache_is_removed(stored, cache, monkeypatch):
+    """What another process is writing stays, and counts."""
+    folder = cache / ".pd4dgs-other"
+    folder.mkdir(parents=True)
+    argv = [sys.executable, "-c", WRITER, str(folder / cached.UNFINISHED)]
+    with subprocess.Popen(argv, stdout=subprocess.PIPE) as writer:
+        assert writer.stdout.readline()
+        os.utime(folder / cached.UNFINISHED, (0, 0))
+        stored()
+        assert (folder / cached.UNFINISHED).stat().st_size == 100_000
+        monkeypatch.setenv(cached.SIZE, str(100_000 / 2**30))
+        with pytest.raises(DataError, match="expected a larger PD4DGS_CACHE_GIB"):
+            stored(1)
+        monkeypatch.delenv(cached.SIZE)
+        writer.kill()
+    stored(2)
+    assert not folder.exists()
 
 
 def test_a_full_disk_keeps_no_part_of_a_video(folder, monkeypatch, cache):
@@ -169,3 +210,20 @@ def test_damage_inside_a_video_is_told(film):
             list(cached.open_video(film).pictures)
     except DataError as error:  # a decoder may give up
         assert "is damaged" in str(error)
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        b"ffconcat version 1.0\nfile whole.mp4\nfile whole.mp4\n",
+        b"#EXTM3U\n#EXT-X-VERSION:3\n#EXTINF:1,\nwhole.mp4\n#EXT-X-ENDLIST\n",
+        b'<svg xmlns="http://www.w3.org/2000/svg" width="64" height="48"><rect width="9" height="9"/></svg>',
+        png(),
+    ],
+    ids=["concat", "hls", "svg", "png"],
+)
+def test_lists_of_other_files_and_pictures_are_no_videos(film, tmp_path, raw):
+    shutil.copy(film, tmp_path / "whole.mp4")
+    (tmp_path / "list.mp4").write_bytes(raw)
+    with pytest.raises(DataError, match="list.mp4: cannot be decoded: .*; expected a whole video in a container among"):
+        list(cached.open_video(tmp_path / "list.mp4").pictures)

@@ -11,7 +11,7 @@ from videos import write_video
 
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.prepare import FEWEST_FRAMES
-from pd4dgs_codec.prepare.stages import Look, choose, look, open_recording, sharpness, write_frames
+from pd4dgs_codec.prepare.stages import FrameFolder, Look, choose, look, open_recording, sharpness, write_frames
 
 pytest.importorskip("imageio_ffmpeg")
 FPS = 10
@@ -84,6 +84,22 @@ def test_a_video_held_upright_is_upright(recording, film, tmp_path, caplog):
     (found,) = source.pictures([3])
     np.testing.assert_array_equal(found, np.rot90(recording[3]))
     assert not caplog.records
+
+
+@pytest.mark.parametrize("flag", [3, 6])
+def test_pictures_of_a_phone_are_turned_as_they_say(tmp_path, flag):
+    """And may be WebP."""
+    picture = np.random.default_rng(0).integers(0, 255, (6, 8, 3), dtype=np.uint8).repeat(8, 0).repeat(8, 1)
+    exif = Image.Exif()
+    exif[0x0112] = flag
+    for i in range(3):
+        Image.fromarray(np.ascontiguousarray(np.rot90(picture, flag // 3))).save(
+            tmp_path / f"{i}.webp", lossless=True, exif=exif
+        )
+    folder = FrameFolder(tmp_path, 30.0)
+    turned = np.rot90(picture, {3: 3, 6: 1}[flag])
+    assert folder.size == turned.shape[1::-1]
+    np.testing.assert_array_equal(next(folder.pictures([1])), turned)
 
 
 def test_frames_of_a_varying_rate_have_their_times(recording, film, tmp_path):

@@ -101,6 +101,21 @@ def test_pictures_that_changed_since_an_interruption_are_read_anew(tmp_path, mon
                 Image.fromarray(255 - np.asarray(Image.open(file))).save(file)  # the folder stays as it was
 
 
+def test_a_second_run_on_one_output_is_refused_and_leaves_the_first_alone(tmp_path, monkeypatch, capsys):
+    frames, work = write(tmp_path / "frames", walk(COUNT)[0]), tmp_path / "out.partial"
+    codes = []
+
+    def second(*_):
+        codes.append(main([str(frames), "-o", str(tmp_path / "out"), "--frames", "8"]))
+        assert sorted(path.name for path in work.iterdir()) == ["frames.json", "images", "prepare.json"]
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(poses, "extract", second)
+    assert main([str(frames), "-o", str(tmp_path / "out")]) == 1 and codes == [1]
+    assert f"{work}: another process is at work here" in capsys.readouterr().err
+    assert json.loads((work / "prepare.json").read_text())["frames"] == 120
+
+
 @pytest.mark.parametrize("number", ["SIGINT", "SIGTERM"])
 def test_signals_are_ours_once_pycolmap_is_loaded(number):
     """The handlers of pycolmap's C++ would print a stack."""
