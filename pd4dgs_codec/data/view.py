@@ -1,6 +1,7 @@
 """Posed pictures: the dataset that training and evaluation use; lenses and poses as files describe them, and removal of
 lens distortion; for all readers, a dataset of frames: split, times, scene box, depth range and background."""
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -36,6 +37,8 @@ BOX_OVER_DISTANCE = 1.3 / 4.0
 #: A border is one colour if this share of it lies within this many 8-bit levels of its median.
 BORDER_SHARE, BORDER_LEVELS = 0.99, 3
 USES = 4  #: of a picture at most, such as for training and for testing
+#: Views whose pixels count in a fingerprint, evenly spread, and the step between such pixels in lines and columns.
+SAMPLED, STEP = 16, 16
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,6 +110,17 @@ class Dataset:
     def camera(self) -> Camera:
         """The default camera: that of the first training view."""
         return self.train[0].camera
+
+    def fingerprint(self) -> str:
+        """16 hexadecimal digits that change with the training views: their poses, intrinsics, sizes and times, and a
+        sample of their pixels. A name or a folder does not count."""
+        digest = hashlib.sha256()
+        for view in self.train:
+            digest.update(view.viewmat.tobytes() + view.K.tobytes())
+            digest.update(repr((view.width, view.height, float(view.time))).encode())
+        for view in self.train[:: -(-len(self.train) // SAMPLED)]:
+            digest.update(view.image[::STEP, ::STEP].tobytes())
+        return digest.hexdigest()[:16]
 
     def remarks(self) -> list[str]:
         """Limits of this data for training and evaluation, a line each."""

@@ -1,10 +1,11 @@
 """Valid datasets that hold little: one frame, one place, one instant, views without a valid pixel."""
 
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from folders import change_frames, pose
+from folders import change_frames, gradient, pose, save
 from test_captures import write_iphone
 
 from pd4dgs_codec.data.dataset import load
@@ -91,3 +92,18 @@ def test_a_dataset_is_read_only(blender):
         assert state() == before
     finally:
         folder.chmod(0o755)
+
+
+def test_a_fingerprint_changes_with_what_is_trained_on_and_not_with_names(blender, tmp_path):
+    folder = blender()
+    whole = load(folder).fingerprint()
+    renamed = tmp_path.parent / f"{tmp_path.name}-renamed"
+    shutil.copytree(folder, renamed)
+    assert whole == load(renamed).fingerprint() and len(whole) == 16
+    found = {whole, load(folder, downscale=2).fingerprint(), load(folder, holdout=0).fingerprint()}
+    for i, change in enumerate(({"time": 0.31}, {"transform_matrix": pose(0.61)}, {"fl_x": 20})):
+        change_frames(folder, lambda n, change=change: change if n == 3 else {})
+        found.add(load(folder).fingerprint())
+        assert len(found) == 4 + i, change
+    save(folder / "r_003.png", gradient(12, 8, 90))
+    assert load(folder).fingerprint() not in found
