@@ -300,6 +300,7 @@ def synchronised_dataset(
 
     The first camera is held out, unless holdout is 0. depth: near and far, if known.
     """
+    cameras, shape = geometry(cameras, points, depth)
     views: list[StoredView] = []
     count, fps = 0, 0.0
     for i, camera in enumerate(cameras):
@@ -320,7 +321,7 @@ def synchronised_dataset(
         test=tuple(test),
         background=(0.0, 0.0, 0.0),
         time_range=(0.0, (count - 1) / fps if count > 1 else 1.0),
-        **geometry(cameras, points, depth),
+        **shape,
     )
 
 

@@ -3,7 +3,7 @@ lens distortion; for all readers, a dataset of frames: split, times, scene box, 
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -34,6 +34,11 @@ OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 LARGEST_TIME, SPAN_TOLERANCE = float(np.finfo(np.float32).max), 1e-3
 #: Half the side of D-NeRF's box of initial points (1.3) over the distance of its cameras (4).
 BOX_OVER_DISTANCE = 1.3 / 4.0
+#: A scene farther from 0 than so many sides of its box is moved: binary32 coordinates would blur it, and the format
+#: numbers voxels to 1,024 sides.
+FAR_OFF = 100.0
+#: Points span a volume if their deviation along every direction is at least this share of the largest.
+LEAST_SPREAD = 1e-3
 #: A border is one colour if this share of it lies within this many 8-bit levels of its median.
 BORDER_SHARE, BORDER_LEVELS = 0.99, 3
 USES = 4  #: of a picture at most, such as for training and for testing
@@ -91,6 +96,8 @@ class Dataset:
         time 0 and 1, (0, 1) if unknown. up: unit vector, world.
     masked: True if the test masks are covisibility masks. left_out: names of views in neither split, as their masks
         hold no valid pixel.
+    origin: the place in the data's own coordinates that is 0 here. flat_points: the number of points that were read,
+        but span no volume, so that `points` is None.
     """
 
     name: str
@@ -105,6 +112,8 @@ class Dataset:
     up: tuple[float, float, float]
     masked: bool
     left_out: tuple[str, ...] = ()
+    origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    flat_points: int = 0
 
     @property
     def camera(self) -> Camera:
@@ -122,9 +131,18 @@ class Dataset:
             digest.update(view.image[::STEP, ::STEP].tobytes())
         return digest.hexdigest()[:16]
 
+    @property
+    def place(self) -> str:
+        """Where 0 lies in the data's own coordinates, in words; "" if it is their 0."""
+        return f"0 is {', '.join(f'{v:.12g}' for v in self.origin)} of the data" if any(self.origin) else ""
+
     def remarks(self) -> list[str]:
         """Limits of this data for training and evaluation, a line each."""
         remarks = []
+        if self.place:
+            remarks.append(f"the scene is far from 0 and was moved: {self.place}")
+        if self.flat_points:
+            remarks.append(f"start points not used: {self.flat_points:,} that span no volume")
         if self.left_out:
             names = ", ".join(self.left_out[:REMARKED]) + (", ..." if len(self.left_out) > REMARKED else "")
             count = f"{len(self.left_out)} of {len(self.train) + len(self.test) + len(self.left_out)} views"
@@ -339,7 +357,7 @@ def posed_dataset(
 ) -> Dataset:
     """The dataset of these frames.
 
-    points: float32 [M, 3], or None. depth: near and far, box: float32 [2, 3], if known. background: RGB 0..1 of the
+    points: floats [M, 3], or None. depth: near and far, box: floats [2, 3], if known. background: RGB 0..1 of the
     scene, and behind pictures with alpha; None for white if a training picture has alpha, else for the colour of their
     border. composite: False drops alpha (photographs).
     """
@@ -350,6 +368,7 @@ def posed_dataset(
     check_pixels(sum(frame.lens.width * frame.lens.height for frame in frames), files, str(folder))
     white = composite and background is None and any(image_info(frame.image)[2] for frame in train)
     times, start, stop = normalised_times([f.time for f in frames], str(folder))
+    frames, shape = geometry(frames, points, depth, box)
     views = [read_view(f, t, downscale, under) for f, t in zip(frames, times, strict=True)]
     return Dataset(
         name=folder.resolve().name,
@@ -357,7 +376,7 @@ def posed_dataset(
         test=tuple(views[len(train) :]),
         background=background or (WHITE if white else border_color(views[: len(train)])),
         time_range=seconds_range(start, stop),
-        **geometry(frames, points, depth, box),
+        **shape,
     )
 
 
@@ -366,14 +385,34 @@ def geometry(
     points: np.ndarray | None,
     depth: tuple[float, float] | None,
     box: np.ndarray | None = None,
-) -> dict[str, Any]:
-    """The fields of a Dataset that follow from its frames and points, see `posed_dataset`."""
-    if points is not None and not len(points):
+) -> tuple[list[UnreadView], dict[str, Any]]:
+    """(the frames, moved towards 0 if the scene is far from it; the fields of a Dataset that follow from them and the
+    points, see `posed_dataset`)."""
+    flat = 0 if points is None or spans_volume(points) else len(points)
+    if points is not None and (flat or not len(points)):
         points = None
     if box is None:
         box = cameras_box(frames, depth) if points is None else points_box(points)
+    side, middle = float((box[1] - box[0]).max()), box.mean(0, np.float64)
+    origin = np.zeros(3)
+    if np.abs(middle).max() > FAR_OFF * side > 0:  # a round number, so that slightly different data have the same one
+        unit = 10.0 ** np.ceil(np.log10(4 * side))
+        origin = np.round(middle / unit) * unit
+    moved = np.eye(4)
+    moved[:3, 3] = origin
+    frames = [replace(frame, viewmat=frame.viewmat @ moved) for frame in frames]
+    box, points = (None if a is None else (a - origin).astype(np.float32) for a in (box, points))
     near, far = depth or depth_range([f.viewmat for f in frames], box, points)
-    return {"points": points, "box": box, "near": near, "far": far, "up": mean_up(frames), "masked": False}
+    fields = {"points": points, "box": box, "near": near, "far": far, "up": mean_up(frames), "masked": False}
+    return frames, fields | {"origin": tuple(origin.tolist()), "flat_points": flat}
+
+
+def spans_volume(points: np.ndarray) -> bool:
+    """Whether points [M, 3] lie neither at one place nor on a line or a plane, so that they say where a scene is."""
+    if len(points) < 4:
+        return False
+    least, _, most = np.linalg.eigvalsh(np.cov(points.T.astype(np.float64)))
+    return bool(least > LEAST_SPREAD**2 * most)
 
 
 def border_pixels(views: Sequence[View]) -> np.ndarray:
@@ -421,17 +460,17 @@ def seconds_range(start: float, stop: float) -> tuple[float, float]:
 
 
 def points_box(points: np.ndarray) -> np.ndarray:
-    """float32 [2, 3]: the 0.5th to the 99.5th percentile of the points, padded by 10 % of the extent on each side.
+    """float64 [2, 3]: the 0.5th to the 99.5th percentile of the points, padded by 10 % of the extent on each side.
 
     The percentiles keep stray triangulations out; the padding makes room for moving objects, which have no points.
     """
     low, high = np.percentile(points.astype(np.float64), [0.5, 99.5], axis=0)
     pad = np.maximum(0.1 * (high - low), 0.01 * max(float((high - low).max()), 1e-6))
-    return np.stack([low - pad, high + pad]).astype(np.float32)
+    return np.stack([low - pad, high + pad])
 
 
 def cameras_box(frames: Sequence[UnreadView], depth: tuple[float, float] | None = None) -> np.ndarray:
-    """float32 [2, 3]: a cube around the point nearest to all optical axes, or straight ahead if they are parallel.
+    """float64 [2, 3]: a cube around the point nearest to all optical axes, or straight ahead if they are parallel.
 
     Its half side is 1.3/4 of the median distance, as in D-NeRF, or half of far - near if `depth` is known.
     """
@@ -442,11 +481,14 @@ def cameras_box(frames: Sequence[UnreadView], depth: tuple[float, float] | None 
     if np.linalg.eigvalsh(total)[0] > 1e-3 * len(frames):
         middle = np.linalg.solve(total, (normal @ origins[:, :, None]).sum(axis=0)[:, 0])
     else:
-        ahead = sum(depth) / 2 if depth else max(4.0 * float(np.ptp(origins, axis=0).max()), 1.0)
+        apart = float(
+            np.ptp(origins, axis=0).max()
+        )  # 0 up to rounding if there is one viewpoint: any distance is right
+        ahead = sum(depth) / 2 if depth else 4.0 * apart if apart > 1e-9 * float(np.abs(origins).max()) else 1.0
         middle = origins.mean(axis=0) + ahead * axes.mean(axis=0)
     distance = float(np.median(np.linalg.norm(origins - middle, axis=1)))
     half = (depth[1] - depth[0]) / 2 if depth else BOX_OVER_DISTANCE * distance
-    return np.stack([middle - half, middle + half]).astype(np.float32)
+    return np.stack([middle - half, middle + half])
 
 
 def depth_range(views: Sequence[np.ndarray], box: np.ndarray, points: np.ndarray | None) -> tuple[float, float]:
@@ -458,6 +500,7 @@ def depth_range(views: Sequence[np.ndarray], box: np.ndarray, points: np.ndarray
     depths = points[:: max(1, len(points) // 2000)] @ axes[:, :3].T + axes[:, 3]
     ahead = depths[depths > 0]
     if not len(ahead):
-        return 0.01, 100.0
+        side = float((box[1] - box[0]).max())
+        return 0.01 * side, 100.0 * side
     near, far = np.percentile(ahead, [0.5, 99.5])
     return float(0.5 * near), float(1.5 * far)

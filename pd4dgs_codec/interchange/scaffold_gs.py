@@ -71,9 +71,9 @@ def read_scaffold_gs(
     camera, up = None, UP
     if (run / "cameras.json").is_file():
         (camera, *_), up = read_cameras(run / "cameras.json")
-    depth = float(np.float32(NEAR)), FAR
+    box, depth = points_box(anchor).astype(np.float32), (float(np.float32(NEAR)), FAR)
     return Scene(
-        info=SceneInfo(voxel, points_box(anchor), (0.0, 1.0), config.background, *depth, up, 0.0, camera),
+        info=SceneInfo(voxel, box, (0.0, 1.0), config.background, *depth, up, 0.0, camera),
         steps=Steps().scaled(1.0),
         layers=(0,),
         rows=(len(anchor),),

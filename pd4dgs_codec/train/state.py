@@ -18,7 +18,7 @@ from pd4dgs_codec.model.networks import EXACT, Noise, Rounding
 from pd4dgs_codec.quality.measure import level_psnr
 from pd4dgs_codec.scene import MASK_THRESHOLD, instant
 from pd4dgs_codec.train.config import TrainConfig
-from pd4dgs_codec.train.initialise import fresh_model
+from pd4dgs_codec.train.initialise import check_visible, fresh_model
 from pd4dgs_codec.train.optimiser import PER_ANCHOR, Optimiser
 from pd4dgs_codec.train.schedule import GUIDED_SHARE, Schedule
 from pd4dgs_codec.train.ssim import Part, pixel_weights, within_reach
@@ -173,6 +173,7 @@ class TrainState:
         steps = config.model_steps(self.size.steps)
         key = config.key_instant if config.rollout == "key" else None
         model = fresh_model(self.size, dataset, config.widths, steps, config.seed, config.max_layer, key)
+        check_visible(model, dataset)
         self.model = model.to(device)
         self.views = TrainingViews(dataset.train, model.info.background, device)
         self.optimiser = Optimiser(self.model, config.rates, config.cooldown, self.views.exposures.values())
