@@ -98,6 +98,7 @@ def whole_files(names: Sequence[str], overwrite: bool, told: str | None = None) 
         for temporary in temporaries:
             _flush(temporary)
         with held():  # all or none of them
+            check_new(names, overwrite)  # they may have appeared meanwhile
             parent.mkdir(parents=True, exist_ok=True)
             for temporary, name in zip(temporaries, names, strict=True):
                 _move(temporary, Path(name))
@@ -131,11 +132,25 @@ def reading(path: str | Path) -> Iterator[None]:
 
 
 def remove_leftovers(path: str | Path) -> None:
-    """Removes the temporary folders of processes killed while writing `path`. No process may be writing it now."""
+    """Removes the temporary folders of processes that were killed while writing `path`."""
     target = Path(os.path.realpath(path))
     for folder in target.parent.glob(f"{PREFIX}*"):
-        if (folder / target.name).is_file():
+        if (folder / target.name).is_file() and not _is_used(folder):
             shutil.rmtree(folder, ignore_errors=True)
+
+
+def _is_used(folder: Path) -> bool:
+    """Whether the process that made a temporary folder may still run."""
+    number = folder.name.removeprefix(PREFIX).partition("-")[0]
+    if os.name != "posix" or not number.isdigit():
+        return True
+    try:
+        os.kill(int(number), 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # of another user
+        pass
+    return True
 
 
 def is_device(path: Path) -> bool:
@@ -171,7 +186,7 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
     folder = None
     try:
         with held():
-            folder = Path(tempfile.mkdtemp(dir=parent, prefix=PREFIX))
+            folder = Path(tempfile.mkdtemp(dir=parent, prefix=f"{PREFIX}{os.getpid()}-"))
             _FOLDERS.add(folder)
         yield folder
     finally:

@@ -19,6 +19,7 @@ from pd4dgs_codec.archives import Module
 from pd4dgs_codec.data.files import LARGEST, read_vertices
 from pd4dgs_codec.data.view import points_box
 from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.format.symbols import first_duplicate
 from pd4dgs_codec.interchange.runs import PLY, Config, State, iteration, network_of, read_cameras, read_torch, run_of
 from pd4dgs_codec.model.sensitivity import whitening_transform
 from pd4dgs_codec.morton import MAX_VOXEL
@@ -257,6 +258,7 @@ def _cells(anchor: np.ndarray, voxel: float, path: Path) -> np.ndarray:
     if off.max() > OFF_GRID:
         found = f"anchors lie up to {off.max():.3g} voxels off the grid of {voxel:g}"
         raise DataError(f"{path}: {found}, expected multiples of it; --voxel-size sets another")
-    if np.ptp(anchor, axis=0).any() and not np.ptp(cells, axis=0).any():
-        raise DataError(f"{path}: all anchors lie in one voxel of {voxel:g}, expected a smaller voxel size")
+    if (voxels := first_duplicate(cells)) is not None:
+        found = f"several anchors lie in voxel {voxels} of {voxel:g}"
+        raise DataError(f"{path}: {found}, expected one; --voxel-size sets a smaller one")
     return cells.astype(np.int32)

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from pd4dgs_codec.archives import read_tensors
-from pd4dgs_codec.errors import DataError, one_line
+from pd4dgs_codec.errors import DataError, EncodeError, one_line
 from pd4dgs_codec.format.check import check_scene
 from pd4dgs_codec.io import read_source, write_bytes
 from pd4dgs_codec.model.deformation import DeformationField
@@ -31,7 +31,8 @@ VERSION = 1
 
 
 def save(path: str | Path, model: Model, training: dict[str, Any] | None = None) -> None:
-    """Writes the model and `training`, the state for resuming, whole or not at all. Raises DataError. See `target`."""
+    """Writes the model and `training`, the state for resuming, whole or not at all. Raises DataError, also for a model
+    that `load` would refuse. See `target`."""
     real = target(path)
     content = {
         "format": FORMAT,
@@ -45,6 +46,11 @@ def save(path: str | Path, model: Model, training: dict[str, Any] | None = None)
         "state": {name: tensor.detach().cpu() for name, tensor in model.state_dict().items()},
         "training": training or {},
     }
+    try:
+        check_finite(content["state"])
+        _build(content)
+    except (DataError, EncodeError) as error:
+        raise DataError(f"{path}: the model cannot be stored: {error}") from None
     content["digest"] = _digest(content)
     buffer = io.BytesIO()  # torch itself reports a full disk only as "unexpected pos"
     try:

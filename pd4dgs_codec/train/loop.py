@@ -70,6 +70,7 @@ class Trainer:
         """size: the model's size; by default the preset's."""
         self.timed = config.total is None
         self.config, self.dataset = config, dataset
+        self.fingerprint = dataset.fingerprint()
         self.learner = Learner(config, dataset, Schedule(config.total), torch.device(device), size)
         self.learner.share = 0.0 if self.timed else None
         self._costs: list[float] = []  #: seconds of each step from which a timed run estimates N
@@ -205,6 +206,8 @@ class Trainer:
         training = {
             "config": self.config.to_json(),
             "source": self.dataset.name,
+            "place": self.dataset.place,
+            "data": self.fingerprint,
             "seconds": self.seconds,
             "curve": json.dumps(self.curve),
         }
@@ -213,11 +216,15 @@ class Trainer:
     def resume(self, path: Path) -> None:
         """Continues from a checkpoint of the same configuration and data.
 
-        Raises TrainError if it holds no training state, DataError if the state is broken or belongs to other data.
+        Raises TrainError if it holds no training state, DataError if the state is broken or belongs to other data: the
+        pictures and cameras count, not the place where they lie.
         """
         model, training = checkpoint.load(path)
         if "optimiser" not in training:
             raise TrainError(f"{path}: found no training state, expected a checkpoint that pd4dgs-train saved")
+        if training.get("data", self.fingerprint) != self.fingerprint:
+            found = f"other pictures or cameras in {self.dataset.name}"
+            raise DataError(f"{path}: found {found} than it was trained on, expected the same data")
         try:
             self.learner.restore(model, training)
             self.seconds, self.curve = float(training["seconds"]), read_curve(training["curve"])
