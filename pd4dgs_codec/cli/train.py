@@ -134,6 +134,8 @@ def _train(args: argparse.Namespace, console: Console) -> int:
     if first:
         result = _summary(args, trainer)
         console.result(result, _text(result))
+        for doubt in result["doubts"]:
+            say(f"warning: {doubt}")
     return OK
 
 
@@ -308,6 +310,7 @@ def _summary(args: argparse.Namespace, trainer: Trainer) -> dict[str, Any]:
         "seconds": round(trainer.seconds, 3),
         "phases_not_reached": learner.schedule.phases_not_reached(learner.position),
         "skipped": learner.skipped,
+        "doubts": trainer.doubts(),
         "left_out": learner.levels.left_out,
         "anchors": len(trainer.model.anchor_q),
         "active_anchors": learner.active_anchors(),

@@ -19,7 +19,6 @@ from pd4dgs_codec.archives import Module
 from pd4dgs_codec.data.files import LARGEST, read_vertices
 from pd4dgs_codec.data.view import points_box
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.format.symbols import first_duplicate
 from pd4dgs_codec.interchange.runs import PLY, Config, State, iteration, network_of, read_cameras, read_torch, run_of
 from pd4dgs_codec.model.sensitivity import whitening_transform
 from pd4dgs_codec.morton import MAX_VOXEL
@@ -258,7 +257,8 @@ def _cells(anchor: np.ndarray, voxel: float, path: Path) -> np.ndarray:
     if off.max() > OFF_GRID:
         found = f"anchors lie up to {off.max():.3g} voxels off the grid of {voxel:g}"
         raise DataError(f"{path}: {found}, expected multiples of it; --voxel-size sets another")
-    if (voxels := first_duplicate(cells)) is not None:
-        found = f"several anchors lie in voxel {voxels} of {voxel:g}"
+    voxels, counts = np.unique(cells.astype(np.int32), axis=0, return_counts=True)
+    if counts.max() > 1:
+        found = f"several anchors lie in voxel {voxels[counts.argmax()].tolist()} of {voxel:g}"
         raise DataError(f"{path}: {found}, expected one; --voxel-size sets a smaller one")
     return cells.astype(np.int32)

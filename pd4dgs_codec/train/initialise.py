@@ -94,7 +94,7 @@ def fresh_mask_logits(n: int, level: int) -> Tensor:
 def scene_info(dataset: Dataset) -> SceneInfo:
     """The `SceneInfo` of a dataset; a voxel is 1/GRID of the box's longest side. Raises DataError for a box that is too
     small or too large to be drawn, or so far from 0 that the format cannot number its voxels."""
-    box = np.asarray(dataset.box, np.float32)
+    box = np.array(dataset.box, np.float32)
     side, farthest = float((box[1] - box[0]).max()), float(np.abs(box).max())
     if not SIDES[0] <= side <= SIDES[1] or farthest + side > MAX_VOXEL / GRID * side:
         expected = f"a longest side of {SIDES[0]:g} to {SIDES[1]:g} and at most {MAX_VOXEL // GRID} sides from 0"
@@ -176,7 +176,7 @@ def carved_points(dataset: Dataset, count: int, generator: torch.Generator) -> T
     A view shows an object where its pixel differs from the constant background. Points outside every view are rarely
     chosen.
     """
-    low, high = (torch.from_numpy(np.asarray(dataset.box[i], np.float32)) for i in (0, 1))
+    low, high = torch.from_numpy(np.array(dataset.box, np.float32))
     points = low + (high - low) * torch.rand(CARVE_CANDIDATES * count, 3, generator=generator)
     px, py, pz = points.numpy().T.copy()
     seen, hits = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)

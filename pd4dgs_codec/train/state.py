@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -51,10 +52,10 @@ class TrainingView:
         view: View, background: Sequence[float], device: torch.device, exposure: Tensor | None = None
     ) -> TrainingView:
         """Copies the image to the device."""
-        pixels = torch.as_tensor(view.image, device=device)
+        pixels = torch.as_tensor(np.require(view.image, requirements="W"), device=device)  # torch warns of others
         mask = torch.ones(pixels.shape[:2], device=device)
         if view.mask is not None:
-            mask = torch.as_tensor(view.mask, device=device).float()
+            mask = torch.as_tensor(np.require(view.mask, requirements="W"), device=device).float()
         shown = (pixels != torch.tensor(background, device=device) * 255).any(2)
         return TrainingView(view, pixels, pixel_weights(mask), shown.any(1), shown.any(0), int(shown.sum()), exposure)
 

@@ -70,7 +70,7 @@ class Eye:
         small = shrunk_view(view, max(1, min(view.width, view.height) // SIZE))
         self.picture = torch.from_numpy(small.image.astype(np.float32).mean(2) / 255)
         if small.mask is not None:
-            self.picture[~torch.from_numpy(small.mask)] = torch.nan
+            self.picture[torch.from_numpy(~small.mask)] = torch.nan
         viewmat, self.K = (torch.from_numpy(np.array(matrix, np.float32)) for matrix in (small.viewmat, small.K))
         self.rotation = viewmat[:3, :3]
         self.position = -self.rotation.T @ viewmat[:3, 3]
