@@ -142,14 +142,15 @@ def remove_leftovers(path: str | Path) -> None:
 def _is_used(folder: Path) -> bool:
     """Whether the process that made a temporary folder may still run."""
     number = folder.name.removeprefix(PREFIX).partition("-")[0]
-    if os.name != "posix" or not number.isdigit():
-        return True
-    try:
-        os.kill(int(number), 0)
-    except (ProcessLookupError, OverflowError):
+    if not number.isdigit():
         return False
-    except OSError:  # of another user
-        pass
+    if os.name == "posix":  # on Windows this would end the process
+        try:
+            os.kill(int(number), 0)
+        except (ProcessLookupError, OverflowError):
+            return False
+        except OSError:  # of another user
+            pass
     return True
 
 
