@@ -246,13 +246,14 @@ def is_pd4(data: bytes) -> bool:
     return data.startswith(SIGNATURE[:4])
 
 
-def checkpoint_scene(path: str, data: bytes) -> Scene:
-    """The scene of a checkpoint of bytes `data`, read from `path`. Needs torch."""
+def checkpoint_scene(path: str, data: bytes) -> tuple[Scene, str]:
+    """The scene of a checkpoint of bytes `data`, read from `path`, and where its 0 lies in the coordinates of its data,
+    "" if it is their 0. Needs torch."""
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.model.model import to_scene
 
-    model, _ = checkpoint.loads(data, shown_name(path))
-    return to_scene(model)
+    model, training = checkpoint.loads(data, shown_name(path))
+    return to_scene(model), str(training.get("place", ""))
 
 
 def write_checkpoint(path: str, scene: Scene, overwrite: bool) -> None:
