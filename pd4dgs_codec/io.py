@@ -103,6 +103,7 @@ def whole_files(names: Sequence[str], overwrite: bool, told: str | None = None) 
         for temporary in temporaries:
             _flush(temporary)
         with held():  # all or none of them
+            check_new(names, overwrite)  # they may have appeared meanwhile
             parent.mkdir(parents=True, exist_ok=True)
             for temporary, name in zip(temporaries, names, strict=True):
                 _move(temporary, Path(name))
@@ -136,10 +137,10 @@ def reading(path: str | Path) -> Iterator[None]:
 
 
 def remove_leftovers(path: str | Path) -> None:
-    """Removes the temporary folders of processes killed while writing `path`. No process may be writing it now."""
+    """Removes the temporary folders of processes that were killed while writing `path`."""
     target = Path(os.path.realpath(path))
     for folder in target.parent.glob(f"{PREFIX}*"):
-        if (folder / target.name).is_file():
+        if (folder / target.name).is_file() and not _is_used(folder):
             shutil.rmtree(folder, ignore_errors=True)
 
 
@@ -147,6 +148,21 @@ def lock(stream: IO[bytes]) -> None:
     """Locks an open file until it is closed. Raises OSError if another process has locked it."""
     if fcntl is not None:
         fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+
+
+def _is_used(folder: Path) -> bool:
+    """Whether the process that made a temporary folder may still run."""
+    number = folder.name.removeprefix(PREFIX).partition("-")[0]
+    if not number.isdigit():
+        return False
+    if os.name == "posix":  # on Windows this would end the process
+        try:
+            os.kill(int(number), 0)
+        except (ProcessLookupError, OverflowError):
+            return False
+        except OSError:  # of another user
+            pass
+    return True
 
 
 def is_device(path: Path) -> bool:
@@ -182,7 +198,7 @@ def temporary_folder(parent: Path | None = None) -> Iterator[Path]:
     folder = None
     try:
         with held():
-            folder = Path(tempfile.mkdtemp(dir=parent, prefix=PREFIX))
+            folder = Path(tempfile.mkdtemp(dir=parent, prefix=f"{PREFIX}{os.getpid()}-"))
             _FOLDERS.add(folder)
         yield folder
     finally:

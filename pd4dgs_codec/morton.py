@@ -49,7 +49,7 @@ def morton_codes(cells: np.ndarray) -> np.ndarray:
     low, high = cells.min(axis=0).tolist(), cells.max(axis=0).tolist()
     span = max(last - first for first, last in zip(low, high, strict=True))
     if span >> AXIS_BITS:
-        raise EncodeError(f"positions span {span + 1} voxels on one axis, limit {1 << AXIS_BITS}")
+        raise EncodeError(f"positions span {span + 1} voxels on one axis, limit {1 << AXIS_BITS} in a slice")
     codes = np.zeros(len(cells), np.int64)
     for axis, first in enumerate(low):
         offsets = cells[:, axis].astype(np.int64)

@@ -3,6 +3,7 @@
 import errno
 import os
 import signal
+import subprocess
 import sys
 from functools import partial
 from itertools import count
@@ -101,6 +102,33 @@ def test_leftovers_of_a_killed_process_are_found_by_the_file_they_hold(tmp_path)
         file.write_bytes(b"x")
     io.remove_leftovers(tmp_path / "m.pt")
     assert not mine.parent.exists() and all(file.exists() for file in others)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs processes that can be asked for")
+def test_what_another_process_is_writing_is_no_leftover(tmp_path):
+    """A second run on one output removed the folder into which the first was saving."""
+    with io.whole_file(tmp_path / "m.pt", False) as temporary:
+        temporary.write_bytes(b"first")
+        io.remove_leftovers(tmp_path / "m.pt")
+    assert (tmp_path / "m.pt").read_bytes() == b"first"
+    ended = subprocess.run([sys.executable, "-c", "import os; print(os.getpid())"], capture_output=True, check=True)
+    for number in (int(ended.stdout), 10**30):
+        left = tmp_path / f"{io.PREFIX}{number}-abc" / "m.pt"
+        left.parent.mkdir()
+        left.write_bytes(b"x")
+        io.remove_leftovers(tmp_path / "m.pt")
+        assert not left.parent.exists()
+
+
+def test_of_two_writers_of_new_files_one_succeeds(tmp_path):
+    names = [str(tmp_path / "out" / f"{i}.png") for i in range(2)]
+    with pytest.raises(DataError, match="exists already"), io.whole_files(names, False) as late:
+        with io.whole_files(names, False) as early:
+            for temporary in early:
+                temporary.write_bytes(b"early")
+        for temporary in late:
+            temporary.write_bytes(b"late")
+    assert [Path(name).read_bytes() for name in names] == [b"early"] * 2 and os.listdir(tmp_path) == ["out"]
 
 
 #: What a save asks of the system, as far as it can be cut short between two of them.

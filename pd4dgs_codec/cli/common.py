@@ -246,13 +246,14 @@ def is_pd4(data: bytes) -> bool:
     return data.startswith(SIGNATURE[:4])
 
 
-def checkpoint_scene(path: str, data: bytes) -> tuple[Scene, list[Viewpoint]]:
-    """The scene of a checkpoint of bytes `data`, read from `path`, and its training cameras and times. Needs torch."""
+def checkpoint_scene(path: str, data: bytes) -> tuple[Scene, list[Viewpoint], str]:
+    """The scene of a checkpoint of bytes `data`, read from `path`; its training cameras and times; and where its 0 lies
+    in the coordinates of its data, "" if it is their 0. Needs torch."""
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.model.model import to_scene
 
     model, training = checkpoint.loads(data, shown_name(path))
-    return to_scene(model), training.get("viewpoints", [])
+    return to_scene(model), training.get("viewpoints", []), str(training.get("place", ""))
 
 
 def write_checkpoint(path: str, scene: Scene, overwrite: bool) -> None:

@@ -160,15 +160,18 @@ def _load(args: argparse.Namespace) -> tuple[Scene, list[Viewpoint], Metadata | 
 
         return decode(data), [], _metadata(args, metadata_of(data))
     common.check_other_file(args.input, args.output)
-    return *common.checkpoint_scene(args.input, data), _metadata(args, None)
+    scene, viewpoints, place = common.checkpoint_scene(args.input, data)
+    return scene, viewpoints, _metadata(args, None, place)
 
 
-def _metadata(args: argparse.Namespace, had: Metadata | None) -> Metadata | None:
+def _metadata(args: argparse.Namespace, had: Metadata | None, place: str = "") -> Metadata | None:
     """Returns the metadata `had` of the file without what was measured on it, and with the fields replaced that were
-    given as options."""
+    given as options. The source also says where the scene's 0 lies in the coordinates of its data, if not at theirs."""
     if had:
         had = replace(had, quality={}, slices=())
     given = options.given(args, "title", "source", "licence")
+    if place:
+        given["source"] = "; ".join(filter(None, [given.get("source"), place]))
     if not given:
         return had
     from pd4dgs_codec.format.metadata import Metadata

@@ -167,8 +167,9 @@ def checked(kind: Callable[[str], T], accept: Callable[[T], bool], expected: str
     """Makes a type: `kind` converts the text, `accept` checks the value, and `expected` is the form in errors."""
 
     def read(text: str) -> T:
-        with contextlib.suppress(ValueError):
-            if accept(value := kind(text)):
+        with contextlib.suppress(ValueError, OverflowError):
+            value = kind(text)
+            if accept(value) and not (isinstance(value, int) and abs(value) >> 63):  # of hundreds of digits
                 return value
         raise argparse.ArgumentTypeError(f"found {text!r}, expected {expected}")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import shlex
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -115,7 +116,6 @@ def _train(args: argparse.Namespace, console: Console) -> int:
     trainer = Trainer(config, dataset, device)
     if args.resume:
         trainer.resume(Path(args.resume))
-        _check_time_left(trainer, args.resume)
     progress, log = None, None
     if first:
         _announce(trainer, console)
@@ -135,6 +135,8 @@ def _train(args: argparse.Namespace, console: Console) -> int:
     if first:
         result = _summary(args, trainer)
         console.result(result, _text(result))
+        for doubt in result["doubts"]:
+            say(f"warning: {doubt}")
     return OK
 
 
@@ -172,10 +174,12 @@ def _stored_config(args: argparse.Namespace) -> TrainConfig:
     """
     from pd4dgs_codec.model import checkpoint
 
-    _, training = checkpoint.load(args.resume)
+    data = common.read_bytes(args.resume)
+    found = "a .pd4 file, which holds no training state" if common.is_pd4(data) else None
+    training = {} if found else checkpoint.loads(data, args.resume)[1]
     if "config" not in training:
-        what = "no training state (decoded from a .pd4, or stripped)"
-        raise TrainError(f"{args.resume}: found {what}, expected a checkpoint of pd4dgs-train")
+        found = found or "no training state (decoded from a .pd4, or stripped)"
+        raise TrainError(f"{args.resume}: found {found}, expected a checkpoint of pd4dgs-train")
     config = TrainConfig.from_json(training["config"], args.resume)
     for name in FIXED:
         asked = getattr(args, name)
@@ -188,10 +192,12 @@ def _stored_config(args: argparse.Namespace) -> TrainConfig:
     for part in args.without:
         if any(getattr(config, name) != value for name, value in ABLATIONS[part].items()):
             raise TrainError(f"{args.resume}: found --without {part}, expected the settings of the checkpoint")
-    if _same_source(args.source) != _same_source(config.source):
-        _expect_same(args.resume, "SOURCE", config.source, args.source)
     # the number of steps stays, since a time limit that comes later does not make a timed run
-    return replace(config, iterations=config.total, max_seconds=args.max_seconds or config.max_seconds)
+    config = replace(
+        config, source=args.source, iterations=config.total, max_seconds=args.max_seconds or config.max_seconds
+    )
+    _check_unfinished(config, training, args.resume)
+    return config
 
 
 def _expect_same(path: str, what: str, stored: Any, asked: Any) -> None:
@@ -199,18 +205,17 @@ def _expect_same(path: str, what: str, stored: Any, asked: Any) -> None:
         raise TrainError(f"{path}: found {what} {asked}, expected {stored} as in the checkpoint")
 
 
-def _same_source(source: str) -> str:
-    from pd4dgs_codec.data.dataset import SYNTHETIC
-
-    return source if source.startswith(SYNTHETIC) else str(Path(source).resolve())
-
-
-def _check_time_left(trainer: Trainer, path: str) -> None:
-    """Raises TrainError if the run has used up its time limit without having finished."""
-    limit = trainer.config.max_seconds
-    if limit and not trainer.finished and trainer.seconds >= limit:
-        used = f"has used {trainer.seconds:.0f} s of its limit of {limit:g} s"
-        raise TrainError(f"{path}: {used}, expected a higher --max-seconds")
+def _check_unfinished(config: TrainConfig, training: dict[str, Any], path: str) -> None:
+    """Says if the run is complete. Raises TrainError if it has used up its time limit before its end."""
+    total, used = config.total, training.get("seconds")
+    done, end = (training.get("share"), 1) if total is None else (training.get("iteration"), total)
+    if not isinstance(done, int | float) or not isinstance(used, int | float):
+        return  # the trainer refuses the state
+    if done >= end:
+        say(f"{path}: the run is complete; a longer one starts anew, with more --iterations or --max-seconds")
+    elif config.max_seconds and used >= config.max_seconds:
+        spent = f"has used {used:.0f} s of its limit of {config.max_seconds:g} s"
+        raise TrainError(f"{path}: {spent}, expected a higher --max-seconds")
 
 
 # -- log and messages --------------------------------------------------------------------------------------------------
@@ -300,10 +305,12 @@ def _summary(args: argparse.Namespace, trainer: Trainer) -> dict[str, Any]:
         "iterations": trainer.iteration,
         "total": 0 if trainer.timed else trainer.total,  # 0: the run ends by time
         "finished": trainer.finished,
+        "resume": None if trainer.finished else _resuming(args, trainer),
         "interrupted": trainer.interrupted,
         "seconds": round(trainer.seconds, 3),
         "phases_not_reached": learner.schedule.phases_not_reached(learner.position),
         "skipped": learner.skipped,
+        "doubts": trainer.doubts(),
         "left_out": learner.levels.left_out,
         "anchors": len(trainer.model.anchor_q),
         "active_anchors": learner.active_anchors(),
@@ -312,14 +319,27 @@ def _summary(args: argparse.Namespace, trainer: Trainer) -> dict[str, Any]:
     }
 
 
+def _resuming(args: argparse.Namespace, trainer: Trainer) -> str:
+    """The command that resumes the run."""
+    words = ["pd4dgs-train", args.source, "-o", args.output, "--resume", args.output]
+    limit = trainer.config.max_seconds
+    if limit and trainer.seconds >= limit:
+        words += ["--max-seconds", f"{2 * limit:g}"]
+    if args.device != "auto":
+        words += ["--device", args.device]
+    if args.log:
+        words += ["--log", args.log]
+    return shlex.join(words)
+
+
 def _text(result: dict[str, Any]) -> str:
     end = "" if result["finished"] or not result["total"] else f" of {result['total']}"
     steps = f"{result['iterations']}{end} steps in {result['seconds']:.0f} s"
     lines = [f"{result['output']}: {steps}, {result['anchors']} anchors"]
     if result["phases_not_reached"]:
         lines.append(f"phases not reached: {', '.join(result['phases_not_reached'])}")
-    if not result["finished"]:
-        lines.append(f"not finished: --resume {result['output']} continues from here")
+    if result["resume"]:
+        lines.append(f"not finished; to go on: {result['resume']}")
     if result["skipped"]:
         lines.append(f"{result['skipped']} steps skipped for non-finite gradients")
     for row in result["left_out"]:

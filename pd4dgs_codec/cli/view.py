@@ -110,6 +110,6 @@ def _packed(source: str) -> bytes:
     from pd4dgs_codec.format.encoder import encode
     from pd4dgs_codec.web.page import EFFORT
 
-    scene, _ = common.checkpoint_scene(source, data)
+    scene, *_ = common.checkpoint_scene(source, data)
     say(f"{common.shown_name(source)}: encoding the checkpoint")
     return encode(scene, effort=EFFORT, omit="nothing")

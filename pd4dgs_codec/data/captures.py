@@ -42,11 +42,9 @@ from pd4dgs_codec.data.view import (
     Origin,
     UnreadView,
     View,
-    cameras_box,
     check_rotation,
     checked_rotation,
     held_out,
-    points_box,
     posed_dataset,
     without_first_camera,
     world_to_camera,
@@ -60,7 +58,7 @@ from pd4dgs_codec.errors import DataError, one_line
 class CameraFiles:
     """The cameras of both splits, centred and scaled, with lenses in pixels of rgb/{factor}x and time ids as times.
 
-    points: float32 [M, 3] of points.npy, centred and scaled, or None. scene, extra: the JSON files.
+    points: float64 [M, 3] of points.npy, centred and scaled, or None. scene, extra: the JSON files.
     """
 
     train: tuple[UnreadView, ...]
@@ -131,8 +129,8 @@ def _points(folder: Path, center: np.ndarray, scale: float) -> np.ndarray | None
     points = read_npy(read_file(path), str(path))
     if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind != "f":
         raise DataError(f"{path}: found {points.dtype} {points.shape}, expected floats [M, 3]")
-    points = (points[(np.abs(points) <= LARGEST).all(axis=1)].astype(np.float64) - center) * scale  # without NaN, too
-    return points.astype(np.float32) if len(points) else None
+    finite = (np.abs(points) <= LARGEST).all(axis=1)  # False for NaN
+    return np.asarray((points[finite].astype(np.float64) - center) * scale)
 
 
 def read_cameras(folder: Path) -> CameraFiles:
@@ -162,7 +160,7 @@ def read_cameras(folder: Path) -> CameraFiles:
 def read_iphone(folder: Path, downscale: int, holdout: int, background: Color | None) -> Dataset:
     """Reads rgb/{factor}x (see `dataset.load`). The dataset's split decides, and `holdout` is ignored."""
     files = read_cameras(folder)
-    box, depth = _box_and_depth(files, [*files.train, *files.test], folder)
+    box, depth = _box_and_depth(files, folder)
     where = f"{folder / 'extra.json'}: "
     r, g, b = array(files.extra.get("background", [0.0] * 3), (3,), f"{where}background").tolist()
     fps = FPS if files.extra.get("fps") is None else number(files.extra["fps"], f"{where}fps", positive=True)
@@ -186,14 +184,12 @@ def read_iphone(folder: Path, downscale: int, holdout: int, background: Color | 
     return replace(dataset, test=test, masked=masked, up=up)
 
 
-def _box_and_depth(
-    files: CameraFiles, frames: list[UnreadView], folder: Path
-) -> tuple[np.ndarray, tuple[float, float] | None]:
-    """The scene box, and (near, far) of scene.json, scene units, or None."""
-    box = cameras_box(frames) if files.points is None else points_box(files.points)
+def _box_and_depth(files: CameraFiles, folder: Path) -> tuple[np.ndarray | None, tuple[float, float] | None]:
+    """The scene box of extra.json, and (near, far) of scene.json, scene units; None for either that is missing."""
+    box = None
     if files.extra.get("bbox") is not None:
         where = f"{folder / 'extra.json'}: bbox"
-        box = array(files.extra["bbox"], (2, 3), where).astype(np.float32)
+        box = array(files.extra["bbox"], (2, 3), where)
         if not (box[0] < box[1]).all():
             raise DataError(f"{where} is {box.tolist()}, expected a lower and an upper corner")
     if files.scene.get("near") is None or files.scene.get("far") is None:
@@ -368,7 +364,7 @@ def _panoptic_lens(k: Any, size: tuple[int, int], where: str) -> Lens:
 
 
 def _panoptic_points(path: Path) -> np.ndarray | None:
-    """Points float32 [M, 3] of the archive, or None. Large archives are not unpacked whole."""
+    """Points, floats [M, 3], of the archive, or None. Large archives are not unpacked whole."""
     if not path.is_file():
         return None
     raw = read_file(path)
@@ -389,4 +385,4 @@ def _panoptic_points(path: Path) -> np.ndarray | None:
     table = read_npy(held, f"{path}: data")
     if table.ndim != 2 or table.shape[1] < 6:
         raise DataError(f"{path}: data has shape {table.shape}, expected numbers [M, 6] or wider")
-    return np.asarray(table[(np.abs(table[:, :6]) <= LARGEST).all(axis=1), :3], np.float32)  # without NaN, too
+    return np.asarray(table[(np.abs(table[:, :6]) <= LARGEST).all(axis=1), :3])  # without NaN, too

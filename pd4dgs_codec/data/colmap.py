@@ -148,7 +148,7 @@ def _rig(model: Path, cameras: list[UnreadView], videos: dict[str, Path]) -> lis
 
 
 def _registered(model: Path, kind: str) -> tuple[list[UnreadView], np.ndarray | None]:
-    """(the pictures of a model, sorted by name, with that name as `image` and time 0; points float32 [M, 3], or
+    """(the pictures of a model, sorted by name, with that name as `image` and time 0; points float64 [M, 3], or
     None)."""
     read = _reader(kind)
     lenses = dict(read(model / f"cameras{kind}").cameras())
@@ -167,7 +167,7 @@ def _registered(model: Path, kind: str) -> tuple[list[UnreadView], np.ndarray | 
     if not (model / f"points3D{kind}").is_file():
         return frames, None
     points = np.array(list(read(model / f"points3D{kind}").points()), np.float64).reshape(-1, 3)
-    return frames, points[(np.abs(points) <= LARGEST).all(axis=1)].astype(np.float32)  # also false of NaN
+    return frames, points[(np.abs(points) <= LARGEST).all(axis=1)]  # also false of NaN
 
 
 def _reader(kind: str) -> type[_Binary] | type[_Text]:

@@ -42,7 +42,8 @@ def reach(root: np.ndarray, target: np.ndarray, lengths: tuple[float, float], be
     second = first * lengths[1] / lengths[0]
     along = (first**2 - second**2 + far**2) / (2 * far)
     aside = bend - line * (bend @ line) / far**2
-    return root + line * (along / far) + aside / np.linalg.norm(aside) * np.sqrt(max(first**2 - along**2, 0.0))
+    away = np.sqrt(max(first**2 - along**2, 0.0)) / np.linalg.norm(aside)
+    return np.asarray(root + line * (along / far) + aside * away)
 
 
 def bone(start: np.ndarray, end: np.ndarray, side: np.ndarray) -> Pose:

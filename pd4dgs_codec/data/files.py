@@ -536,7 +536,7 @@ def read_only_ply(folder: Path) -> np.ndarray | None:
 
 
 def read_ply(path: Path) -> np.ndarray:
-    """Points float32 [M, 3], without points that are not finite or beyond LARGEST."""
+    """Points float64 [M, 3], without points that are not finite or beyond LARGEST."""
     vertices = read_vertices(path)
-    points = np.stack([vertices[c] for c in "xyz"], axis=1)
-    return np.asarray(points[(np.abs(points) <= LARGEST).all(axis=1)], np.float32)  # without NaN, too
+    points = np.stack([vertices[c] for c in "xyz"], axis=1, dtype=np.float64)
+    return np.asarray(points[(np.abs(points) <= LARGEST).all(axis=1)])  # without NaN, too

@@ -322,6 +322,7 @@ def synchronised_dataset(
 
     source: of the points. The first camera is held out, unless holdout is 0. depth: near and far, if known.
     """
+    cameras, shape = geometry(cameras, points, depth)
     views: list[StoredView] = []
     count, fps = 0, 0.0
     for i, camera in enumerate(cameras):
@@ -343,7 +344,7 @@ def synchronised_dataset(
         background=(0.0, 0.0, 0.0),
         time_range=(0.0, (count - 1) / fps if count > 1 else 1.0),
         origin=Origin(f"the videos, {fps:g} a second", points=source, posed=f"{len(cameras)} videos with a pose"),
-        **geometry(cameras, points, depth),
+        **shape,
     )
 
 

@@ -44,6 +44,11 @@ LARGEST_TIME, SPAN_TOLERANCE = float(np.finfo(np.float32).max), 1e-3
 LEVEL_SPREAD, LEVEL_ROLL, UPSIDE = 1e-3, 0.25, 0.1
 #: Half the side of D-NeRF's box of initial points (1.3) over the distance of its cameras (4).
 BOX_OVER_DISTANCE = 1.3 / 4.0
+#: A scene farther from 0 than so many sides of its box is moved: binary32 coordinates would blur it, and the format
+#: numbers voxels to 1,024 sides.
+FAR_OFF = 100.0
+#: Points span a volume if their deviation along every direction is at least this share of the largest.
+LEAST_SPREAD = 1e-3
 #: A border is one colour if this share of it lies within this many 8-bit levels of its median.
 BORDER_SHARE, BORDER_LEVELS = 0.99, 3
 #: A lens is scaled to a picture that is larger or smaller by this share; one that is cropped a little is refused.
@@ -122,6 +127,8 @@ class Dataset:
         time 0 and 1, (0, 1) if unknown. up: unit vector, world.
     masked: True if the test masks are covisibility masks. left_out: names of views in neither split, as their masks
         hold no valid pixel.
+    shift: the place in the data's own coordinates that is 0 here. flat_points: the number of points that were read,
+        but span no volume, so that `points` is None.
     """
 
     name: str
@@ -137,6 +144,8 @@ class Dataset:
     masked: bool
     left_out: tuple[str, ...] = ()
     origin: Origin = Origin()
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    flat_points: int = 0
 
     @property
     def camera(self) -> Camera:
@@ -153,6 +162,11 @@ class Dataset:
         for view in self.train[:: -(-len(self.train) // SAMPLED)]:
             digest.update(view.image[::STEP, ::STEP].tobytes())
         return digest.hexdigest()[:16]
+
+    @property
+    def place(self) -> str:
+        """Where 0 lies in the data's own coordinates, in words; "" if it is their 0."""
+        return f"0 is {', '.join(f'{v:.12g}' for v in self.shift)} of the data" if any(self.shift) else ""
 
     def summary(self) -> list[str]:
         """What was read, a line each: views and pictures, times, colours, start points."""
@@ -179,6 +193,10 @@ class Dataset:
     def remarks(self) -> list[str]:
         """Limits of this data for training and evaluation, a line each."""
         remarks = list(self.origin.notes)
+        if self.place:
+            remarks.append(f"the scene is far from 0 and was moved: {self.place}")
+        if self.flat_points:
+            remarks.append(f"start points not used: {self.flat_points:,} that span no volume")
         if self.left_out:
             remarks.append(counted("views left out, no valid pixel in the mask", self.left_out))
         if len({view.time for view in self.train}) == 1:
@@ -428,7 +446,7 @@ def posed_dataset(
 ) -> Dataset:
     """The dataset of these frames. Those whose picture is missing are left out.
 
-    points: float32 [M, 3], or None. depth: near and far, box: float32 [2, 3], if known. background: RGB 0..1 of the
+    points: floats [M, 3], or None. depth: near and far, box: floats [2, 3], if known. background: RGB 0..1 of the
     scene, and behind pictures with alpha; None for white if a training picture has alpha, else for the colour of their
     border. composite: False drops alpha (photographs). origin: of the times and points; with fps, the times of the
     frames are numbers of frames. If frames have no times, the last number in the name of their picture is theirs, or
@@ -440,6 +458,7 @@ def posed_dataset(
     if len(frames) > USES * len(files):
         raise DataError(f"{folder}: {len(frames)} frames of {len(files)} pictures, expected at most {USES} per picture")
     check_pixels(sum(frame.lens.width * frame.lens.height for frame in frames), files, str(folder))
+    frames, shape = geometry(frames, points, depth, box)
     alpha = composite and any(image_info(frame.image)[2] for frame in train)
     if untimed := [frame.name for frame in frames if frame.time is None]:
         if len(untimed) < len(frames):
@@ -459,7 +478,7 @@ def posed_dataset(
         background=background or (WHITE if alpha else border_color(views[: len(train)])),
         time_range=seconds_range(start, stop),
         origin=replace(origin, posed=posed, alpha=alpha),
-        **geometry(frames, points, depth, box),
+        **shape,
     )
 
 
@@ -504,14 +523,26 @@ def geometry(
     points: np.ndarray | None,
     depth: tuple[float, float] | None,
     box: np.ndarray | None = None,
-) -> dict[str, Any]:
-    """The fields of a Dataset that follow from its frames and points, see `posed_dataset`."""
-    if points is not None and not len(points):
+) -> tuple[list[UnreadView], dict[str, Any]]:
+    """(the frames, moved towards 0 if the scene is far from it; the fields of a Dataset that follow from them and the
+    points, see `posed_dataset`)."""
+    flat = 0 if points is None or spans_volume(points) else len(points)
+    if points is not None and (flat or not len(points)):
         points = None
     if box is None:
         box = cameras_box(frames, depth) if points is None else points_box(points)
+    side, middle = float((box[1] - box[0]).max()), box.mean(0, np.float64)
+    shift = np.zeros(3)
+    if np.abs(middle).max() > FAR_OFF * side > 0:  # a round number, so that slightly different data have the same one
+        unit = 10.0 ** np.ceil(np.log10(4 * side))
+        shift = np.round(middle / unit) * unit
+    moved = np.eye(4)
+    moved[:3, 3] = shift
+    frames = [replace(frame, viewmat=frame.viewmat @ moved) for frame in frames]
+    box = (box - shift).astype(np.float32)
+    points = None if points is None else (points - shift).astype(np.float32)
     near, far = depth or depth_range([f.viewmat for f in frames], box, points)
-    return {
+    fields = {
         "points": points,
         "box": box,
         "near": near,
@@ -519,6 +550,15 @@ def geometry(
         "up": up_direction([f.viewmat for f in frames]),
         "masked": False,
     }
+    return frames, fields | {"shift": tuple(shift.tolist()), "flat_points": flat}
+
+
+def spans_volume(points: np.ndarray) -> bool:
+    """Whether points [M, 3] lie neither at one place nor on a line or a plane, so that they say where a scene is."""
+    if len(points) < 4:
+        return False
+    least, _, most = np.linalg.eigvalsh(np.cov(points.T.astype(np.float64)))
+    return bool(least > LEAST_SPREAD**2 * most)
 
 
 def border_pixels(views: Sequence[View]) -> np.ndarray:
@@ -578,17 +618,17 @@ def seconds_range(start: float, stop: float) -> tuple[float, float]:
 
 
 def points_box(points: np.ndarray) -> np.ndarray:
-    """float32 [2, 3]: the 0.5th to the 99.5th percentile of the points, padded by 10 % of the extent on each side.
+    """float64 [2, 3]: the 0.5th to the 99.5th percentile of the points, padded by 10 % of the extent on each side.
 
     The percentiles keep stray triangulations out; the padding makes room for moving objects, which have no points.
     """
     low, high = np.percentile(points.astype(np.float64), [0.5, 99.5], axis=0)
     pad = np.maximum(0.1 * (high - low), 0.01 * max(float((high - low).max()), 1e-6))
-    return np.stack([low - pad, high + pad]).astype(np.float32)
+    return np.stack([low - pad, high + pad])
 
 
 def cameras_box(frames: Sequence[UnreadView], depth: tuple[float, float] | None = None) -> np.ndarray:
-    """float32 [2, 3]: a cube around the point nearest to all optical axes, or straight ahead if they are parallel.
+    """float64 [2, 3]: a cube around the point nearest to all optical axes, or straight ahead if they are parallel.
 
     Its half side is 1.3/4 of the median distance, as in D-NeRF, or half of far - near if `depth` is known.
     """
@@ -599,11 +639,14 @@ def cameras_box(frames: Sequence[UnreadView], depth: tuple[float, float] | None 
     if np.linalg.eigvalsh(total)[0] > 1e-3 * len(frames):
         middle = np.linalg.solve(total, (normal @ origins[:, :, None]).sum(axis=0)[:, 0])
     else:
-        ahead = sum(depth) / 2 if depth else max(4.0 * float(np.ptp(origins, axis=0).max()), 1.0)
+        apart = float(
+            np.ptp(origins, axis=0).max()
+        )  # 0 up to rounding if there is one viewpoint: any distance is right
+        ahead = sum(depth) / 2 if depth else 4.0 * apart if apart > 1e-9 * float(np.abs(origins).max()) else 1.0
         middle = origins.mean(axis=0) + ahead * axes.mean(axis=0)
     distance = float(np.median(np.linalg.norm(origins - middle, axis=1)))
     half = (depth[1] - depth[0]) / 2 if depth else BOX_OVER_DISTANCE * distance
-    return np.stack([middle - half, middle + half]).astype(np.float32)
+    return np.stack([middle - half, middle + half])
 
 
 def depth_range(views: Sequence[np.ndarray], box: np.ndarray, points: np.ndarray | None) -> tuple[float, float]:
@@ -615,6 +658,7 @@ def depth_range(views: Sequence[np.ndarray], box: np.ndarray, points: np.ndarray
     depths = points[:: max(1, len(points) // 2000)] @ axes[:, :3].T + axes[:, 3]
     ahead = depths[depths > 0]
     if not len(ahead):
-        return 0.01, 100.0
+        side = float((box[1] - box[0]).max())
+        return 0.01 * side, 100.0 * side
     near, far = np.percentile(ahead, [0.5, 99.5])
     return float(0.5 * near), float(1.5 * far)

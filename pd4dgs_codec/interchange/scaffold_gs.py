@@ -71,9 +71,9 @@ def read_scaffold_gs(
     camera, up = None, UP
     if (run / "cameras.json").is_file():
         (camera, *_), up = read_cameras(run / "cameras.json")
-    depth = float(np.float32(NEAR)), FAR
+    box, depth = points_box(anchor).astype(np.float32), (float(np.float32(NEAR)), FAR)
     return Scene(
-        info=SceneInfo(voxel, points_box(anchor), (0.0, 1.0), config.background, *depth, up, 0.0, camera),
+        info=SceneInfo(voxel, box, (0.0, 1.0), config.background, *depth, up, 0.0, camera),
         steps=Steps().scaled(1.0),
         layers=(0,),
         rows=(len(anchor),),
@@ -257,9 +257,8 @@ def _cells(anchor: np.ndarray, voxel: float, path: Path) -> np.ndarray:
     if off.max() > OFF_GRID:
         found = f"anchors lie up to {off.max():.3g} voxels off the grid of {voxel:g}"
         raise DataError(f"{path}: {found}, expected multiples of it; --voxel-size sets another")
-    if np.ptp(anchor, axis=0).any() and not np.ptp(cells, axis=0).any():
-        raise DataError(f"{path}: all anchors lie in one voxel of {voxel:g}, expected a smaller voxel size")
-    if shared := len(cells) - len(np.unique(cells, axis=0)):
-        found = f"{shared:,} of {len(cells):,} anchors share a voxel of {voxel:g} with another"
-        raise DataError(f"{path}: {found}, expected one anchor per voxel")
+    voxels, counts = np.unique(cells.astype(np.int32), axis=0, return_counts=True)
+    if counts.max() > 1:
+        found = f"several anchors lie in voxel {voxels[counts.argmax()].tolist()} of {voxel:g}"
+        raise DataError(f"{path}: {found}, expected one; --voxel-size sets a smaller one")
     return cells.astype(np.int32)

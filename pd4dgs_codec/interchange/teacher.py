@@ -105,6 +105,8 @@ def load_source(
     if not options.cameras:
         return _around(source, Path(place), teacher, options, downscale, holdout)
     data = load(options.cameras, downscale=downscale, holdout=holdout, background=options.background)
+    if data.place:
+        raise DataError(f"{options.cameras}: the cameras are too far from 0 ({data.place}), expected a model near 0")
     poses = [(view.camera, view.time) for view in data.train]  # the held-out pictures stay
     train = _pictures(teacher, poses, data.background, data.near)
     return replace(data, name=source, train=tuple(train), points=_points(teacher, _solid(source, teacher, MIDDLE)))
@@ -119,7 +121,7 @@ def _around(source: str, place: Path, teacher: Teacher, options: Options, downsc
     times = teacher.times or tuple(np.linspace(0, 1, BOX_TIMES))
     some = spread(times, BOX_TIMES)
     everywhere = np.concatenate([teacher.splats(t).means[_solid(source, teacher, t)] for t in some])
-    box = points_box(everywhere)
+    box = points_box(everywhere).astype(np.float32)
     near, far = depth_range([c.viewmat.astype(np.float64) for c in cameras], box, everywhere)
     background = options.background or teacher.background
     views = _pictures(teacher, poses, background, near)

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 from pd4dgs_codec.archives import read_tensors
-from pd4dgs_codec.errors import DataError, one_line
+from pd4dgs_codec.errors import DataError, EncodeError, one_line
 from pd4dgs_codec.format.check import check_info, check_scene
 from pd4dgs_codec.io import read_source, write_bytes
 from pd4dgs_codec.model.deformation import DeformationField
@@ -32,11 +32,12 @@ VERSION = 1
 
 
 def save(path: str | Path, model: Model, training: dict[str, Any] | None = None) -> None:
-    """Writes the model and `training`, the state for resuming, whole or not at all. Raises DataError. See `target`."""
+    """Writes the model and `training`, the state for resuming, whole or not at all. Raises DataError, also for a model
+    that `load` would refuse. See `target`."""
     real, training = target(path), dict(training or {})
     if viewpoints := training.get("viewpoints"):
         training["viewpoints"] = [[_camera_to_plain(camera), time] for camera, time in viewpoints]
-    content = {
+    content: dict[str, Any] = {
         "format": FORMAT,
         "version": VERSION,
         "info": _info_to_plain(model.info),
@@ -48,6 +49,11 @@ def save(path: str | Path, model: Model, training: dict[str, Any] | None = None)
         "state": {name: tensor.detach().cpu() for name, tensor in model.state_dict().items()},
         "training": training,
     }
+    try:
+        check_finite(content["state"])
+        _build(content)
+    except (DataError, EncodeError) as error:
+        raise DataError(f"{path}: the model cannot be stored: {error}") from None
     content["digest"] = _digest(content)
     buffer = io.BytesIO()  # torch itself reports a full disk only as "unexpected pos"
     try:

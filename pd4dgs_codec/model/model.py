@@ -294,7 +294,7 @@ def from_scene(scene: Scene) -> Model:
         {name: MLP.from_arrays(net) for name, net in scene.networks.items()},
         global_field,
         local_field,
-        *(torch.from_numpy(np.array(a)) for g in (scene.grading,) if g is not None for a in (g.classes, g.centre)),
+        *(() if scene.grading is None else map(torch.tensor, (scene.grading.classes, scene.grading.centre))),
     )
 
 

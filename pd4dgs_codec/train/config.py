@@ -11,7 +11,7 @@ import math
 from dataclasses import dataclass, field, fields, is_dataclass, replace
 from typing import Any
 
-from pd4dgs_codec.errors import TrainError
+from pd4dgs_codec.errors import TrainError, one_line
 from pd4dgs_codec.model.config import PRESETS
 from pd4dgs_codec.scene import MAX_FEATURE, MAX_SLOTS, Steps, Widths
 
@@ -88,6 +88,8 @@ def option(default: Any, **about: Any) -> Any:
     return field(default=default, metadata={"option": Option(**about)})
 
 
+#: That a checkpoint may count.
+MOST_STEPS = 2_000_000_000
 #: Steps up to which a run uses the deformation rates of `LearningRates` unchanged.
 SHORT_RUN = 1500
 
@@ -157,7 +159,11 @@ class TrainConfig:
     background: tuple[float, float, float] | None = option(None, least=0, most=1, count=3)
     #: None: the preset's default, or as many as `max_seconds` allows
     iterations: int | None = option(
-        None, help=f"training steps (default: {_STEPS}; with --max-seconds as many as fit)", metavar="N", least=1
+        None,
+        help=f"training steps (default: {_STEPS}; with --max-seconds as many as fit)",
+        metavar="N",
+        least=1,
+        most=MOST_STEPS,
     )
     #: without `iterations`, the schedule is spread over this time; with `iterations`, the limit stops the run early
     max_seconds: float | None = option(
@@ -257,8 +263,9 @@ class TrainConfig:
         try:
             config: TrainConfig = _rebuilt(json.loads(text), TrainConfig())
             return config
-        except (ValueError, TypeError, AttributeError, RecursionError) as error:
-            raise TrainError(f"{path}: its stored configuration cannot be read: {error}") from None
+        except (ValueError, TypeError, AttributeError, RecursionError, OverflowError) as error:
+            reason = one_line(str(error), 160)
+            raise TrainError(f"{path}: its stored configuration cannot be read: {reason}") from None
 
 
 #: The `Option` of each declared field of `TrainConfig`.
@@ -277,13 +284,16 @@ def at_quality(quality: float) -> dict[str, float]:
 
 
 def _rebuilt(plain: Any, like: Any) -> Any:
-    """Converts JSON data to the type of `like`: nested dataclasses, and tuples for lists. Raises ValueError, TypeError
-    or AttributeError."""
+    """Converts JSON data to the type of `like`: nested dataclasses, and tuples for lists. Raises ValueError, TypeError,
+    AttributeError or OverflowError."""
     if is_dataclass(like) and not isinstance(like, type):
         return type(like)(**{name: _rebuilt(value, getattr(like, name)) for name, value in plain.items()})
-    if isinstance(plain, list):
-        return tuple(_rebuilt(value, like[0] if isinstance(like, tuple) else 0.0) for value in plain)
-    kind = (int, float) if isinstance(like, float) else type(like)
-    if like is not None and not isinstance(plain, kind) or isinstance(plain, dict):
+    if like is None and plain is None:
+        return None
+    if isinstance(plain, list) and (like is None or isinstance(like, tuple) and len(plain) == len(like)):
+        return tuple(_rebuilt(value, 0.0) for value in plain)
+    kind = (int, float) if like is None or isinstance(like, float) else type(like)
+    fits = isinstance(plain, kind) and isinstance(plain, bool) == isinstance(like, bool)  # True is an int
+    if not fits or isinstance(plain, (int, float)) and not math.isfinite(plain):
         raise ValueError(f"found {plain!r}, expected a value like {like!r}")
     return plain

@@ -9,7 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.data.view import Dataset, View, border_pixels
+from pd4dgs_codec.data.view import Dataset, View, border_pixels, spans_volume
+from pd4dgs_codec.draw.gaussians import LEAST_NEAR
+from pd4dgs_codec.draw.projection import FAR
 from pd4dgs_codec.draw.simd import Tasks, parallel
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.model.config import ModelConfig
@@ -21,9 +23,13 @@ from pd4dgs_codec.train.stereo import with_points
 
 #: Voxels along the longest side of the scene's box.
 GRID = 1024
+#: The shortest and the longest such side, scene units: nothing is drawn nearer than LEAST_NEAR or farther than FAR.
+SIDES = 10 * LEAST_NEAR, 0.1 * FAR
 MASK_START = 2.0
 #: a_j of absent levels: its softplus is 4e-18, so their masks equal those of the highest level present.
 TIED = -40.0
+#: A view shows a model if its anchors are at so many of its pixels or more.
+LEAST_PIXELS = 10
 NEAREST = 3  #: neighbours whose distance sets the size of an anchor
 #: For a dataset without points: random candidates per initial point, and training views that score them.
 CARVE_CANDIDATES = 20
@@ -86,12 +92,12 @@ def fresh_mask_logits(n: int, level: int) -> Tensor:
 
 
 def scene_info(dataset: Dataset) -> SceneInfo:
-    """The `SceneInfo` of a dataset; a voxel is 1/GRID of the box's longest side. Raises DataError for a box without
-    extent, or one so far from the origin that the format cannot number its voxels."""
-    box = np.asarray(dataset.box, np.float32)
+    """The `SceneInfo` of a dataset; a voxel is 1/GRID of the box's longest side. Raises DataError for a box that is too
+    small or too large to be drawn, or so far from 0 that the format cannot number its voxels."""
+    box = np.array(dataset.box, np.float32)
     side, farthest = float((box[1] - box[0]).max()), float(np.abs(box).max())
-    if not side > 0 or farthest + side > MAX_VOXEL / GRID * side:
-        expected = f"one with a side and at most {MAX_VOXEL // GRID} sides from 0"
+    if not SIDES[0] <= side <= SIDES[1] or farthest + side > MAX_VOXEL / GRID * side:
+        expected = f"a longest side of {SIDES[0]:g} to {SIDES[1]:g} and at most {MAX_VOXEL // GRID} sides from 0"
         raise DataError(f"{dataset.name}: the scene's box is {box.tolist()}, expected {expected}")
     return SceneInfo(
         voxel_size=_binary32(side / GRID),
@@ -109,8 +115,9 @@ def scene_info(dataset: Dataset) -> SceneInfo:
 def initial_cells(dataset: Dataset, count: int, voxel_size: float, generator: torch.Generator) -> Tensor:
     """int32 [n, 3] unique voxel cells, about `count` of them."""
     points = torch.from_numpy(np.array(() if dataset.points is None else dataset.points, np.float32).reshape(-1, 3))
-    points = points[near_box(points, torch.from_numpy(np.asarray(dataset.box, np.float32)))]
-    if len(points) == 0:
+    box = torch.from_numpy(np.array(dataset.box, np.float32))
+    points = points[near_box(points, box)]
+    if not spans_volume(points.numpy()):
         points = carved_points(dataset, count, generator)
     elif len(points) > count:
         points = points[torch.randperm(len(points), generator=generator)[:count]]
@@ -119,8 +126,23 @@ def initial_cells(dataset: Dataset, count: int, voxel_size: float, generator: to
         pick = torch.randint(len(points), (count - len(points),), generator=generator)
         jitter = torch.randn(len(pick), 3, generator=generator) * spacing[pick, None]
         points = torch.cat([points, points[pick] + jitter])
+        points = points[near_box(points, box)]
     cells: Tensor = torch.unique(torch.round(points / voxel_size).to(torch.int32), dim=0)
     return cells
+
+
+def check_visible(model: Model, dataset: Dataset) -> None:
+    """Raises DataError if hardly an anchor of a fresh model is in any picture, so that nothing could be learnt."""
+    x, y, z = model.anchor.cpu().numpy().T.copy()
+    most = 0
+    for view in _carving_views(dataset):
+        line, column, inside = view.project(x, y, z)
+        most = max(most, len(np.unique((line * view.width + column)[inside])))
+        if most >= min(LEAST_PIXELS, view.width * view.height):
+            return
+    found = f"the {len(x):,} start points are at {most} different pixels of a training picture at most"
+    expected = "poses, focal lengths and units that belong together"
+    raise DataError(f"{dataset.name}: the pictures show nothing of the scene: {found}, expected {expected}")
 
 
 def near_box(points: Tensor, box: Tensor) -> Tensor:
@@ -154,7 +176,7 @@ def carved_points(dataset: Dataset, count: int, generator: torch.Generator) -> T
     A view shows an object where its pixel differs from the constant background. Points outside every view are rarely
     chosen.
     """
-    low, high = (torch.from_numpy(np.asarray(dataset.box[i], np.float32)) for i in (0, 1))
+    low, high = torch.from_numpy(np.array(dataset.box, np.float32))
     points = low + (high - low) * torch.rand(CARVE_CANDIDATES * count, 3, generator=generator)
     px, py, pz = points.numpy().T.copy()
     seen, hits = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
@@ -164,14 +186,15 @@ def carved_points(dataset: Dataset, count: int, generator: torch.Generator) -> T
         seen[inside] += 1
         hits[inside] += shown[line[inside], column[inside]]
     share = torch.from_numpy((hits + np.float32(1e-3)) / (seen + 1))  # + 1 discounts points that few views see
-    return points[torch.multinomial(share.square(), count, generator=generator)]
+    chosen: Tensor = points[torch.multinomial(share.square(), count, generator=generator)]
+    return chosen
 
 
 def nearest_distances(points: Tensor) -> Tensor:
-    """[n]: root mean squared distance of points [n, 3] to their NEAREST nearest neighbours, exact; 1 for one point."""
+    """[n]: root mean squared distance of points [n, 3] to their NEAREST nearest neighbours, exact; 0 for one point."""
     n = len(points)
     if n < 2:
-        return torch.full((n,), 1.0)
+        return torch.zeros(n)
     squares, order = np.empty(n, np.float32), points[:, 0].argsort()
     _nearest_squares(squares, points[order].numpy(), min(NEAREST, n - 1))
     out = torch.empty(n)

@@ -14,6 +14,7 @@ from pd4dgs_codec.errors import NotFinite
 from pd4dgs_codec.model.config import ModelConfig
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.picture import Picture, render
+from pd4dgs_codec.scene import deformation_unit
 from pd4dgs_codec.threads import keep_freed_memory
 from pd4dgs_codec.train import workers
 from pd4dgs_codec.train.config import TrainConfig
@@ -53,6 +54,7 @@ class Learner(TrainState):
         if device.type == "cuda":  # TF32 is too coarse for SSIM's variances, differences of blurred images
             torch.backends.cudnn.allow_tf32 = False
         super().__init__(config, dataset, schedule, device, size)
+        self.unit = float(deformation_unit(self.model.info.box))  #: of lengths in the loss, scene units
         self.model_loss = ModelLoss(config, self.generator)
         self.levels, self.prefixes, self.grow = SelectLevels(self.practise), Prefixes(), Grow()
         self.match = Match()
@@ -211,7 +213,7 @@ class Learner(TrainState):
         terms = {"l1": l1, "dssim": dissimilarity}
         loss = (1 - config.ssim) * l1 + config.ssim * dissimilarity
         if config.volume and len(picture.gaussians.scales):
-            x, y, z = picture.gaussians.scales.unbind(1)  # the gradient of prod() is slow
+            x, y, z = (picture.gaussians.scales / self.unit).unbind(1)  # the gradient of prod() is slow
             terms["volume"] = (x * y * z).mean()
             loss = loss + config.volume * terms["volume"]
         if (guide := self.match.term(self, level)) is not None:

@@ -7,13 +7,14 @@ import json
 import math
 import threading
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import median
 from typing import Any, Protocol
 
 import torch
 
-from pd4dgs_codec.data.view import Dataset, spread
+from pd4dgs_codec.data.view import Dataset, View, spread
 from pd4dgs_codec.errors import DataError, TrainError
 from pd4dgs_codec.io import finite
 from pd4dgs_codec.model import checkpoint
@@ -23,6 +24,7 @@ from pd4dgs_codec.signals import stop_request
 from pd4dgs_codec.threads import one_torch_thread
 from pd4dgs_codec.train import workers
 from pd4dgs_codec.train.config import TrainConfig
+from pd4dgs_codec.train.doubts import doubts
 from pd4dgs_codec.train.learner import Learner
 from pd4dgs_codec.train.schedule import COARSE_SHARE, Schedule
 
@@ -72,6 +74,7 @@ class Trainer:
         """size: the model's size; by default the preset's."""
         self.timed = config.total is None
         self.config, self.dataset = config, dataset
+        self.fingerprint = dataset.fingerprint()
         self.learner = Learner(config, dataset, Schedule(config.total), torch.device(device), size)
         self.learner.share = 0.0 if self.timed else None
         self._costs: list[float] = []  #: seconds of each step from which a timed run estimates N
@@ -194,11 +197,17 @@ class Trainer:
     def _evaluate(self, record: dict[str, Any]) -> None:
         """Adds a point to the curve: mean mPSNR per level, dB, on a few held-out views, or on training views if none
         are held out."""
-        views = self.dataset.test or self.dataset.train
-        chosen = views[:: max(1, len(views) // CURVE_VIEWS)][:CURVE_VIEWS]
-        record["held_out_psnr"] = psnr = workers.alike(lambda: self.learner.level_psnr(chosen))
+        record["held_out_psnr"] = psnr = workers.alike(lambda: self.learner.level_psnr(self._curve_views()))
         self.curve.append({"iteration": self.iteration, "seconds": self.seconds, "psnr": psnr})
         record["plane_bits"] = self.learner.plane_bits()
+
+    def _curve_views(self) -> Sequence[View]:
+        views = self.dataset.test or self.dataset.train
+        return views[:: max(1, len(views) // CURVE_VIEWS)][:CURVE_VIEWS]
+
+    def doubts(self) -> list[str]:
+        """What the pictures of the finished run give cause for, a line each; see `doubts`."""
+        return doubts(self.learner, self._curve_views(), self.curve[-1]["psnr"]) if self.finished and self.curve else []
 
     def save(self, path: Path) -> None:
         """Writes a checkpoint from which a run can resume. Of several workers only the first one writes."""
@@ -207,6 +216,8 @@ class Trainer:
         training = {
             "config": self.config.to_json(),
             "source": self.dataset.name,
+            "place": self.dataset.place,
+            "data": self.fingerprint,
             "seconds": self.seconds,
             "curve": json.dumps(self.curve),
             "viewpoints": [(view.camera, float(view.time)) for view in spread(self.dataset.train, VIEWPOINTS)],
@@ -216,11 +227,15 @@ class Trainer:
     def resume(self, path: Path) -> None:
         """Continues from a checkpoint of the same configuration and data.
 
-        Raises TrainError if it holds no training state, DataError if the state is broken or belongs to other data.
+        Raises TrainError if it holds no training state, DataError if the state is broken or belongs to other data: the
+        pictures and cameras count, not the place where they lie.
         """
         model, training = checkpoint.load(path)
         if "optimiser" not in training:
             raise TrainError(f"{path}: found no training state, expected a checkpoint that pd4dgs-train saved")
+        if training.get("data", self.fingerprint) != self.fingerprint:
+            found = f"other pictures or cameras in {self.dataset.name}"
+            raise DataError(f"{path}: found {found} than it was trained on, expected the same data")
         try:
             self.learner.restore(model, training)
             self.seconds, self.curve = float(training["seconds"]), read_curve(training["curve"])

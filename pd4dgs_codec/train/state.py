@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 
@@ -17,8 +18,8 @@ from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.networks import EXACT, Noise, Rounding
 from pd4dgs_codec.quality.measure import level_psnr
 from pd4dgs_codec.scene import MASK_THRESHOLD, instant
-from pd4dgs_codec.train.config import TrainConfig
-from pd4dgs_codec.train.initialise import fresh_model
+from pd4dgs_codec.train.config import MOST_STEPS, TrainConfig
+from pd4dgs_codec.train.initialise import check_visible, fresh_model
 from pd4dgs_codec.train.optimiser import PER_ANCHOR, Optimiser
 from pd4dgs_codec.train.schedule import GUIDED_SHARE, Schedule
 from pd4dgs_codec.train.ssim import Part, pixel_weights, within_reach
@@ -27,7 +28,6 @@ from pd4dgs_codec.train.ssim import Part, pixel_weights, within_reach
 KEPT_BYTES = 1 << 30
 #: Pixels of the shorter side from which pictures are reduced at first: reducing smaller ones saves little time.
 LARGE = 400
-MOST_STEPS = 1 << 31  #: that a checkpoint may count
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,10 +52,10 @@ class TrainingView:
         view: View, background: Sequence[float], device: torch.device, exposure: Tensor | None = None
     ) -> TrainingView:
         """Copies the image to the device."""
-        pixels = torch.as_tensor(view.image, device=device)
+        pixels = torch.as_tensor(np.require(view.image, requirements="W"), device=device)  # torch warns of others
         mask = torch.ones(pixels.shape[:2], device=device)
         if view.mask is not None:
-            mask = torch.as_tensor(view.mask, device=device).float()
+            mask = torch.as_tensor(np.require(view.mask, requirements="W"), device=device).float()
         shown = (pixels != torch.tensor(background, device=device) * 255).any(2)
         return TrainingView(view, pixels, pixel_weights(mask), shown.any(1), shown.any(0), int(shown.sum()), exposure)
 
@@ -173,6 +173,7 @@ class TrainState:
         steps = config.model_steps(self.size.steps)
         key = config.key_instant if config.rollout == "key" else None
         model = fresh_model(self.size, dataset, config.widths, steps, config.seed, config.max_layer, key)
+        check_visible(model, dataset)
         self.model = model.to(device)
         self.views = TrainingViews(dataset.train, model.info.background, device)
         self.optimiser = Optimiser(self.model, config.rates, config.cooldown, self.views.exposures.values())
@@ -309,9 +310,15 @@ class TrainState:
             if state["densifier"][name].shape != value.shape:
                 found, expected = tuple(state["densifier"][name].shape), tuple(value.shape)
                 raise ValueError(f"{name} has shape {found}, expected {expected}")
-        for name, most in (("iteration", MOST_STEPS), ("skipped", MOST_STEPS), ("total", MOST_STEPS), ("share", 1)):
-            if not 0 <= state[name] <= most:
-                raise ValueError(f"{name} is {state[name]!r}, expected a number from 0 to {most}")
+        steps, fewest = MOST_STEPS, int(self.share is None)  # a timed run may not have estimated its total yet
+        for name, least, most in (
+            ("iteration", 0, steps),
+            ("skipped", 0, steps),
+            ("total", fewest, steps),
+            ("share", 0, 1),
+        ):
+            if not least <= state[name] <= most:
+                raise ValueError(f"{name} is {state[name]!r}, expected a number from {least} to {most}")
         if not math.isfinite(state["rho"]):
             raise ValueError(f"rho is {state['rho']!r}, expected a finite number")
         for camera, exposure in self.views.exposures.items():

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, unfold
 
-from pd4dgs_codec.data.view import Dataset, View, points_box, shrunk_view
+from pd4dgs_codec.data.view import Dataset, View, points_box, shrunk_view, spans_volume
 from pd4dgs_codec.train import workers
 
 #: Views that are searched. They are those of one instant if it has at least CAMERAS, else evenly spread over all.
@@ -41,10 +41,11 @@ def with_points(dataset: Dataset, key: float | None) -> Dataset:
     are found. key: the key instant, normalised time, or None."""
     views = _chosen(dataset.train, 0.5 if key is None else key)
     points, depths = workers.alike(lambda: stereo_points(views, dataset.box.mean(0)))
-    if not len(points):
+    if not spans_volume(points):
         return dataset
     near, far = np.percentile(depths, [0.5, 99.5])
-    return replace(dataset, points=points, box=points_box(points), near=float(near / 2), far=float(far * 1.5))
+    box = points_box(points).astype(np.float32)
+    return replace(dataset, points=points, box=box, near=float(near / 2), far=float(far * 1.5))
 
 
 def _chosen(views: Sequence[View], key: float) -> list[View]:
@@ -69,7 +70,7 @@ class Eye:
         small = shrunk_view(view, max(1, min(view.width, view.height) // SIZE))
         self.picture = torch.from_numpy(small.image.astype(np.float32).mean(2) / 255)
         if small.mask is not None:
-            self.picture[~torch.from_numpy(small.mask)] = torch.nan
+            self.picture[torch.from_numpy(~small.mask)] = torch.nan
         viewmat, self.K = (torch.from_numpy(np.array(matrix, np.float32)) for matrix in (small.viewmat, small.K))
         self.rotation = viewmat[:3, :3]
         self.position = -self.rotation.T @ viewmat[:3, 3]

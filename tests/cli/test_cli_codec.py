@@ -11,6 +11,7 @@ from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.format.metadata import Metadata
+from pd4dgs_codec.model import checkpoint
 
 ENCODE_KEYS = {"mode", "bytes", "verified", "seconds", "layers", "left_out"}
 LAYER_KEYS = {"layer", "bytes", "payload_bits", "rate_bits", "position_bits", "symbols", "anchors"}
@@ -180,3 +181,12 @@ def test_max_bytes_and_a_truncated_file_stop_at_a_slice(cli, tmp_path):
     done = cli("decode", path, "--max-bytes", str(ends[0] - 1))
     assert done.code == 1 and f"{ends[0] - 1} bytes end before the first slice" in done.err
     assert f"{ends[1]:,}".encode() in cli("info", path).out
+
+
+def test_a_file_says_where_the_0_of_a_moved_scene_lies(cli, model_pt, tmp_path):
+    moved, out = tmp_path / "moved.pt", tmp_path / "m.pd4"
+    checkpoint.save(moved, checkpoint.load(model_pt)[0], {"place": "0 is 465000, 5243000, 0 of the data"})
+    for given, said in (((), ""), (("--source", "a square"), "a square; ")):
+        assert cli("encode", moved, "-o", out, "-f", "--effort", 1, *given).code == 0
+        told = cli("info", out, "--json").json["metadata"]["source"]
+        assert told == f"{said}0 is 465000, 5243000, 0 of the data"

@@ -2,6 +2,8 @@
 
 import json
 import os
+import shlex
+import shutil
 import signal
 import subprocess
 import sys
@@ -74,7 +76,7 @@ def test_the_quality_sets_the_dial_and_single_options_replace_parts_of_it(train,
     assert other.code == 1 and "--quality with rate_scale" in other.err
 
 
-def test_an_interrupted_run_says_what_it_lacks_and_is_resumed_to_its_end(train, tmp_path, monkeypatch):
+def test_an_interrupted_run_says_what_it_lacks_and_how_it_goes_on(cli, train, tmp_path, monkeypatch):
     step = Learner.step
 
     def interrupted(self):
@@ -83,12 +85,34 @@ def test_an_interrupted_run_says_what_it_lacks_and_is_resumed_to_its_end(train, 
         return step(self)
 
     monkeypatch.setattr(Learner, "step", interrupted)
-    cut = train(tmp_path / "cut.pt", iterations=8)
+    cut = train(tmp_path / "cut one.pt", "--log", tmp_path / "log", iterations=8)
     assert cut.code == 0 and "3 of 8 steps" in cut.err
-    assert "phases not reached: " in cut.err and "exact rounding of attributes" in cut.err and "--resume" in cut.err
+    assert "phases not reached: " in cut.err and "exact rounding of attributes" in cut.err
     monkeypatch.setattr(Learner, "step", step)
-    resumed = train(tmp_path / "cut.pt", "--resume", tmp_path / "cut.pt", "--json", iterations=None)
+    (command,) = (line.partition("to go on: ")[2] for line in cut.err.splitlines() if "to go on: " in line)
+    program, *words = shlex.split(command)
+    resumed = cli(program.removeprefix("pd4dgs-"), *words, "--json")
     assert resumed.code == 0 and resumed.json["iterations"] == 8 and resumed.json["finished"] is True
+    again = cli("train", *words)
+    assert again.code == 0 and "the run is complete; a longer one starts anew" in again.err
+
+
+def test_a_pd4_file_is_no_checkpoint_to_resume(train, scene_pd4, tmp_path):
+    result = train(tmp_path / "m.pt", "--resume", scene_pd4, iterations=None)
+    assert result.code == 1 and "found a .pd4 file, which holds no training state, expected" in result.err
+
+
+def test_a_moved_folder_is_resumed_and_another_one_at_its_place_is_not(cli, train, tmp_path, dataset):
+    path, moved = tmp_path / "m.pt", tmp_path / "elsewhere"
+    options = ("-o", path, "--preset", "tiny", "-j", 1)
+    assert cli("train", dataset, *options, "--iterations", 2).code == 0
+    shutil.copytree(dataset, moved)
+    assert cli("train", moved, "-o", path, "--resume", path).code == 0
+    assert json.loads(checkpoint.load(path)[1]["config"])["source"] == str(moved)
+    for name in ("000.png", "003.png"):
+        shutil.copyfile(moved / "005.png", moved / name)
+    result = cli("train", moved, "-o", path, "--resume", path)
+    assert result.code == 1 and "other pictures or cameras" in result.err and len(result.error_lines) == 2
 
 
 def test_resume_refuses_contradictions_and_replaces_no_other_file(cli, train, tmp_path, shared_dataset):
@@ -110,8 +134,6 @@ def test_resume_refuses_contradictions_and_replaces_no_other_file(cli, train, tm
     for what, options in contradictions.items():
         result = cli("train", shared_dataset, "-o", first, "--resume", first, *options)
         assert result.code == 1 and what in result.err and len(result.error_lines) == 1
-    result = cli("train", "synthetic:static", "-o", first, "--resume", first)
-    assert result.code == 1 and "synthetic:static" in result.err
     second.write_bytes(b"precious")
     assert cli("train", shared_dataset, "-o", second, "--resume", first).code == 1
     assert (first.read_bytes(), second.read_bytes()) == (before, b"precious")
@@ -141,7 +163,8 @@ def test_time_limit_ends_cleanly_and_must_grow_on_resume(cli, train, tmp_path, s
     report = result.json
     assert result.code == 0 and report["iterations"] == 3 and report["finished"] is False
     assert "rate and mask terms" in report["phases_not_reached"]
-    refused = cli("train", shared_dataset, "-o", first, "--resume", first)
+    assert "--max-seconds 2000" in report["resume"]
+    refused = cli("train", tmp_path / "absent", "-o", first, "--resume", first)  # before any data are read
     assert refused.code == 1 and "higher --max-seconds" in refused.err
 
 

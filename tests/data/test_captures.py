@@ -302,11 +302,12 @@ def test_a_scene_without_masks_and_points(exported):
 
 def test_center_and_scale(exported):
     changed(exported / "scene.json", {"center": [1.0, 2.0, 3.0], "scale": 0.5})
-    np.save(exported / "points.npy", np.array([[3.0, 2.0, 5.0], [np.nan, 0, 0]]))
+    points = np.array([[3.0, 2.0, 5.0], [5.0, 2.0, 5.0], [3.0, 4.0, 5.0], [3.0, 2.0, 7.0], [np.nan, 0, 0]])
+    np.save(exported / "points.npy", points)
     d = load(exported)
     before = np.array([-1.0, -1.0, -1.0])  # view 1: t = (1, 1, 1), no rotation
     np.testing.assert_allclose(-d.train[1].viewmat[:3, 3], (before - [1, 2, 3]) * 0.5, atol=1e-6)
-    np.testing.assert_allclose(d.points, [[1, 0, 1]])
+    np.testing.assert_allclose(d.points, [[1, 0, 1], [2, 0, 1], [1, 1, 1], [1, 0, 2]])
     assert (d.near, d.far) == (0.1, 9.0)  # already scaled
 
 

@@ -269,18 +269,79 @@ def test_binary_and_ascii_points_agree(blender):
         assert ((xyz >= d.box[0]) & (xyz <= d.box[1])).all(axis=1).mean() >= 0.95
 
 
+CORNERS = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+
+
+def corners(scale: float) -> bytes:
+    """A PLY file of four points that span a volume."""
+    body = "".join(f"{x * scale} {y * scale} {z * scale}\n" for x, y, z in CORNERS)
+    return ply("ascii", body.encode(), vertices=4)
+
+
 def test_named_points_go_before_the_only_one(blender):
     folder = blender(ply_file_path="b.ply")
-    for name, point in (("a", b"1 0 0\n"), ("b", b"2 0 0\n")):
-        save(folder / f"{name}.ply", ply("ascii", point, vertices=1))
-    assert load(folder).points.tolist() == [[2.0, 0.0, 0.0]]
+    for name, scale in (("a", 1.0), ("b", 2.0)):
+        save(folder / f"{name}.ply", corners(scale))
+    assert load(folder).points.max() == 2
 
 
 def test_hidden_files_are_no_points(blender):
     folder = blender(ply_file_path=None)
-    save(folder / "a.ply", ply("ascii", b"1 0 0\n", vertices=1))
+    save(folder / "a.ply", corners(1.0))
     save(folder / "._a.ply", b"of macOS")
-    assert load(folder).points.tolist() == [[1.0, 0.0, 0.0]]
+    assert load(folder).points.tolist() == CORNERS
+
+
+LINE = [[0.01 * i, 0.0, 0.5] for i in range(100)]
+FLAT = {
+    "none": [],
+    "one": [[0.0, 0.0, 0.5]],
+    "three": [[0.0, 0.0, 0.5], [0.2, 0.1, 0.6], [-0.8, -0.8, 0.4]],
+    "at one place": [[0.2, 0.1, 0.6]] * 500,
+    "on a line": LINE,
+    "on a far plane": [[100 + x, 3 * x * y, 200 - x] for x, _, _ in LINE for y in (0.0, 0.3)],
+}
+
+
+@pytest.mark.parametrize("kind", FLAT)
+def test_points_that_span_no_volume_decide_nothing_and_are_counted(blender, kind):
+    without, folder = load(blender()), blender()
+    body = "".join(f"{x} {y} {z}\n" for x, y, z in FLAT[kind])
+    save(folder / "points.ply", ply("ascii", body.encode(), vertices=len(FLAT[kind])))
+    d = load(folder)
+    assert d.points is None and (d.near, d.far) == (without.near, without.far)
+    np.testing.assert_array_equal(d.box, without.box)
+    told = [remark for remark in d.remarks() if "span no volume" in remark]
+    assert len(told) == bool(FLAT[kind]) and all(f" {len(FLAT[kind])} " in remark for remark in told)
+
+
+@pytest.mark.parametrize("unit, offset", [(1e-3, 1e3), (1.0, 5e6), (1e3, 1e5)])
+def test_a_scene_far_from_0_is_moved_and_keeps_its_views(blender, unit, offset):
+    """The poses are read in binary64; binary32 would round the farthest ones to half a unit."""
+    at = offset * np.array([1.0, -1.0, 0.3])
+
+    def at_place(i):
+        matrix = np.array(pose(0.2 * i))
+        matrix[:3, 3] = matrix[:3, 3] * unit + at
+        return {"transform_matrix": matrix.tolist()}
+
+    folder = blender()
+    save(folder / "points.ply", corners(1.0))
+    near = load(folder)
+    change_frames(folder, at_place)
+    body = "".join(" ".join(repr(float(v)) for v in np.array(p) * unit + at) + "\n" for p in CORNERS)
+    save(folder / "points.ply", ply("ascii", body.encode(), XYZ.replace("float", "double"), vertices=4))
+    far = load(folder)
+    moved = np.array(far.shift)
+    assert (far.place != "") == (offset / unit > 200) and np.abs(far.box).max() < 250 * unit
+    assert any(far.place in remark for remark in far.remarks()) or not far.place
+    for a, b in zip(near.train, far.train, strict=True):
+        centre = -b.viewmat[:3, :3].T @ b.viewmat[:3, 3] + moved
+        np.testing.assert_allclose(
+            centre, -a.viewmat[:3, :3].T @ a.viewmat[:3, 3] * unit + at, rtol=0, atol=1e-4 * unit
+        )
+    np.testing.assert_allclose(far.points + moved, near.points * unit + at, rtol=0, atol=1e-4 * unit)
+    np.testing.assert_allclose((far.near, far.far), np.array((near.near, near.far)) * unit, rtol=1e-4)
 
 
 def test_box_and_depth_without_points(blender):

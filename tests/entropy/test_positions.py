@@ -80,7 +80,7 @@ def test_cells_on_a_coarser_lattice_cost_no_more():
     [
         ([[0, 0, 0], [1, 0, 0], [1, 0, 0]], "same cell twice, rows 1 and 2"),
         ([[1, 0, 0], [0, 0, 0]], "out of Morton order"),
-        ([[0, 0, 0], [1 << 21, 0, 0]], "span 2097153 voxels"),
+        ([[0, 0, 0], [1 << 21, 0, 0]], "span 2097153 voxels on one axis, limit 2097152 in a slice"),
         ([[0.0, 0.0, 0.0]], "integer array"),
         ([[0, MAX_VOXEL + 1, 0]], "limit 1048576 in magnitude"),
     ],

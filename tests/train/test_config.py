@@ -1,5 +1,6 @@
 """Options of training, the schedule that follows from them, and configurations as checkpoints store them."""
 
+import json
 import math
 from dataclasses import replace
 
@@ -18,7 +19,7 @@ from pd4dgs_codec.train.schedule import Schedule
     "bad, message",
     [
         ({"preset": "huge"}, "preset must be one of tiny, small, paper, found huge"),
-        ({"iterations": 0}, "iterations must be at least 1, found 0"),
+        ({"iterations": 0}, "iterations must be from 1 to 2e[+]09, found 0"),
         ({"max_seconds": 0.0}, "max_seconds must be more than 0, found 0.0"),
         ({"rollout": "greedy"}, "rollout must be one of key"),
         ({"seed": -1}, "seed must be from 0"),
@@ -106,3 +107,17 @@ def test_rollout_probabilities():
     assert sum(rollout_probabilities(0.37)) == pytest.approx(1.0)
     assert updated_rho(0.5, torch.zeros(4), torch.ones(4)) == pytest.approx(0.525)
     assert updated_rho(0.5, torch.ones(0), torch.ones(0)) == pytest.approx(0.475)
+
+
+@pytest.mark.parametrize("name", ["seed", "iterations", "ssim", "source", "lambdas", "rates", "background", "noise"])
+@pytest.mark.parametrize("value", [True, [1, [2]], {}, 10**400, math.nan, "x" * 9, None])
+def test_a_stored_configuration_is_read_or_refused_in_one_line(name, value):
+    text = json.dumps(json.loads(TrainConfig().to_json()) | {name: value})
+    try:
+        found = TrainConfig.from_json(text, "m.pt")
+    except TrainError as error:
+        assert str(error).startswith("m.pt: ") or name in str(error)
+        assert "\n" not in str(error) and len(str(error)) < 400
+    else:
+        allowed = [("noise", True), ("iterations", None), ("background", None), ("source", "x" * 9), ("rates", {})]
+        assert (name, value) in allowed and getattr(found, name) == (value if name != "rates" else LearningRates())

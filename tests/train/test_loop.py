@@ -280,6 +280,27 @@ def test_broken_training_state_is_refused_in_one_line(dataset, tmp_path, name):
         assert str(tmp_path / "m.pt") in str(caught.value) and "\n" not in str(caught.value)
 
 
+def test_a_run_of_n_steps_has_a_total(dataset, tmp_path):
+    """With a total of 0, as before a timed run has estimated its own, it would never end."""
+    trainer_of(dataset, 5).save(tmp_path / "m.pt")
+    model, training = checkpoint.load(tmp_path / "m.pt")
+    checkpoint.save(tmp_path / "m.pt", model, training | {"total": 0})
+    with pytest.raises(DataError, match="total is 0, expected a number from 1 to"):
+        trainer_of(dataset, 5).resume(tmp_path / "m.pt")
+    trainer_of(dataset, None, max_seconds=5.0).save(tmp_path / "m.pt")
+    trainer_of(dataset, None, max_seconds=5.0).resume(tmp_path / "m.pt")
+
+
+def test_other_pictures_and_other_cameras_are_refused_and_the_same_under_another_name_are_not(dataset, tmp_path):
+    trainer_of(dataset, 5).save(tmp_path / "m.pt")
+    trainer_of(dataclasses.replace(dataset, name="moved"), 5).resume(tmp_path / "m.pt")
+    view = dataset.train[2]
+    for change in ({"image": view.image[::-1].copy()}, {"viewmat": view.viewmat + np.float32(0.001)}, {"time": 0.41}):
+        train = (*dataset.train[:2], dataclasses.replace(view, **change), *dataset.train[3:])
+        with pytest.raises(DataError, match="other pictures or cameras in disc than it was trained on"):
+            trainer_of(dataclasses.replace(dataset, train=train), 5).resume(tmp_path / "m.pt")
+
+
 def test_points_that_all_lie_far_outside_are_as_good_as_none(dataset):
     far = dataclasses.replace(dataset, points=np.full((20, 3), 1e4, np.float32))
     assert len(trainer_of(far, 5).model.anchor_q) > 100
