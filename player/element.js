@@ -8,6 +8,7 @@
 // slice. A change of autoplay, max-bytes or max-seconds acts on the next file.
 
 import { Orbit } from "./render/orbit.js";
+import { SCALES, SIZE_NAMES } from "./render/pace.js";
 import { Player } from "./render/player.js";
 import { enterVr, hasHeadset } from "./render/xr.js";
 
@@ -323,14 +324,13 @@ export class Pd4Player extends HTMLElement {
   _showStatus() {
     const player = this._player;
     if (!player || this._bar.hidden) return;
-    const { bytes, total, loading, ends, level, levels, fps, scale, software } = player.status;
-    const parts = [];
+    const { bytes, total, ends, level, levels, fps, scale, software } = player.status;
     const drawn = level !== null;
-    if (drawn) parts.push(`level ${level}${levels.length ? ` of ${levels[levels.length - 1]}` : ""}`);
-    if (bytes) parts.push(`${size(bytes)}${loading && total ? ` of ${size(total)}` : ""}`);
-    if (fps > 1) parts.push(`${fps} fps`);
-    if (drawn && scale < 1) parts.push(`${Math.round(100 * scale)} %`);
-    if (drawn && software) parts.push("no GPU: drawn by the CPU, with fewer pixels in motion");
+    const last = ends.length ? ends[ends.length - 1].layer : levels[levels.length - 1];
+    const parts = drawn ? [`level ${level} of ${last}, ${sizes(bytes, total)}`] : bytes ? [sizes(bytes, total)] : [];
+    if (fps) parts.push(`${fps.toFixed(fps < 9.5 ? 1 : 0)} fps`);
+    const fewer = scale < 1 ? `${SIZE_NAMES[SCALES.indexOf(scale)]} size: ` : "";
+    if (drawn && (software || fewer)) parts.push(fewer + (software ? "no GPU found" : "drawing is slow"));
     this._statusLine.textContent = parts.join(" · ");
 
     const whole = ends.filter(({ layer }, i) => layer !== ends[i + 1]?.layer); // of slices the last one
@@ -372,9 +372,11 @@ export class Pd4Player extends HTMLElement {
   }
 }
 
-/** @param {number} bytes */
-function size(bytes) {
-  return bytes < 1e6 ? `${Math.round(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`;
+/** How much has come, in the unit of all. @param {number} bytes @param {number | null} total */
+function sizes(bytes, total) {
+  const [unit, by, digits] = (total ?? bytes) < 1e6 ? /** @type {const} */ (["kB", 1e3, 0]) : ["MB", 1e6, 1];
+  const [come, all] = [bytes, total ?? 0].map((n) => (n / by).toFixed(digits));
+  return `${come === all || !total ? "" : `${come} of `}${total ? all : come} ${unit}`;
 }
 
 customElements.define("pd4-player", Pd4Player);

@@ -23,7 +23,7 @@ import { WORKERS } from "./workers.js";
  * @property {number | null} [bytes] how much of the file to load at most
  * @property {number | null} [seconds] how long to load beyond the first slice
  * @property {"gpu" | "cpu" | null} [evaluator] default: the faster one of the machine
- * @property {boolean} [degrade] whether a slow machine gets fewer pixels and lower levels, default true
+ * @property {boolean} [degrade] whether a slow machine gets fewer pixels while something moves, default true
  * @property {number | null} [pixelRatio] device pixels per CSS pixel, default the window's, at most 2
  */
 
@@ -37,7 +37,7 @@ import { WORKERS } from "./workers.js";
  * @property {{layer: number, end: number}[]} ends where in the file each slice ends, empty while it is unknown
  * @property {number | null} level shown, null before the first picture
  * @property {number[]} levels that have arrived
- * @property {number} fps pictures drawn in the last second
+ * @property {number} fps pictures drawn a second
  * @property {number} scale of the picture's sides
  * @property {number} gaussians drawn
  * @property {boolean} software whether the CPU draws, for want of a GPU
@@ -102,7 +102,7 @@ export class Player extends Clip {
     this._frameRequest = 0;
     this._lastFrame = 0;
     this._lastMoved = -Infinity;
-    /** Ends of draws in the last second. @type {number[]} */
+    /** Ends of draws in the last second, of slower ones the last four. @type {number[]} */
     this._draws = [];
     this._started = performance.now();
     /** When scenes came. @type {WeakMap<Scene, {arrived: number, decoded: number}>} */
@@ -206,16 +206,23 @@ export class Player extends Clip {
   /** @returns {Status} */
   get status() {
     const now = performance.now();
-    while (this._draws.length && now - this._draws[0] > 1000) this._draws.shift();
     return {
       ...this._status,
       level: this._shownLevel,
       levels: this._scene?.layers ?? [],
-      fps: this._draws.length,
+      fps: this._rate(now),
       scale: this._moving(now) ? this._scale() : 1,
       gaussians: this._painter?.count ?? 0,
       software: this._gpu?.software ?? false,
     };
+  }
+
+  /** Pictures a second lately; 0 where the last one was long ago. @param {number} now */
+  _rate(now) {
+    const draws = this._draws;
+    while (draws.length > 4 && now - draws[0] > 1000) draws.shift();
+    const span = (draws[draws.length - 1] - draws[0]) / (draws.length - 1);
+    return draws.length > 1 && now - draws[draws.length - 1] < 2 * span + 500 ? 1000 / span : 0;
   }
 
   /** The renderer as the driver names it; empty without WebGL2. */
@@ -376,8 +383,7 @@ export class Player extends Clip {
   _state() {
     const scene = /** @type {Scene} */ (this._scene);
     const camera = /** @type {Camera} */ (this.camera);
-    let level = this._front ? (this._level ?? 2) : 0; // the first picture is the one that comes soonest
-    if (this._playing && this._options.degrade !== false) level = Math.min(level, this._pace.level);
+    const level = this._front ? (this._level ?? 2) : 0; // the first picture is the one that comes soonest
     return stateOf(scene, Math.max(level, 0), this.time, centreOf(camera));
   }
 
@@ -414,8 +420,6 @@ export class Player extends Clip {
     const gpu = /** @type {Gpu} */ (this._gpu);
     const opened = this._started;
     const state = this._state();
-    const playing = this._playing;
-    const started = performance.now();
     this._evaluating = true;
     try {
       const spare = this._spare;
@@ -429,7 +433,6 @@ export class Player extends Clip {
       this._front = { splats, state };
       this.counts.evaluated++;
       this._dirty = true;
-      if (playing) this._pace.evaluated(state.level, performance.now() - started, performance.now());
     } catch (error) {
       if (this._isStale(gpu, opened)) return;
       if (this._onCpu(gpu, state.scene)) {
