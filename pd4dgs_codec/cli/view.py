@@ -54,10 +54,10 @@ def _view(args: argparse.Namespace, console: Console) -> int:
         console.result({"output": args.output, "input": args.input}, args.output)
         return OK
     with temporary_folder() as folder:
-        source = args.input
-        (folder / PAGE).write_bytes(page().encode())
-        if not is_url(source):
-            (folder / SCENE).write_bytes(_packed(source))
+        source, data = args.input, None if is_url(args.input) else _packed(args.input)
+        (folder / PAGE).write_bytes(page(about=data).encode())
+        if data is not None:
+            (folder / SCENE).write_bytes(data)
             source = SCENE
         with serving(folder, args, console, port=args.port, private=True) as server:
             url = f"{server.url}{PAGE}?src={quote(source, safe='')}"

@@ -61,7 +61,7 @@ def package(
     if video is not None:
         files[VIDEO_PLAYLIST] = hls_video(video, names[VIDEO])
     files[PLAYLIST] = hls(INDEX, video, VIDEO_PLAYLIST)
-    files[PAGE] = (page(names[SCENE]) if immutable else page()).encode()
+    files[PAGE] = page(names[SCENE] if immutable else None, data).encode()
     index = {
         "file": names[SCENE],
         "format_version": about["format_version"],

@@ -16,6 +16,7 @@ from pathlib import Path
 
 from pd4dgs_codec.errors import DataError, DeliveryError
 from pd4dgs_codec.format.decoder import decode
+from pd4dgs_codec.format.info import info
 from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.web import PAGE, is_url
 
@@ -84,11 +85,11 @@ def player_folder() -> Path:
     raise DataError(f"{package}: found no player, expected an installed package or a checkout")
 
 
-def page(source: bytes | str | None = None) -> str:
+def page(source: bytes | str | None = None, about: bytes | None = None) -> str:
     """Returns the player as one HTML file.
 
     source: the bytes of a `.pd4` to embed, or its URL; None: `scene.pd4` beside the page, or the page's
-    `?src=address`.
+    `?src=address`. about: bytes of a `.pd4` whose metadata name the page; default: those that are embedded.
     """
     root = player_folder()
     workers = {name: bundle(root, f"render/{name}") for name in WORKERS}
@@ -103,6 +104,10 @@ globalThis.early?.begin(workers["{WORKERS[0]}"]);
 {code}</script>
 """
     text = re.sub(r"<!--.*?-->\s*", "", (root / PAGE).read_text(encoding="utf-8"), flags=re.DOTALL)
+    about = source if isinstance(source, bytes) else about
+    title: str = ((about and info(about)["metadata"]) or {}).get("title") or ""
+    for usual, tag in ((".pd4 player", "title"), ("Dynamic scene", "h1")) if title else ():
+        text = text.replace(f"{usual}</{tag}>", f"{html.escape(title)}</{tag}>")
     head, body, _ = re.split(r'(?=<p id="note")|<script type="module".*', text, maxsplit=2)
     early = "" if isinstance(source, bytes) else f"<script>\n{packed(root / EARLY)}</script>"
     head = head.replace(f'<script src="./{EARLY}"></script>', early)
