@@ -1,5 +1,6 @@
-// The first script of index.html, behind what is painted first, and no module: a worker asks for the scene while the rest of the page arrives. It
-// becomes the loader once it is given the address of that code, by the packed page or by render/loader.js.
+// The first script of index.html, behind what is painted first, and no module: a worker asks for the scene while the
+// rest of the page arrives. It becomes the loader once it is given the address of that code, by the packed page or by
+// render/loader.js.
 
 {
   const query = new URLSearchParams(location.search);
@@ -22,11 +23,19 @@
     };`;
   const start = () => new Worker(URL.createObjectURL(new Blob([code], { type: "text/javascript" })));
   // a file: is no place to ask, and a bench loads by itself
-  const worker = /^https?:/.test(url) && !query.has("bench") ? start() : null;
+  /** @type {Worker | null} */
+  let worker = null;
+  try {
+    if (/^https?:/.test(url) && !query.has("bench")) worker = start();
+  } catch {
+    // a policy forbids it; the player says so if it forbids the next one as well
+  }
   let begun = false;
   const begin = (/** @type {string} */ loader) => {
     if (!begun) worker?.postMessage(loader);
     begun = true;
   };
-  Object.assign(globalThis, { early: { url, worker, begin } });
+  const early = { url, worker, begin };
+  if (worker) worker.onerror = () => (early.worker = null);
+  Object.assign(globalThis, { early });
 }

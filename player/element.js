@@ -3,12 +3,14 @@
 //   <script type="module" src="player/element.js"></script>
 //   <pd4-player src="scene.pd4" controls autoplay loop></pd4-player>
 //
-// Attributes: src; poster, a picture until there is one; controls; autoplay; loop; time, seconds to start at; level,
-// the highest to load and show; max-bytes and max-seconds, how much of the file to load, and how long beyond its first
-// slice. A change of autoplay, max-bytes or max-seconds acts on the next file. What the element contains, such as a
-// picture, covers the canvas until the first frame.
+// Attributes: src; poster, a picture until there is one; controls; autoplay; loop; speed; time, seconds to start at; fit,
+// contain or cover; free, whether the camera may leave what was captured; label, the scene's name; level, the highest
+// to load and show; max-bytes and max-seconds, how much of the file to load, and how long beyond its first slice. A
+// change of autoplay, max-bytes or max-seconds acts on the next file. What the element contains, such as a picture,
+// covers the canvas until the first frame.
 
 import { Orbit } from "./render/orbit.js";
+import { SCALES, SIZE_NAMES } from "./render/pace.js";
 import { Player } from "./render/player.js";
 import { enterVr, hasHeadset } from "./render/xr.js";
 
@@ -18,6 +20,7 @@ export { Player } from "./render/player.js";
 const EVENTS = ["progress", "firstpicture", "upgrade", "loaded", "timeupdate", "statechange", "error"];
 /** Between two looks at the status, milliseconds. */
 const STATUS_MS = 250;
+const LOST = "paused: the browser draws no more scenes at once; it goes on when others are out of view";
 /** Seconds that a key steps through the scene. */
 const FRAME = 1 / 30;
 
@@ -36,6 +39,7 @@ export function open(source, { canvas, ...options }) {
 
 const STYLE = `
 :host { display: block; position: relative; container-type: inline-size; overflow: hidden; aspect-ratio: 4 / 3;
+  contain-intrinsic-width: 320px; max-width: 100%; min-width: 0; min-height: 0;
   background: #000; color: #eee; font: 13px/1.4 system-ui, sans-serif; }
 :host([hidden]) { display: none; }
 canvas, img { position: absolute; inset: 0; width: 100%; height: 100%; }
@@ -44,10 +48,11 @@ img { object-fit: contain; pointer-events: none; }
 slot { position: absolute; inset: 0; overflow: hidden; background: inherit; pointer-events: none;
   transition: opacity .3s, visibility .3s; }
 slot.past { opacity: 0; visibility: hidden; }
+:host([fit="cover"]) img { object-fit: cover; }
 .error { position: absolute; inset: 0 0 auto; margin: 0; padding: 8px 12px; background: #611e;
   overflow-wrap: anywhere; }
 .bar { position: absolute; inset: auto 0 0; display: flex; gap: 8px; align-items: center; padding: 6px 10px;
-  background: linear-gradient(transparent, #000a); }
+  background: #000a; }
 .bar > * { flex: none; }
 button, select { font: inherit; color: inherit; background: #0006; border: 1px solid #fff4; border-radius: 4px;
   min-width: 32px; height: 28px; padding: 0 6px; cursor: pointer; }
@@ -64,17 +69,19 @@ input { -webkit-appearance: none; appearance: none; position: absolute; inset: 0
   background: none; cursor: pointer; }
 input::-webkit-slider-runnable-track { background: none; }
 input::-webkit-slider-thumb { -webkit-appearance: none; width: 6px; height: 22px; border-radius: 3px;
-  background: #fff; }
+  background: #fff; box-shadow: 0 0 0 2px #000a; }
 input::-moz-range-track { background: none; }
-input::-moz-range-thumb { width: 6px; height: 22px; border: 0; border-radius: 3px; background: #fff; }
+input::-moz-range-thumb { width: 6px; height: 22px; border: 0; border-radius: 3px; background: #fff;
+  box-shadow: 0 0 0 2px #000a; }
 .clock, .status { font-variant-numeric: tabular-nums; }
-.status { position: absolute; inset: auto 10px 44px auto; text-align: right; opacity: .75; text-shadow: 0 0 4px #000, 0 0 2px #000;
-  pointer-events: none; }
+.status { position: absolute; inset: auto 6px 46px auto; margin-left: 6px; padding: 1px 6px; border-radius: 4px;
+  background: #000a; pointer-events: none; }
+.status:empty { display: none; }
 @container (max-width: 420px) {
   .bar { flex-wrap: wrap; justify-content: flex-end; }
   .bar .time { flex-basis: 100%; order: -1; }
   .bar .play { margin-right: auto; }
-  .status { bottom: 78px; }
+  .status { bottom: 80px; }
 }
 @container (max-width: 340px) {
   .clock { display: none; }
@@ -113,7 +120,7 @@ const BODY = `
 const number = (text) => (text === null || text.trim() === "" || Number.isNaN(Number(text)) ? null : Number(text));
 
 export class Pd4Player extends HTMLElement {
-  static observedAttributes = ["src", "level", "time", "loop", "controls", "poster"];
+  static observedAttributes = ["src", "level", "time", "loop", "speed", "fit", "free", "label", "controls", "poster"];
 
   constructor() {
     super();
@@ -147,7 +154,7 @@ export class Pd4Player extends HTMLElement {
     part(".vr").addEventListener("click", () => this._enterVr());
     hasHeadset().then((there) => (part(".vr").hidden = !there));
     part(".full").addEventListener("click", () => this._toggleFullScreen());
-    root.addEventListener("keydown", (event) => this._key(/** @type {KeyboardEvent} */ (event)));
+    this._onKey = (/** @type {KeyboardEvent} */ event) => this._key(event);
     this._showState();
   }
 
@@ -165,6 +172,7 @@ export class Pd4Player extends HTMLElement {
       });
     }
     this._timer = window.setInterval(() => this._showStatus(), STATUS_MS);
+    document.addEventListener("keydown", this._onKey);
     this._showControls();
     this._showPoster();
     this._load();
@@ -172,6 +180,7 @@ export class Pd4Player extends HTMLElement {
 
   disconnectedCallback() {
     clearInterval(this._timer);
+    document.removeEventListener("keydown", this._onKey);
     this._orbit?.close();
     this._orbit = null;
     this._player?.close();
@@ -185,7 +194,9 @@ export class Pd4Player extends HTMLElement {
     else if (name === "level") this._player.level = number(value);
     else if (name === "time") this.seek(number(value) ?? 0);
     else if (name === "loop") this._player.loop = value !== null;
-    else if (name === "controls") this._showControls();
+    else if (name === "speed") this._player.speed = this._asked().speed;
+    else if (name === "fit") this._player.fit = this._asked().fit;
+    else if (name === "free" || name === "label" || name === "controls") this._showControls();
     else this._showPoster();
   }
 
@@ -198,7 +209,7 @@ export class Pd4Player extends HTMLElement {
 
   /** Loads a scene in place of the one on show. @param {string | URL | Blob} source */
   async load(source) {
-    this._error.hidden = true;
+    this._say("");
     if (!this._player) return;
     Object.assign(this._player._options, this._asked());
     await this._player.load(source);
@@ -271,6 +282,8 @@ export class Pd4Player extends HTMLElement {
       time: number(this.getAttribute("time")),
       autoplay: this.hasAttribute("autoplay"),
       loop: this.hasAttribute("loop"),
+      speed: Math.max(number(this.getAttribute("speed")) ?? 1, 0),
+      fit: /** @type {import("./render/camera.js").Fit} */ (this.getAttribute("fit") === "cover" ? "cover" : "contain"),
       bytes: number(this.getAttribute("max-bytes")),
       seconds: number(this.getAttribute("max-seconds")),
     };
@@ -283,16 +296,19 @@ export class Pd4Player extends HTMLElement {
 
   /** @param {string} name @param {any} detail */
   _react(name, detail) {
-    if (name === "error") {
-      this._error.textContent = detail.message;
-      this._error.hidden = false;
-    }
+    if (name === "error") this._say(detail.message);
     if (name === "firstpicture") {
       this._poster.hidden = true;
       this._slot.classList.add("past");
     }
     if (name === "statechange" || name === "timeupdate") this._showState();
     if (name !== "timeupdate") this._showStatus();
+  }
+
+  /** Shows a message, or none. @param {string} text */
+  _say(text) {
+    this._error.textContent = text;
+    this._error.hidden = !text;
   }
 
   _showPoster() {
@@ -307,8 +323,10 @@ export class Pd4Player extends HTMLElement {
     const canvas = this._player?.canvas;
     if (canvas) canvas.tabIndex = controls ? 0 : -1; // without controls keys do nothing
     canvas?.setAttribute("role", controls ? "application" : "img");
+    canvas?.setAttribute("aria-label", this.getAttribute("label") ?? "Dynamic scene");
     this._orbit?.close();
     this._orbit = controls && this._player ? new Orbit(this._player, this._player.canvas) : null;
+    if (this._orbit) this._orbit.free = this.hasAttribute("free");
   }
 
   _showState() {
@@ -331,15 +349,16 @@ export class Pd4Player extends HTMLElement {
   /** The status line, the levels on the time bar and in the list. */
   _showStatus() {
     const player = this._player;
-    if (!player || this._bar.hidden) return;
-    const { bytes, total, loading, ends, level, levels, fps, scale, software } = player.status;
-    const parts = [];
+    if (!player) return;
+    const { bytes, total, ends, level, levels, fps, scale, software, lost } = player.status;
+    if (lost !== (this._error.textContent === LOST)) this._say(lost ? LOST : "");
+    if (this._bar.hidden) return;
     const drawn = level !== null;
-    if (drawn) parts.push(`level ${level}${levels.length ? ` of ${levels[levels.length - 1]}` : ""}`);
-    if (bytes) parts.push(`${size(bytes)}${loading && total ? ` of ${size(total)}` : ""}`);
-    if (fps > 1) parts.push(`${fps} fps`);
-    if (drawn && scale < 1) parts.push(`${Math.round(100 * scale)} %`);
-    if (drawn && software) parts.push("no GPU: drawn by the CPU, with fewer pixels in motion");
+    const { layer: last, end } = ends[ends.length - 1] ?? { layer: levels[levels.length - 1], end: total };
+    const parts = bytes ? [`${drawn ? `level ${level} of ${last}, ` : ""}${sizes(bytes, end)}`] : [];
+    if (fps) parts.push(`${fps.toFixed(fps < 9.5 ? 1 : 0)} fps`);
+    const fewer = scale < 1 ? `${SIZE_NAMES[SCALES.indexOf(scale)]} size: ` : "";
+    if (drawn && (software || fewer)) parts.push(fewer + (software ? "no GPU found" : "drawing is slow"));
     this._statusLine.textContent = parts.join(" · ");
 
     const whole = ends.filter(({ layer }, i) => layer !== ends[i + 1]?.layer); // of slices the last one
@@ -361,12 +380,14 @@ export class Pd4Player extends HTMLElement {
 
   /** @param {KeyboardEvent} event */
   _key(event) {
-    if (!this.hasAttribute("controls") || event.ctrlKey || event.metaKey || event.altKey) return;
-    if (event.target !== this._player?.canvas) return; // buttons and slider have keys of their own
+    if (!this._orbit || event.defaultPrevented || event.ctrlKey || event.metaKey || event.altKey) return;
+    // buttons and slider have keys of their own, a page keeps its own unless the pointer is over the scene
+    const unclaimed = document.activeElement === document.body && (this._orbit.fills || this.matches(":hover"));
+    if (event.composedPath()[0] !== this._player?.canvas && !unclaimed) return;
     if (event.key === " ") this.toggle();
     else if (event.key === "f") this._toggleFullScreen();
     else if (event.key === "," || event.key === ".") this.seek(this.time + (event.key === "." ? FRAME : -FRAME));
-    else if (!this._orbit?.key(event)) return;
+    else if (!this._orbit.key(event)) return;
     event.preventDefault();
   }
 
@@ -381,9 +402,11 @@ export class Pd4Player extends HTMLElement {
   }
 }
 
-/** @param {number} bytes */
-function size(bytes) {
-  return bytes < 1e6 ? `${Math.round(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`;
+/** How much has come, in the unit of all. @param {number} bytes @param {number | null} total */
+function sizes(bytes, total) {
+  const [unit, by, digits] = (total ?? bytes) < 1e6 ? /** @type {const} */ (["kB", 1e3, 0]) : ["MB", 1e6, 1];
+  const [come, all] = [bytes, total ?? 0].map((n) => (n / by).toFixed(digits));
+  return `${come === all || !total ? "" : `${come} of `}${total ? all : come} ${unit}`;
 }
 
 customElements.define("pd4-player", Pd4Player);

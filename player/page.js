@@ -17,7 +17,9 @@ if (query.has("bench")) {
   bench(source, document.body, query.get("sizes") ?? undefined);
 } else {
   for (const name of ["controls", "autoplay", "loop"]) player.toggleAttribute(name, query.get(name) !== "0");
-  for (const name of ["level", "time", "poster", "max-bytes", "max-seconds"]) {
+  player.setAttribute("label", document.querySelector("h1")?.textContent ?? "");
+  player.toggleAttribute("free", query.get("free") === "1");
+  for (const name of ["level", "time", "speed", "fit", "poster", "max-bytes", "max-seconds"]) {
     const value = query.get(name);
     if (value !== null) player.setAttribute(name, value);
   }

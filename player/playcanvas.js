@@ -167,7 +167,8 @@ export class Pd4 extends Script {
     const { x, y, z } = toScene.transformPoint(camera.getPosition());
     playback.loop = this.loop;
     playback.level = this.maxLayer;
-    playback.advance(dt * this.speed, [x, y, z]);
+    playback.speed = this.speed;
+    playback.advance(dt, [x, y, z]);
     if (this.exact && camera.camera) this._measurePixels(camera.camera);
   }
 

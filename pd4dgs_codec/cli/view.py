@@ -60,14 +60,15 @@ def _view(args: argparse.Namespace, console: Console) -> int:
         console.result({"output": args.output, "input": args.input}, args.output)
         return OK
     with temporary_folder() as folder:
-        (folder / PAGE).write_bytes(page().encode())
-        if os.path.isdir(args.input):
-            shown = _copied(args.input, folder)
+        data = None if os.path.isdir(args.input) or is_url(args.input) else _packed(args.input)
+        (folder / PAGE).write_bytes(page(about=data).encode())
+        if data is not None:
+            (folder / SCENE).write_bytes(data)
+            shown = player_of(SCENE)
         elif is_url(args.input):
             shown = player_of(args.input)
         else:
-            (folder / SCENE).write_bytes(_packed(args.input))
-            shown = player_of(SCENE)
+            shown = _copied(args.input, folder)
         with serving(folder, args, console, port=args.port, private=True) as server:
             url = f"{server.url}{shown}"
             console.result({"url": url, "input": args.input}, url, on_stdout=True)

@@ -66,7 +66,7 @@ def package(
     if video is not None:
         files[VIDEO_PLAYLIST] = hls_video(video, names[VIDEO])
     files[PLAYLIST] = hls(INDEX, video, VIDEO_PLAYLIST)
-    files[PAGE] = page(names[SCENE], draw(scene)).encode()
+    files[PAGE] = page(names[SCENE], data, draw(scene)).encode()
     index = {
         "file": names[SCENE],
         "format_version": about["format_version"],

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from pd4dgs_codec.errors import DataError, DeliveryError
 from pd4dgs_codec.format.decoder import decode
+from pd4dgs_codec.format.info import info
 from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.web import PAGE, is_url
 
@@ -123,16 +124,21 @@ document.head.append(Object.assign(document.createElement("script"),{src:packed}
 """
 
 
-def page(source: bytes | str | None = None, still: Still | None = None) -> str:
+def page(source: bytes | str | None = None, about: bytes | None = None, still: Still | None = None) -> str:
     """Returns the player as one HTML file.
 
     source: the bytes of a `.pd4` to embed, or its URL; None: `scene.pd4` beside the page, or the page's
-    `?src=address`. still: shown before any script has arrived.
+    `?src=address`. about: bytes of a `.pd4` whose metadata name the page; default: those that are embedded. still:
+    shown before any script has arrived.
     """
     root = player_folder()
     code = bundle(root, SCRIPT, *(f"render/{name}" for name in WORKERS), start=ENTRY)
     code = _WORKER_URL.sub(r"new URL(packed+'#\1')", code)
     text = re.sub(r"<!--.*?-->\s*", "", (root / PAGE).read_text(encoding="utf-8"), flags=re.DOTALL)
+    about = source if isinstance(source, bytes) else about
+    title: str = ((about and info(about)["metadata"]) or {}).get("title") or ""
+    for usual, tag in ((".pd4 player", "title"), ("Dynamic scene", "h1")) if title else ():
+        text = text.replace(f"{usual}</{tag}>", f"{html.escape(title)}</{tag}>")
     head, _, _ = re.split(r'<script src="\./early\.js"></script>\s*|<p id="note".*', text, flags=re.DOTALL)
     early = "" if isinstance(source, bytes) else f"<script>\n{packed(root / EARLY)}</script>\n"
     if isinstance(source, str):

@@ -7,9 +7,9 @@ import { Stream } from "./stream.js";
 
 /** The file is not available, as opposed to one that cannot be decoded. */
 export class FetchError extends Error {
-  /** @param {string} message */
+  /** @param {string} message in which a server's words are made harmless for a terminal */
   constructor(message) {
-    super(message);
+    super(message.replace(/[^ -~]/g, (c) => `\\u${c.charCodeAt(0).toString(16).padStart(4, "0")}`));
     this.name = "FetchError";
   }
 }
@@ -56,10 +56,13 @@ export class SceneSource {
     /** Connections that ended early, and changes of the file, so far. */
     this.cuts = 0;
     this.changes = 0;
-    /** Bytes of the file that have arrived from its first one on, and its length, null while it is unknown. */
+    /** Bytes of the file that have arrived from its first one on. */
     this.received = 0;
-    /** @type {number | null} */
-    this.total = null;
+    /** What a server says that the file has, for progress alone: it may be the length of a compressed response.
+     * @type {number | null} */
+    this._announced = null;
+    /** Whether the server has no byte behind those received. */
+    this._ended = false;
     this._signal = signal;
     /** What decodes the bytes; another one if the file changes. */
     this.decoder = new Stream();
@@ -68,13 +71,15 @@ export class SceneSource {
     this._pause = pause;
     this._progress = progress;
     this._fetch = options.fetch ?? globalThis.fetch.bind(globalThis);
-    /** The file's strong ETag, or its date. @type {string | null} */
-    this._validator = null;
+    /** The file's ETag, or its date; null where the server does not show them. @type {string | null} */
+    this._tag = null;
     /** The open connection. @type {AbortController | null} */
     this._controller = null;
     /** Its response. skip: bytes that are here already.
      * @type {{reader: Reader, skip: number, rest: Uint8Array} | null} */
     this._body = null;
+    /** Ends the read that waits for it: not every body notices that its connection was aborted. */
+    this._giveUp = (/** @type {unknown} */ _reason) => {};
     /** When a wait of the connection lapses, and the timer that looks. */
     this._lapse = Infinity;
     /** @type {ReturnType<typeof setTimeout> | undefined} */
@@ -86,12 +91,23 @@ export class SceneSource {
     /** Preamble of the file. */
     this._head = new Uint8Array(PREAMBLE_SIZE);
     this._gathered = new Uint8Array(GATHERED);
-    signal?.addEventListener("abort", () => this._controller?.abort(signal.reason), { once: true });
+    signal?.addEventListener("abort", () => this._abort(signal.reason), { once: true });
+  }
+
+  /** Bytes of the file: as its header says, before it is there as the server does; null if neither is known. */
+  get total() {
+    return this.decoder.end ?? this._announced;
+  }
+
+  /** @param {unknown} [reason] */
+  _abort(reason) {
+    this._controller?.abort(reason);
+    this._giveUp(reason);
   }
 
   /** Ends the connection. `scenes` may be called again. */
   close() {
-    this._controller?.abort();
+    this._abort();
     this._controller = this._body = null;
     this._stopTimer();
   }
@@ -191,21 +207,24 @@ export class SceneSource {
       if (!damaged || this._repairedAt === good) throw error;
       this._repairedAt = good;
       this.close();
-      this.received = good;
-      this.decoder.rewind();
+      if (this._tag === null && this._requested.received) this._restart(); // perhaps the rest of another file
+      else {
+        this.received = good;
+        this.decoder.rewind();
+      }
       return [];
     }
   }
 
   /**
-   * The next bytes to arrive, none beyond `end`, which nothing is decoded before; perhaps none at all; null if the file
-   * ends. The array is used again. Raises Cut, FetchError or an error of fetch.
+   * The next bytes to arrive, none beyond `end`, which nothing is decoded before; perhaps none at all; null if the
+   * server has no more. The array is used again. Raises Cut, FetchError or an error of fetch.
    *
    * @param {number} end @param {number} until seconds
    * @returns {Promise<Uint8Array | null>}
    */
   async _read(end, until) {
-    if (this.total !== null && this.received >= this.total) return null;
+    if (this._ended) return null;
     if (!this._body) {
       await this._request(until);
       return NOTHING; // if the file has changed, it begins anew
@@ -218,7 +237,7 @@ export class SceneSource {
         this._await(until);
         let came;
         try {
-          came = await body.reader.read();
+          came = await this._next(body.reader);
         } catch (error) {
           if (filled) break; // the next call meets it again, as the end below
           throw error;
@@ -227,8 +246,9 @@ export class SceneSource {
         if (came.done) {
           if (filled) break;
           this.close();
-          if (this.total !== null) throw new Cut(`ended at byte ${this.received} of ${this.total}`);
-          this.total = this.received; // a length that was never told ends with the response
+          // the header says that more follows, so that it is asked for; a response without a new byte is the answer
+          if (this.received > this._requested.received) throw new Cut(`ended at byte ${this.received} of ${this.total}`);
+          this._ended = true;
           return null;
         }
         const skipped = Math.min(body.skip, came.value.length);
@@ -251,6 +271,15 @@ export class SceneSource {
     return this._gathered.subarray(0, filled);
   }
 
+  /** @param {Reader} reader @returns {Promise<ReadableStreamReadResult<Uint8Array>>} */
+  _next(reader) {
+    return new Promise((resolve, reject) => {
+      this._controller?.signal.throwIfAborted();
+      this._giveUp = reject;
+      reader.read().then(resolve, reject);
+    });
+  }
+
   /** Begins a wait. One timer serves all of a connection, since one for each would take longer than a small piece does;
    * those that follow lapse no earlier. @param {number} until */
   _await(until) {
@@ -263,14 +292,19 @@ export class SceneSource {
     const left = this._lapse - performance.now();
     const later = Math.min(Math.ceil(left) + 1, 2 ** 31 - 1); // more would fire at once
     this._timer = left > 0 && left < Infinity ? setTimeout(() => this._look(), later) : undefined;
-    if (left <= 0) this._controller?.abort(new Cut("timed out waiting for data"));
+    if (left <= 0) this._abort(new Cut("timed out waiting for data"));
   }
 
   /** Requests the missing bytes. @param {number} until */
   async _request(until) {
     const start = this.received;
+    if (this.url.startsWith("file:")) {
+      const way = "open the page through a web server (pd4dgs-serve FOLDER), or drop the file onto it";
+      throw new FetchError(`${this.url}: browsers do not let a page from a file read another file; ${way}`);
+    }
+    // without If-Range, for which browsers would ask another origin's permission: the answer says whether it is the file
     /** @type {Record<string, string>} */
-    const headers = start && this._validator ? { Range: `bytes=${start}-`, "If-Range": this._validator } : {};
+    const headers = start ? { Range: `bytes=${start}-` } : {};
     const { signal } = (this._controller = new AbortController());
     this._requested = { at: now(), received: start };
     // a request after a cut or damage bypasses caches
@@ -283,37 +317,38 @@ export class SceneSource {
   }
 
   /**
-   * Checks a response; restarts if the file has changed. Returns how many of its bytes are here already, null if it is
-   * of no use.
+   * Checks a response; restarts if the file has changed. What does not say so is taken: slices have checksums. Returns
+   * how many of its bytes are here already, null if it is of no use.
    *
    * @param {Response} response @param {boolean} resumes whether a range was requested
    */
   _accept({ status, statusText, headers }, resumes) {
-    if (status === 416 && resumes) return this._restart(); // the file has become shorter
-    if (status !== 200 && status !== 206) {
+    const beyond = status === 416 && resumes; // there is no such byte
+    if (status !== 200 && status !== 206 && !beyond) {
       const said = `the server answered ${status} ${statusText}`.trimEnd();
       if (TEMPORARY.includes(status)) throw new Cut(said);
       throw new FetchError(`${this.url}: ${said}`);
     }
-    const tag = headers.get("ETag");
-    const strong = tag && !tag.startsWith("W/") ? tag : null;
-    const validator = strong ?? headers.get("Last-Modified");
-    if (status === 206) {
-      const part = /^bytes (\d{1,15})-\d{1,15}\/(\d{1,15})$/.exec(headers.get("Content-Range") ?? "");
-      if (!resumes || !part || Number(part[1]) !== this.received) {
-        throw new Cut("the response holds other bytes than requested");
-      }
-      const total = Number(part[2]);
-      if ((validator ?? this._validator) !== this._validator || (this.total ?? total) !== total) return this._restart();
-      this.total = total;
-      return 0;
+    const tag = (headers.get("ETag") ?? headers.get("Last-Modified"))?.replace(/^W\//, "") ?? null;
+    const length = lengthOf(headers.get("Content-Length"));
+    // not shown to another origin unless the server exposes it; the length may be an asterisk
+    const range = /^bytes (?:(\d{1,15})-\d{1,15}|\*)\/(\d{1,15}|\*)$/.exec(headers.get("Content-Range") ?? "");
+    const total = lengthOf(range?.[2]);
+    if (tag !== null && this._tag !== null && tag !== this._tag) return this._restart();
+    if (total !== null && (beyond ? total < this.received : total !== (this.decoder.end ?? total))) return this._restart();
+    this._tag ??= tag;
+    if (beyond) {
+      this._ended = true;
+      return null;
     }
-    if (this.received && (strong === null || strong !== this._validator)) this._restart();
-    // the length of a compressed response is not that of the file
-    const length = headers.get("Content-Encoding") ? null : headers.get("Content-Length");
-    this.total = length !== null && /^\d{1,15}$/.test(length) ? Number(length) : null;
-    this._validator = validator;
-    return this.received; // the same file, from a server without ranges
+    if (status === 200 || (!range && length !== null && length === this._announced)) {
+      this._announced = length;
+      return this.received; // the same file, from a server without ranges
+    }
+    const start = range ? Number(range[1]) : this.received;
+    if (!(start <= this.received)) throw new Cut("the response holds other bytes than requested");
+    this._announced ??= total;
+    return this.received - start;
   }
 
   /** The file has changed. @returns {null} */
@@ -323,13 +358,16 @@ export class SceneSource {
     this.decoder = new Stream();
     this.received = 0;
     this._requested.received = 0;
-    this.total = null;
-    this._validator = null;
+    this._announced = this._tag = null;
+    this._ended = false;
     return null;
   }
 }
 
 /** @typedef {ReadableStreamDefaultReader<Uint8Array>} Reader */
+
+/** @param {string | null | undefined} text */
+const lengthOf = (text) => (/^\d{1,15}$/.test(text ?? "") ? Number(text) : null);
 
 const NOTHING = new Uint8Array(0);
 const now = () => performance.now() / 1000;

@@ -45,6 +45,8 @@ export class LayerReader {
     /** Each slice's layer with the end of its chunk in the file, in file order; empty until the header is there.
      * @type {{layer: number, end: number}[]} */
     this.layerEnds = [];
+    /** Bytes of the file as its header has them, null until it is there. @type {number | null} */
+    this.end = null;
     /** Of the next chunk, or of the header before it is read. */
     this.offset = 0;
     /** What the layers read so far hold. @type {LayerParts[]} */
@@ -90,6 +92,7 @@ export class LayerReader {
       this.layerEnds.push({ layer: type, end });
       return (come += length);
     });
+    this.end = end;
     this._share = sums.map((sum) => sum / come);
     const { feature, slots } = header.widths;
     const widths = { anchor: 3, feature, scalingLog: 6, offset: 3 * slots };

@@ -36,6 +36,11 @@ export class Stream {
     return this._reader.layerEnds;
   }
 
+  /** Bytes of the file as its header has them, null until it is there. */
+  get end() {
+    return this._reader.end;
+  }
+
   /**
    * The newest scene of each layer that `bytes` complete a slice of, with all slices so far. The bytes are copied.
    *

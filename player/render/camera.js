@@ -1,6 +1,6 @@
 // Cameras: pinhole, axes x right, y down, z forward, as the format has them.
 
-/** @import { Camera, Info } from "../decode/scene.js" */
+/** @import { Camera, Info, Scene } from "../decode/scene.js" */
 
 /** @typedef {[number, number, number]} Vector */
 
@@ -53,6 +53,35 @@ export function lookAlong(eye, forward, down, { K, width, height }) {
   return { viewmat: new Float32Array([...rows, 0, 0, 0, 1]), K, width, height };
 }
 
+/** Strips along the left, right and upper side of a picture, as shares of it, and how densely anchors lie there at least
+ * where a scene goes on beyond it, relative to all of the picture. */
+const STRIP = 0.1;
+const DENSITY = 0.25;
+
+/**
+ * Whether a scene goes on beyond its camera's picture, as a place does; a thing ends within it, and was seen from all
+ * around more likely. The ground below says nothing.
+ *
+ * @param {Scene} scene @returns {boolean}
+ */
+export function goesOn({ anchor, mask, info: { camera, near } }) {
+  if (!camera) return false;
+  const { viewmat: v, K, width, height } = camera;
+  const codes = mask[mask.length - 1];
+  const strips = [0, 0, 0];
+  let inside = 0;
+  for (let i = 0; i < codes.length; i++) {
+    if (!codes[i]) continue;
+    const [x, y, z] = [0, 4, 8].map((r) => dot(anchor.subarray(3 * i, 3 * i + 3), v.subarray(r, r + 3)) + v[r + 3]);
+    const px = (K[0] * x / z + K[2]) / width;
+    const py = (K[4] * y / z + K[5]) / height;
+    if (!(z > near && px >= 0 && px <= 1 && py >= 0 && py <= 1)) continue;
+    inside++;
+    [px, 1 - px, py].forEach((share, k) => (strips[k] += Number(share < STRIP)));
+  }
+  return Math.max(...strips) > DENSITY * STRIP * inside;
+}
+
 /** The middle of a scene's box. @param {Info} info @returns {Vector} */
 export const middleOf = ({ box: [low, high] }) => plus(plus([0, 0, 0], low, 0.5), high, 0.5);
 
@@ -73,27 +102,28 @@ export function defaultCamera(info) {
   return lookAlong(eye, forward, plus([0, 0, 0], worldUp, -1), { K, width: 640, height: 480 });
 }
 
+/** What a window shows of a camera's picture: all, or as much as fills it. @typedef {"contain" | "cover"} Fit */
+
 /**
- * How much larger than a camera's picture a window shows it. The window shows all of it, but upright ones (phones) fill
- * up with it: above and below it was nothing captured, there are only floaters.
+ * How much larger than a camera's picture a window shows it.
  *
  * @param {Pick<Camera, "width" | "height">} camera @param {number} width @param {number} height of the window, pixels
+ * @param {Fit} [fit]
  */
-export function magnification(camera, width, height) {
-  const sides = [width / camera.width, height / camera.height];
-  return height > width ? Math.max(...sides) : Math.min(...sides);
+export function magnification(camera, width, height, fit = "contain") {
+  return Math[fit === "cover" ? "max" : "min"](width / camera.width, height / camera.height);
 }
 
 /**
  * The camera for a picture of another size, its own in the middle.
  *
- * @param {Camera} camera @param {number} width @param {number} height pixels
+ * @param {Camera} camera @param {number} width @param {number} height pixels @param {Fit} [fit]
  * @returns {Camera}
  */
-export function fitted(camera, width, height) {
+export function fitted(camera, width, height, fit) {
   if (camera.width === width && camera.height === height) return camera;
   const { viewmat, K } = camera;
-  const scale = magnification(camera, width, height);
+  const scale = magnification(camera, width, height, fit);
   return {
     viewmat,
     K: new Float32Array([

@@ -89,8 +89,8 @@ function report(scene, times = { arrived, decoded: epochNow() }) {
 serve({
   /** @param {string | Blob} from */
   open(from) {
-    source = new SceneSource(typeof from === "string" ? from : URL.createObjectURL(from), {
-      fetch: ask,
+    source = new SceneSource(typeof from === "string" ? from : "the file", {
+      fetch: typeof from === "string" ? ask : async () => new Response(from), // no address that a policy may forbid
       progress: () => {
         arrived = epochNow();
         if (performance.now() - told > PROGRESS_MS) report();

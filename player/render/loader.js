@@ -28,9 +28,11 @@ export function startLoader(told, from) {
  * `error` {message, kind}.
  */
 export class Clip extends EventTarget {
-  /** @param {{time?: number | null, loop?: boolean}} options */
-  constructor({ time, loop }) {
+  /** @param {{time?: number | null, loop?: boolean, speed?: number | null}} options */
+  constructor({ time, loop, speed }) {
     super();
+    /** Seconds of the scene's time per second. */
+    this.speed = speed ?? 1;
     /** Whether playing begins anew at the end. */
     this.loop = !!loop;
     /** As far as it has arrived. @type {Scene | null} */
@@ -113,7 +115,7 @@ export class Clip extends EventTarget {
   _advance(elapsed) {
     if (this._playing) {
       const [start, end] = this.timeRange;
-      const next = this.time + (this._resumed ? 0 : elapsed);
+      const next = this.time + (this._resumed ? 0 : elapsed) * this.speed;
       const again = this.loop && end > start;
       this._time = next < end ? next : again ? start + ((next - start) % (end - start)) : end;
       if (next >= end && !again) this.pause();

@@ -1,8 +1,8 @@
 // Moving the camera: about a point of the scene, along the picture, towards it.
 
-import { centreOf, cross, downOf, dot, forwardOf, lookAlong, magnification } from "./camera.js";
+import { centreOf, cross, defaultCamera, downOf, dot, forwardOf, goesOn, lookAlong, magnification } from "./camera.js";
 import { middleOf, plus, turn, unit } from "./camera.js";
-/** @import { Camera } from "../decode/scene.js" */
+/** @import { Camera, Scene } from "../decode/scene.js" */
 /** @import { Vector } from "./camera.js" */
 /** @import { Player } from "./player.js" */
 
@@ -16,12 +16,24 @@ const POLE = 0.1;
 const WHEEL = 1.0015;
 /** Anchors that are looked at to find what the camera looks at. */
 const SAMPLES = 4000;
+/** How far the view of a place may differ from that of its camera: radians, and to the side, ahead and back as shares of
+ * the distance to what the camera looks at. Beyond, nothing was captured. */
+const CONE = { angle: 0.5, aside: 0.5, ahead: 0.7, back: 0.15 };
+
+/** The camera of a place, and how far what it looks at is. @typedef {{eye: Vector, forward: Vector, distance: number}}
+ * Limits */
 
 export class Orbit {
   /** @param {Player} player @param {HTMLElement} surface takes pointers, wheel and keys */
   constructor(player, surface) {
     this._player = player;
     this._surface = surface;
+    /** Whether the camera may go where nothing was captured. */
+    this.free = false;
+    /** Whether the pointer has pressed since it came in: a wheel that only comes past scrolls the page. */
+    this._engaged = false;
+    /** Whose limits are known, null: it has none. @type {{info: object, limits: Limits | null} | null} */
+    this._known = null;
     /** What the camera turns about. @type {Vector | null} */
     this._pivot = null;
     /** The camera that it made last. @type {Camera | null} */
@@ -36,10 +48,20 @@ export class Orbit {
     for (const name of /** @type {const} */ (["pointerup", "pointercancel"])) {
       surface.addEventListener(name, (event) => this._pointers.delete(event.pointerId), { signal });
     }
+    surface.addEventListener("pointerleave", () => (this._engaged = false), { signal });
     surface.addEventListener("wheel", (event) => this._wheel(event), { signal, passive: false });
     surface.addEventListener("contextmenu", (event) => event.preventDefault(), { signal });
     surface.addEventListener("dblclick", () => this.reset(), { signal });
-    surface.style.touchAction = "none";
+    // in a page that scrolls, a finger that goes up or down scrolls it
+    const touch = () => (surface.style.touchAction = this.fills ? "none" : "pan-y");
+    addEventListener("resize", touch, { signal });
+    touch();
+  }
+
+  /** Whether there is nothing beside the surface that could scroll or take keys. */
+  get fills() {
+    const { clientWidth, clientHeight } = this._surface;
+    return clientWidth >= innerWidth && clientHeight >= innerHeight;
   }
 
   /** Back to the scene's own camera. */
@@ -59,6 +81,12 @@ export class Orbit {
    * @param {number} yaw @param {number} pitch radians
    */
   turn(yaw, pitch) {
+    this._turn(yaw, 0);
+    this._turn(0, pitch); // where one of them ends, the other goes on
+  }
+
+  /** @param {number} yaw @param {number} pitch radians */
+  _turn(yaw, pitch) {
     this._change((eye, forward, down, pivot, up) => {
       const right = cross(down, forward);
       const polar = Math.acos(Math.min(Math.max(-dot(forward, up), -1), 1)); // between the view and straight down
@@ -75,7 +103,7 @@ export class Orbit {
       const camera = this._player.camera;
       const { clientWidth, clientHeight } = this._surface;
       if (!camera || !clientWidth || !clientHeight) return null;
-      const scale = magnification(camera, clientWidth, clientHeight);
+      const scale = magnification(camera, clientWidth, clientHeight, this._player.fit);
       const distance = Math.max(dot(plus(pivot, eye, -1), forward), 1e-9);
       const { viewmat } = camera;
       const right = [viewmat[0], viewmat[1], viewmat[2]];
@@ -118,6 +146,7 @@ export class Orbit {
 
   /** @param {PointerEvent} event */
   _down(event) {
+    this._engaged = true;
     this._surface.setPointerCapture(event.pointerId);
     this._pointers.set(event.pointerId, { x: event.clientX, y: event.clientY });
     this._panning = event.button !== 0 || event.shiftKey;
@@ -149,6 +178,7 @@ export class Orbit {
 
   /** @param {WheelEvent} event */
   _wheel(event) {
+    if (!this._engaged && !this.fills) return;
     event.preventDefault();
     const pixels = event.deltaMode === WheelEvent.DOM_DELTA_PIXEL ? event.deltaY : 30 * event.deltaY;
     this.zoom(WHEEL ** Math.min(Math.max(pixels, -400), 400));
@@ -163,16 +193,47 @@ export class Orbit {
     const { camera, info } = player;
     if (!camera || !info) return;
     if (camera !== this._made) this._pivot = null; // of another scene or a script's camera
-    const pivot = (this._pivot ??= this._findPivot());
+    const pivot = (this._pivot ??= this._findPivot(camera));
     const down = downOf(camera);
     const up = unit(info.up, plus([0, 0, 0], down, -1));
-    const next = change(centreOf(camera), forwardOf(camera), down, pivot, up);
-    if (next && next.flat().every(Number.isFinite)) player.camera = this._made = lookAlong(...next, camera);
+    const pose = /** @type {[Vector, Vector]} */ ([centreOf(camera), forwardOf(camera)]);
+    const next = change(...pose, down, pivot, up);
+    if (!next || !next.flat().every(Number.isFinite)) return;
+    if (this._excess(next[0], next[1]) > 1 && this._excess(...pose) <= 1) { // a script may have gone beyond
+      this._pivot = pivot; // a pan has moved it
+      return;
+    }
+    player.camera = this._made = lookAlong(...next, camera);
   }
 
-  /** What the camera looks at: on its axis, at the median depth of the anchors in the picture's middle. */
-  _findPivot() {
-    const { scene, camera } = this._player;
+  /** How far a view is from the camera of a place, in units of what CONE allows. @param {Vector} eye
+   * @param {Vector} forward */
+  _excess(eye, forward) {
+    const { scene } = this._player;
+    if (!scene || this.free) return 0;
+    if (this._known?.info !== scene.info) this._known = { info: scene.info, limits: this._findLimits(scene) };
+    const { limits } = this._known;
+    if (!limits) return 0;
+    const moved = plus(eye, limits.eye, -1);
+    const ahead = dot(moved, limits.forward) / limits.distance;
+    const aside = Math.hypot(...plus(moved, limits.forward, -ahead * limits.distance)) / limits.distance;
+    const angle = Math.acos(Math.min(dot(forward, limits.forward), 1));
+    return Math.max(angle / CONE.angle, aside / CONE.aside, ahead / CONE.ahead, -ahead / CONE.back);
+  }
+
+  /** @param {Scene} scene @returns {Limits | null} */
+  _findLimits(scene) {
+    if (!goesOn(scene)) return null;
+    const home = defaultCamera(scene.info);
+    const eye = centreOf(home);
+    const forward = forwardOf(home);
+    return { eye, forward, distance: dot(plus(this._findPivot(home), eye, -1), forward) };
+  }
+
+  /** What a camera looks at: on its axis, at the median depth of the anchors in the picture's middle.
+   * @param {Camera | null} camera */
+  _findPivot(camera) {
+    const { scene } = this._player;
     if (!scene || !camera) return /** @type {Vector} */ ([0, 0, 0]);
     const { viewmat: v, K, width, height } = camera;
     const { anchor, info } = scene;

@@ -20,10 +20,12 @@ import { WORKERS } from "./workers.js";
  * @property {number | null} [time] seconds of the scene's time to start at
  * @property {boolean} [autoplay]
  * @property {boolean} [loop]
+ * @property {number | null} [speed] seconds of the scene's time per second, default 1
  * @property {number | null} [bytes] how much of the file to load at most
  * @property {number | null} [seconds] how long to load beyond the first slice
  * @property {"gpu" | "cpu" | null} [evaluator] default: the faster one of the machine
- * @property {boolean} [degrade] whether a slow machine gets fewer pixels and lower levels, default true
+ * @property {boolean} [degrade] whether a slow machine gets fewer pixels while something moves, default true
+ * @property {import("./camera.js").Fit} [fit] what a window of another shape shows, default contain
  * @property {number | null} [pixelRatio] device pixels per CSS pixel, default the window's, at most 2
  */
 
@@ -37,10 +39,11 @@ import { WORKERS } from "./workers.js";
  * @property {{layer: number, end: number}[]} ends where in the file each slice ends, empty while it is unknown
  * @property {number | null} level shown, null before the first picture
  * @property {number[]} levels that have arrived
- * @property {number} fps pictures drawn in the last second
+ * @property {number} fps pictures drawn a second while something moves, else 0
  * @property {number} scale of the picture's sides
  * @property {number} gaussians drawn
  * @property {boolean} software whether the CPU draws, for want of a GPU
+ * @property {boolean} lost whether it is in view and the browser has taken the WebGL context
  */
 
 /** After so many milliseconds without movement the picture is drawn at full quality. */
@@ -50,6 +53,13 @@ const REST_MS = 250;
 const SOFTWARE_ANCHORS = 30_000;
 /** The first step of SCALES without a GPU. */
 const SOFTWARE_STEP = 2;
+/** So many players of a page have WebGL contexts, as many as mobile browsers keep; for more in view, the browser decides.
+ * Those out of view give theirs up. */
+const MOST_CONTEXTS = 8;
+/** Players that have one. @type {Set<Player>} */
+const equipped = new Set();
+/** A context that the browser took comes back within so many milliseconds, or others have it. */
+const LOST_MS = 1000;
 
 /**
  * Events: those of `Clip`; `progress` {bytes, total}; `firstpicture` and `upgrade` {level, bytes, seconds, arrived,
@@ -102,7 +112,7 @@ export class Player extends Clip {
     this._frameRequest = 0;
     this._lastFrame = 0;
     this._lastMoved = -Infinity;
-    /** Ends of draws in the last second. @type {number[]} */
+    /** Ends of draws in the last second, of slower ones the last four. @type {number[]} */
     this._draws = [];
     this._started = performance.now();
     /** When scenes came. @type {WeakMap<Scene, {arrived: number, decoded: number}>} */
@@ -111,11 +121,18 @@ export class Player extends Clip {
     this.counts = { drawn: 0, evaluated: 0 };
     this._listening = new AbortController();
     const { signal } = this._listening;
+    /** What brings back the context that was given up. @type {WEBGL_lose_context | null} */
+    this._given = null;
+    /** When the browser took the context. */
+    this._lostAt = Infinity;
     const lost = (/** @type {Event} */ event) => {
       event.preventDefault(); // else it never comes back
       this._dropGpu();
+      if (!this._given) this._lostAt = performance.now();
+      else if (this._inView) setTimeout(() => this._equip()); // it has come back meanwhile
     };
     const restored = () => {
+      this._given = null;
       this._startGpu();
       this._wake();
     };
@@ -124,8 +141,11 @@ export class Player extends Clip {
     this._resize = new ResizeObserver(() => this._changed());
     this._resize.observe(canvas);
     this._visible = true;
+    /** Whether it is known to be in view. */
+    this._inView = false;
     this._seen = new IntersectionObserver((entries) => {
-      this._visible = entries[entries.length - 1].isIntersecting; // the newest
+      this._visible = this._inView = entries[entries.length - 1].isIntersecting; // the newest
+      if (this._inView) this._equip();
       this._wake();
     });
     this._seen.observe(canvas);
@@ -153,7 +173,7 @@ export class Player extends Clip {
     this._changed();
     this._unfit = false;
     const loading = this._loadOn();
-    if (!this._gpu) this._startGpu(); // which takes longer than to ask a server
+    if (this._inView || equipped.size < MOST_CONTEXTS) this._equip(); // which takes longer than to ask a server
     if (this._options.evaluator === "cpu" || this._gpu?.software) this._cpu ??= new CpuEvaluator();
     await loading;
   }
@@ -193,6 +213,16 @@ export class Player extends Clip {
     this._changed();
   }
 
+  /** What a window of another shape than the camera's picture shows. @returns {import("./camera.js").Fit} */
+  get fit() {
+    return this._options.fit ?? "contain";
+  }
+
+  set fit(fit) {
+    this._options.fit = fit;
+    this._changed();
+  }
+
   /** The camera in use; assign null for the scene's own. @returns {Camera | null} */
   get camera() {
     return this._head ?? this._camera ?? (this._scene && defaultCamera(this._scene.info));
@@ -206,16 +236,24 @@ export class Player extends Clip {
   /** @returns {Status} */
   get status() {
     const now = performance.now();
-    while (this._draws.length && now - this._draws[0] > 1000) this._draws.shift();
     return {
       ...this._status,
       level: this._shownLevel,
       levels: this._scene?.layers ?? [],
-      fps: this._draws.length,
+      fps: this._moving(now) ? this._rate(now) : 0,
       scale: this._moving(now) ? this._scale() : 1,
       gaussians: this._painter?.count ?? 0,
       software: this._gpu?.software ?? false,
+      lost: this._visible && now - this._lostAt > LOST_MS,
     };
+  }
+
+  /** Pictures a second lately; 0 where the last one was long ago. @param {number} now */
+  _rate(now) {
+    const draws = this._draws;
+    while (draws.length > 4 && now - draws[0] > 1000) draws.shift();
+    const span = (draws[draws.length - 1] - draws[0]) / (draws.length - 1);
+    return draws.length > 1 && now - draws[draws.length - 1] < 2 * span + 500 ? 1000 / span : 0;
   }
 
   /** The renderer as the driver names it; empty without WebGL2. */
@@ -268,9 +306,7 @@ export class Player extends Clip {
     this._listening.abort();
     this._sorter.close();
     this._cpu?.close();
-    const gl = this._gpu?.gl;
-    this._dropGpu();
-    gl?.getExtension("WEBGL_lose_context")?.loseContext(); // browsers keep few contexts alive
+    this._giveUp();
     this.canvas.width = this.canvas.height = 1;
   }
 
@@ -293,6 +329,21 @@ export class Player extends Clip {
 
   // --- the GPU
 
+  /** Sees to a GPU for what is loaded. */
+  _equip() {
+    if (this._gpu || this.closed || !(this._loader || this._scene)) return;
+    if (equipped.size >= MOST_CONTEXTS) [...equipped].find((player) => !player._visible)?._giveUp();
+    if (this._given) this._given.restoreContext();
+    else this._startGpu();
+  }
+
+  /** Gives up the WebGL context, as browsers keep few alive; `_equip` brings it back. */
+  _giveUp() {
+    this._given = this._gpu?.gl.getExtension("WEBGL_lose_context") ?? this._given;
+    this._dropGpu();
+    this._given?.loseContext();
+  }
+
   _startGpu() {
     const gl = this.canvas.getContext("webgl2", {
       alpha: false,
@@ -306,6 +357,8 @@ export class Player extends Clip {
     }
     if (gl.isContextLost()) return;
     this._gpu = new Gpu(gl);
+    equipped.add(this);
+    this._lostAt = Infinity;
     this._pace = new Pace(this._gpu.software ? SOFTWARE_STEP : 0);
     this._painter = new Painter(this._gpu);
     this._dirty = true;
@@ -314,6 +367,7 @@ export class Player extends Clip {
   /** Forgets a GPU whose context is lost, and with it all that it held. */
   _dropGpu() {
     this._gpu = this._painter = this._evaluator = this._front = this._spare = null;
+    equipped.delete(this);
   }
 
   /** Whether another scene was opened, or the GPU's context lost, since a step began: it then has no result, and its
@@ -376,8 +430,7 @@ export class Player extends Clip {
   _state() {
     const scene = /** @type {Scene} */ (this._scene);
     const camera = /** @type {Camera} */ (this.camera);
-    let level = this._front ? (this._level ?? 2) : 0; // the first picture is the one that comes soonest
-    if (this._playing && this._options.degrade !== false) level = Math.min(level, this._pace.level);
+    const level = this._front ? (this._level ?? 2) : 0; // the first picture is the one that comes soonest
     return stateOf(scene, Math.max(level, 0), this.time, centreOf(camera));
   }
 
@@ -414,8 +467,6 @@ export class Player extends Clip {
     const gpu = /** @type {Gpu} */ (this._gpu);
     const opened = this._started;
     const state = this._state();
-    const playing = this._playing;
-    const started = performance.now();
     this._evaluating = true;
     try {
       const spare = this._spare;
@@ -429,7 +480,6 @@ export class Player extends Clip {
       this._front = { splats, state };
       this.counts.evaluated++;
       this._dirty = true;
-      if (playing) this._pace.evaluated(state.level, performance.now() - started, performance.now());
     } catch (error) {
       if (this._isStale(gpu, opened)) return;
       if (this._onCpu(gpu, state.scene)) {
@@ -555,7 +605,7 @@ export class Player extends Clip {
     const { camera, _painter: painter, _front: front } = this;
     if (!camera || !painter || !front) return false;
     const { info } = front.state.scene;
-    const views = eyes ?? [fitted(camera, this.canvas.width, this.canvas.height)];
+    const views = eyes ?? [fitted(camera, this.canvas.width, this.canvas.height, this.fit)];
     painter.draw(front.splats, views, info.background, info.near, target);
     return true;
   }

@@ -9,7 +9,12 @@ export class Remote {
     this._calls = 0;
     /** @type {Error | null} */
     this._failed = null;
-    this._worker = from instanceof Worker ? from : start(from);
+    try {
+      this._worker = from instanceof Worker ? from : start(from);
+    } catch (error) {
+      this._fail(new Error(`this page may start no worker: ${/** @type {Error} */ (error).message}`));
+      return;
+    }
     this._worker.onmessage = ({ data }) => {
       const waiting = this._waiting.get(data.call);
       this._waiting.delete(data.call);
@@ -20,7 +25,8 @@ export class Remote {
     };
     this._worker.onerror = (event) => {
       event.preventDefault();
-      this._fail(new Error(`a worker stopped: ${event.message || "it could not be loaded"}`));
+      const why = "it was not found, or the page's policy forbids it (Content-Security-Policy: worker-src)";
+      this._fail(new Error(`a worker stopped: ${event.message || why}`));
     };
   }
 
@@ -35,7 +41,7 @@ export class Remote {
     return new Promise((resolve, reject) => {
       const call = ++this._calls;
       this._waiting.set(call, { resolve, reject });
-      this._worker.postMessage({ call, name, args }, transfer);
+      this._worker?.postMessage({ call, name, args }, transfer);
     });
   }
 
@@ -48,7 +54,7 @@ export class Remote {
 
   /** Ends the worker. Unanswered and later calls are rejected. */
   close() {
-    this._worker.terminate();
+    this._worker?.terminate();
     this._fail(new Error("the worker was closed"));
   }
 }
@@ -56,7 +62,7 @@ export class Remote {
 /** @param {URL} url @returns {Worker} */
 function start(url) {
   if (url.protocol === "blob:") return new Worker(url); // packed: a page from a file cannot load modules
-  if (url.origin === location.origin) return new Worker(url, { type: "module" });
+  if (url.origin === globalThis.origin) return new Worker(url, { type: "module" });
   // a browser starts no worker from another origin, but one that imports from there
   const source = new Blob([`import ${JSON.stringify(url.href)};`], { type: "text/javascript" });
   const local = URL.createObjectURL(source);

@@ -34,7 +34,7 @@ class Worker {
   }
 }
 
-Object.assign(globalThis, { Worker, location: { origin: "null" }, document: { baseURI: "http://localhost/" } });
+Object.assign(globalThis, { Worker, origin: "null", document: { baseURI: "http://localhost/" } });
 after(async () => {
   for (let i = 0; threads && i < 500; i++) await new Promise((resolve) => setTimeout(resolve, 20));
   if (threads) throw new Error(`${threads} threads are left`);

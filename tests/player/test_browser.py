@@ -44,7 +44,9 @@ from tiny import random_deformation, random_network
 from pd4dgs_codec import decode, encode, show
 from pd4dgs_codec import scene as scene_module
 from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.format.encoder import with_metadata
 from pd4dgs_codec.format.info import info
+from pd4dgs_codec.format.metadata import Metadata
 from pd4dgs_codec.interchange.splats import Splats, ply_bytes
 from pd4dgs_codec.scene import Camera, Deformation, Scene, SceneInfo, Steps, Widths
 from pd4dgs_codec.web.page import page as packed_page
@@ -499,10 +501,12 @@ def test_a_level_may_be_raised_while_a_lower_one_loads(harness, folder, lively):
         harness.wait_for_function("harness.player.status.level === 2")
 
 
-def element(page: Any, server: Server, attributes: str, code: Server | None = None) -> Any:
-    """A page of `server` with one element. code: the server of the element's code, if it is another one."""
+def element(page: Any, server: Server, attributes: str, code: Server | None = None, *, policy: str = "") -> Any:
+    """A page of `server` with one element. code: the server of the element's code, if it is another one. policy: of the
+    content of the page."""
     script = (code or server).url_of("player/element.js")
-    html = f"""<!doctype html><title>t</title><script type="module" src="{script}"></script>
+    html = f"""<!doctype html><title>t</title><meta http-equiv="Content-Security-Policy" content="{policy}">
+      <script type="module" src="{script}"></script>
       <pd4-player {attributes} style="width: 320px; height: 240px"></pd4-player>"""
     (server.root / "element.html").write_text(html)
     page.add_init_script(
@@ -738,8 +742,217 @@ def test_every_control_has_a_name_and_is_reached_by_key(page, server):
     assert page.evaluate("navigator.xr.isSessionSupported('immersive-vr')") is False
     assert player.get_by_role("button", name="Show in the headset").count() == 0
     status = player.locator("[part=status]").inner_text()
-    assert status.startswith("level 2 of 2 · ")
-    assert status.endswith(" · no GPU: drawn by the CPU, with fewer pixels in motion")
+    assert re.fullmatch(r"level 2 of 2, \d+ kB( · [\d.]+ fps)? · (\S+ size: )?no GPU found", status)
+
+
+def test_a_slow_machine_shows_smaller_pictures_never_a_lower_level(page, server):
+    player = element(page, server, f'controls loop src="{server.url_of("small.pd4")}"')
+    wait_for_level(page, 2)
+    page.evaluate(
+        f"""() => {{
+          const {{ player }} = {ELEMENT};
+          const evaluated = player._gaussians;
+          player._gaussians = async (...args) => {{
+            await new Promise((resolve) => setTimeout(resolve, 450)); // more than a level may take, in older players
+            return evaluated.apply(player, args);
+          }};
+          player._pace._step = 3;
+          player.play();
+        }}"""
+    )
+    page.wait_for_function(f"{ELEMENT}.player.counts.evaluated > 5")
+    assert page.evaluate(f"{ELEMENT}.player.status.level") == 2
+    assert page.evaluate(f"{ELEMENT}.player.canvas.width") == 107  # a third of the element's
+    player.locator("[part=status]", has_text="third size: no GPU found").wait_for()
+
+
+VIEW = f"[...{ELEMENT}.camera.viewmat]"
+
+
+def test_keys_and_wheel_are_the_pages_unless_the_pointer_says_otherwise(page, server):
+    page.goto(server.url_of("player/index.html") + "?autoplay=0")  # which the player fills
+    wait_for_level(page, 2)
+    home = page.evaluate(VIEW)
+    page.keyboard.press("ArrowLeft")  # without a click
+    turned = page.evaluate(VIEW)
+    assert turned != home
+    page.mouse.move(200, 100)
+    page.mouse.wheel(0, -100)
+    page.wait_for_function(f"(before) => {VIEW}.some((v, i) => v !== before[i])", arg=turned)
+
+    player = element(page, server, f'controls src="{server.url_of("small.pd4")}"')
+    wait_for_level(page, 2)
+    page.evaluate("document.body.style.height = '2000px'")
+    page.mouse.move(460, 350)
+    page.keyboard.press("ArrowLeft")
+    assert page.evaluate(VIEW) == home
+    page.mouse.move(100, 100)
+    page.mouse.wheel(0, 20)
+    page.wait_for_function("scrollY > 0")
+    assert page.evaluate(VIEW) == home
+    page.keyboard.press("ArrowLeft")  # over the scene
+    assert page.evaluate(VIEW) != home
+    page.keyboard.press("Home")
+    page.mouse.down()
+    page.mouse.up()
+    at = page.evaluate("scrollY")
+    page.mouse.wheel(0, 20)
+    page.wait_for_function(f"(before) => {VIEW}.some((v, i) => v !== before[i])", arg=home)
+    assert page.evaluate("scrollY") == at
+    play = player.get_by_role("button", name="Play")
+    play.focus()
+    page.keyboard.press("ArrowLeft")
+    page.keyboard.press("Space")  # presses the button, once
+    assert player.get_by_role("button", name="Pause").count() == 1
+
+
+def test_the_view_of_a_place_stays_near_its_camera(page, server):
+    """One whose picture cuts through the anchors; a thing that lies within its picture is free."""
+    scene = lively_scene(150)
+    camera = scene.info.camera
+    for name, zoom in (("place", 3), ("thing", 0.4)):
+        K = camera.K * np.array([[zoom, 1, 1], [1, zoom, 1], [1, 1, 1]], np.float32)
+        seen = replace(scene, info=replace(scene.info, camera=replace(camera, K=K)))
+        (server.root / f"{name}.pd4").write_bytes(encode(seen, layers=2, effort=1))
+    element(page, server, f'controls src="{server.url_of("place.pd4")}"')
+    wait_for_level(page, 2)
+    turned = f"""(keys) => {{
+      const {{ _orbit: orbit }} = {ELEMENT};
+      const press = (key) => orbit.key(new KeyboardEvent("keydown", {{ key }}));
+      orbit.reset();
+      const home = {ELEMENT}.camera.viewmat;
+      for (const key of keys) for (let i = 0; i < 30; i++) press(key);
+      const {{ viewmat: v }} = {ELEMENT}.camera;
+      return {{ angle: Math.acos(v[8] * home[8] + v[9] * home[9] + v[10] * home[10]), back: v[11] - home[11] }};
+    }}"""
+    limited = page.evaluate(turned, ["ArrowLeft", "ArrowUp"])
+    assert 0.3 < limited["angle"] <= 0.5
+    assert 0 < page.evaluate(turned, ["-"])["back"] < 1
+    page.evaluate(f"{ELEMENT}.setAttribute('free', '')")
+    assert page.evaluate(turned, ["ArrowLeft"])["angle"] > 1
+    assert page.evaluate(turned, ["-"])["back"] > 3
+    page.evaluate(f"{ELEMENT}.removeAttribute('free'), {ELEMENT}.load('{server.url_of('thing.pd4')}')")
+    wait_for_level(page, 2)
+    assert page.evaluate(turned, ["ArrowLeft"])["angle"] > 1
+
+
+def test_fit_speed_and_label(page, server):
+    attributes = 'controls speed="4" fit="cover" label="Two balls"'
+    player = element(page, server, f'{attributes} src="{server.url_of("small.pd4")}"')
+    player.get_by_role("application", name="Two balls").wait_for()
+    wait_for_level(page, 2)
+    shown = f"""() => {{
+      const {{ player }} = {ELEMENT};
+      let seen;
+      const {{ draw }} = player._painter;
+      player._painter.draw = (splats, [view]) => (seen = view);
+      player._draw();
+      player._painter.draw = draw;
+      return [seen.K[0] / player.camera.K[0], seen.width, seen.height];
+    }}"""
+    page.evaluate(f"{ELEMENT}.style.height = '480px'")
+    page.wait_for_function(f"{ELEMENT}.player.canvas.height > {ELEMENT}.player.canvas.width")
+    scale, _, height = page.evaluate(shown)
+    assert scale == pytest.approx(height / HEIGHT)
+    page.evaluate(f"{ELEMENT}.removeAttribute('fit')")
+    scale, width, _ = page.evaluate(shown)
+    assert scale == pytest.approx(width / WIDTH)
+    page.evaluate(f"(player => (player._playing = true, player._advance(0.1), player.pause()))({ELEMENT}.player)")
+    assert page.evaluate(f"{ELEMENT}.time") == pytest.approx(1.4)
+
+
+def test_text_of_controls_is_legible_on_a_white_scene(page, server):
+    scene = lively_scene(20)
+    white = replace(scene, info=replace(scene.info, background=(1.0, 1.0, 1.0)))
+    (server.root / "white.pd4").write_bytes(encode(white, layers=2, effort=1))
+    player = element(page, server, f'controls src="{server.url_of("white.pd4")}"')
+    wait_for_level(page, 2)
+    player.locator("[part=status]", has_text="level 2").wait_for()
+    picture = screenshot(page) / 255
+    for part in ("[part=status]", "select"):
+        box = player.locator(part).bounding_box()
+        x, y, w, h = (round(box[key]) for key in ("x", "y", "width", "height"))
+        linear = np.where(picture <= 0.04045, picture / 12.92, ((picture + 0.055) / 1.055) ** 2.4)
+        light = (linear @ [0.2126, 0.7152, 0.0722])[y + 3 : y + h - 3, x + 3 : x + w - 3]
+        assert (light.max() + 0.05) / (np.median(light) + 0.05) >= 4.5, part
+
+
+def test_the_metadata_name_the_page(page, server, small):
+    (server.root / "named.html").write_text(packed_page(with_metadata(small, Metadata(title="Two <b>balls"))[0]))
+    page.goto(server.url_of("named.html"))
+    page.get_by_role("application", name="Two <b>balls").wait_for()
+    assert page.title() == "Two <b>balls"
+
+
+# -- in other people's pages -------------------------------------------------------------------------------------------
+
+
+def test_a_page_of_many_players_shows_those_in_view(page, server):
+    """More than the browser has contexts for."""
+    shutil.copy(ROOT / "spec" / "vectors" / "valid" / "layers-0-1-2.pd4", server.root / "tiny.pd4")
+    one = f'<pd4-player src="{server.url_of("tiny.pd4")}" style="width: 80px; margin-bottom: 400px"></pd4-player>'
+    script = f'<script type="module" src="{server.url_of("player/element.js")}"></script>'
+    (server.root / "many.html").write_text(f"<!doctype html><title>t</title>{script}{18 * one}")
+    page.goto(server.url_of("many.html"))
+    drawn = "(i) => !!document.querySelectorAll('pd4-player')[i].player?._isSettled()"
+    for number in (0, 9, 17, 0):  # whose context has been given up meanwhile
+        page.evaluate("(i) => document.querySelectorAll('pd4-player')[i].scrollIntoView()", number)
+        page.wait_for_function(drawn, arg=number)
+    equipped = "[...document.querySelectorAll('pd4-player')].filter(({ player }) => player._gpu).length"
+    assert page.evaluate(equipped) <= 8
+
+
+def test_a_context_that_the_browser_took_for_good_is_told(page, server):
+    player = element(page, server, f'src="{server.url_of("small.pd4")}"')
+    wait_for_level(page, 2)
+    page.evaluate(f"{ELEMENT}.player.canvas.getContext('webgl2').getExtension('WEBGL_lose_context').loseContext()")
+    assert "no more scenes at once" in player.get_by_role("alert").inner_text(timeout=TIMEOUT_MS)
+
+
+LAYOUTS = {
+    "row": '<div style="display: flex">{}</div>',
+    "beside text": '<div style="display: flex"><p style="flex: none; width: 100px">text</p>{}</div>',
+    "centred column": '<div style="display: flex; flex-direction: column; align-items: center">{}</div>',
+    "grid": '<div style="display: grid; justify-items: center">{}</div>',
+    "float": '<div style="float: left">{}</div>',
+    "low column": '<div style="display: flex; flex-direction: column; height: 200px">{}<p>text</p></div>',
+}
+
+
+def test_the_element_has_a_size_in_every_layout(page, server):
+    element(page, server, "")
+    body = "".join(layout.format("<pd4-player></pd4-player>") for layout in LAYOUTS.values())
+    page.evaluate("(html) => (document.body.innerHTML = html)", body)
+    sizes = page.evaluate("[...document.querySelectorAll('pd4-player')].map((e) => [e.clientWidth, e.clientHeight])")
+    for name, (width, height) in zip(LAYOUTS, sizes, strict=True):
+        assert 140 <= width <= 480 and 100 <= height <= 360, (name, width, height)
+
+
+#: Policies of a page that has the player's files, and what the player says.
+POLICIES = {
+    "default-src 'none'; script-src 'self'; connect-src 'self'": "level 2 of 2",
+    "worker-src 'none'": "(Content-Security-Policy: worker-src)",
+}
+
+
+@pytest.mark.parametrize("policy, words", POLICIES.items(), ids=["strict", "no workers"])
+def test_a_page_with_a_policy_plays_or_says_why_not(page, server, policy, words):
+    player = element(page, server, f'controls src="{server.url_of("small.pd4")}"', policy=policy)
+    player.get_by_text(words).wait_for()
+
+
+def test_a_sandboxed_frame_is_not_blank(page, server):
+    """Its origin is none, so that no worker may come from the server."""
+    element(page, server, f'controls src="{server.url_of("small.pd4")}"')
+    frame = '<iframe sandbox="allow-scripts" src="element.html" width="400" height="300"></iframe>'
+    page.evaluate("(html) => (document.body.innerHTML = html)", frame)
+    page.frame_locator("iframe").get_by_role("alert").wait_for()
+
+
+def test_a_page_without_workers_says_so(page, server):
+    page.add_init_script("window.Worker = class { constructor() { throw new DOMException('no', 'SecurityError') } }")
+    player = element(page, server, f'src="{server.url_of("small.pd4")}"')
+    player.get_by_text("this page may start no worker: no").wait_for()
 
 
 def eye_camera(scene: Scene, pose: dict[str, Any], eye: Sequence[float]) -> Camera:
