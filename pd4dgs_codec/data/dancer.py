@@ -13,8 +13,8 @@ from pd4dgs_codec.data.bodies import Body, Paint, Pose, rotation
 
 DANCER = "dancer"  #: the scene's name
 GROUND = -0.92  #: its height
-SKINS = ((0.93, 0.74, 0.62), (0.80, 0.58, 0.44), (0.55, 0.37, 0.27))
-HAIRS = ((0.28, 0.16, 0.10), (0.72, 0.34, 0.12), (0.16, 0.15, 0.20))
+SKINS = ((0.97, 0.80, 0.70), (0.90, 0.69, 0.55), (0.70, 0.50, 0.39))
+HAIRS = ((0.50, 0.32, 0.22), (0.88, 0.52, 0.24), (0.36, 0.35, 0.44))
 
 
 def _rgb(hue: float, light: float, depth: float) -> np.ndarray:
@@ -121,8 +121,8 @@ class Dancer:
         """All bodies, the ground first."""
         rng, hue, tall, broad = self.rng, self.hue, self.tall, self.broad
         skin, hair = np.array(SKINS[rng.integers(3)]), np.array(HAIRS[rng.integers(3)])
-        cream, dark = np.array([0.97, 0.95, 0.90]), np.array([0.10, 0.10, 0.14])
-        shirt, trousers, shoe = _rgb(hue, 0.58, 0.30), _rgb(hue + 0.55, 0.48, 0.18), _rgb(hue + 0.17, 0.58, 0.36)
+        cream, dark = np.array([0.97, 0.95, 0.90]), np.array([0.26, 0.26, 0.32])
+        shirt, trousers, shoe = _rgb(hue, 0.70, 0.24), _rgb(hue + 0.55, 0.62, 0.20), _rgb(hue + 0.17, 0.66, 0.28)
         pale = 0.4 * shirt + 0.6 * cream
         parts: list[Part] = []
 
@@ -134,13 +134,13 @@ class Dancer:
             parts.append(Part(on, shape, size, at, self.cloth(low, high, size, *(waves or ((0.0, 0.0, 0.0),)))))
 
         stripes, checks = ((0.0, 0.0, 36.0),), ((24.0, 0.0, 24.0), (24.0, 0.0, -24.0))
-        add("pelvis", "sphere", (0.21 * broad, 0.15, 0.17), (0, 0, -0.02), trousers, 1.3 * trousers, *checks)
+        add("pelvis", "sphere", (0.21 * broad, 0.15, 0.17), (0, 0, -0.02), trousers, 1.2 * trousers, *checks)
         add("chest", "sphere", (0.23 * broad, 0.155, 0.34 * tall), (0, 0, -0.12 * tall), shirt, pale, *stripes)
         add("chest", "sphere", (0.27 * broad, 0.13, 0.11), (0, 0, 0.14 * tall), shirt, pale, *stripes)
         add("chest", "cylinder", (0.055, 0.055, 0.08), (0, 0, 0.27 * tall), skin)
         add("head", "sphere", (0.155, 0.17, 0.19), (0, 0, 0), skin)
-        add("head", "sphere", (0.168, 0.165, 0.165), (0, 0.035, 0.055), hair, 1.6 * hair, (40.0, 0.0, 12.0))
-        add("head", "sphere", (0.075, 0.075, 0.075), (0, 0.15, 0.17), hair, 1.6 * hair, (40.0, 0.0, 12.0))
+        add("head", "sphere", (0.168, 0.165, 0.165), (0, 0.035, 0.055), hair, 1.35 * hair, (40.0, 0.0, 12.0))
+        add("head", "sphere", (0.075, 0.075, 0.075), (0, 0.15, 0.17), hair, 1.35 * hair, (40.0, 0.0, 12.0))
         add("head", "sphere", (0.028, 0.045, 0.03), (0, -0.165, -0.035), 0.9 * skin)
         add("head", "sphere", (0.055, 0.03, 0.018), (0, -0.142, -0.095), np.array([0.75, 0.16, 0.18]))
         for x in (-0.06, 0.06):
@@ -153,10 +153,10 @@ class Dancer:
             add(f"{side} hand", "sphere", (0.065, 0.05, 0.07), (0, 0, 0), skin)
             for k, wide in enumerate((0.125, 0.088)):
                 woven = (24.0, 0.0, 4.5), (24.0, 0.0, -4.5)
-                add(f"{side} leg {k}", "sphere", (wide, wide, 1.2), (0, 0, 0), trousers, 1.3 * trousers, *woven)
+                add(f"{side} leg {k}", "sphere", (wide, wide, 1.2), (0, 0, 0), trousers, 1.2 * trousers, *woven)
             add(f"{side} knee", "sphere", (0.088, 0.088, 0.088), (0, 0, 0), trousers)
             add(f"{side} foot", "sphere", (0.075, 0.15, 0.07), (0, -0.07, -0.01), shoe, cream, (0.0, 30.0, 0.0))
-        glow = _rgb(hue + 0.4, 0.62, 0.38)
+        glow = _rgb(hue + 0.4, 0.66, 0.30)
         add("lantern", "cylinder", (0.009, 0.009, 0.13), (0, 0, -0.13), dark)
         add(
             "lantern", "cylinder", (0.10, 0.10, 0.12), (0, 0, -0.38), glow, cream, (30.0, 0.0, 26.0), (30.0, 0.0, -26.0)
