@@ -45,7 +45,7 @@ const STYLE = `
 canvas, img { position: absolute; inset: 0; width: 100%; height: 100%; }
 canvas:focus-visible { outline: 2px solid #6bf; outline-offset: -2px; }
 img { object-fit: contain; pointer-events: none; }
-slot { position: absolute; inset: 0; overflow: hidden; background: inherit; pointer-events: none;
+slot { display: block; position: absolute; inset: 0; overflow: hidden; background: inherit; pointer-events: none;
   transition: opacity .3s, visibility .3s; }
 slot.past { opacity: 0; visibility: hidden; }
 :host([fit="cover"]) img { object-fit: cover; }
@@ -297,10 +297,7 @@ export class Pd4Player extends HTMLElement {
   /** @param {string} name @param {any} detail */
   _react(name, detail) {
     if (name === "error") this._say(detail.message);
-    if (name === "firstpicture") {
-      this._poster.hidden = true;
-      this._slot.classList.add("past");
-    }
+    if (name === "firstpicture") this._showPoster();
     if (name === "statechange" || name === "timeupdate") this._showState();
     if (name !== "timeupdate") this._showStatus();
   }
@@ -313,8 +310,10 @@ export class Pd4Player extends HTMLElement {
 
   _showPoster() {
     const poster = this.getAttribute("poster");
-    if (poster !== null) this._poster.src = poster;
-    this._poster.hidden = poster === null || this._player?.status.level !== null;
+    const drawn = this._player?.status.level !== null;
+    if (poster !== null && !drawn) this._poster.src = poster;
+    this._poster.hidden = poster === null || drawn;
+    this._slot.classList.toggle("past", drawn);
   }
 
   _showControls() {

@@ -867,7 +867,8 @@ def test_text_of_controls_is_legible_on_a_white_scene(page, server):
     (server.root / "white.pd4").write_bytes(encode(white, layers=2, effort=1))
     player = element(page, server, f'controls src="{server.url_of("white.pd4")}"')
     wait_for_level(page, 2)
-    player.locator("[part=status]", has_text="level 2").wait_for()
+    page.evaluate(f"{ELEMENT}.player.settled()")
+    player.locator("[part=status]", has_text=re.compile(r"^level 2 of 2, \d+ kB( · no GPU found)?$")).wait_for()  # to stay
     picture = screenshot(page) / 255
     for part in ("[part=status]", "select"):
         box = player.locator(part).bounding_box()
@@ -875,6 +876,24 @@ def test_text_of_controls_is_legible_on_a_white_scene(page, server):
         linear = np.where(picture <= 0.04045, picture / 12.92, ((picture + 0.055) / 1.055) ** 2.4)
         light = (linear @ [0.2126, 0.7152, 0.0722])[y + 3 : y + h - 3, x + 3 : x + w - 3]
         assert (light.max() + 0.05) / (np.median(light) + 0.05) >= 4.5, part
+
+
+def test_what_the_element_contains_covers_it_until_the_first_picture(page, server):
+    element(page, server, "")
+    page.evaluate(f"{ELEMENT}.innerHTML = '<p style=\"height: 100px; margin: 0; background: #f00\">text</p>'")
+    page.evaluate(f"{ELEMENT}.style.background = '#00f', {ELEMENT}.player._startGpu()")  # whose canvas is opaque
+    colours = screenshot(page)[[50, 200], 200]
+    assert colours.tolist() == [[255, 0, 0], [0, 0, 255]]
+    page.evaluate(f"{ELEMENT}.load('{server.url_of('small.pd4')}')")
+    wait_for_level(page, 2)
+    assert abs(screenshot(page)[[50, 200], 200] - colours.astype(int)).max(axis=1).min() > 60
+    page.evaluate(f"document.body.append({ELEMENT})")  # where it begins anew
+    assert screenshot(page)[50, 200].tolist() == [255, 0, 0]
+
+
+def test_a_page_that_is_opened_as_a_file_says_why_it_is_empty(page):
+    page.goto((PLAYER / "index.html").as_uri())
+    assert page.locator("#note").bounding_box()["y"] < 50
 
 
 def test_the_metadata_name_the_page(page, server, small):
