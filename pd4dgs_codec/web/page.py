@@ -157,9 +157,11 @@ def _held(name: str, data: bytes) -> str:
 
 
 def _img(still: Still) -> str:
-    """The picture as large as the player draws the scene, all of its camera's picture in the window."""
-    fitted = f"width:calc({still.reach}*min(100cqw,100cqh*{still.aspect:.4f}))"
-    style = f"<style>pd4-player{{background:{still.background}}}pd4-player>img{{{fitted}}}</style>"
+    """The picture as large as the player draws the scene, for both values of `fit`."""
+    style = f"<style>pd4-player{{background:{still.background}}}"
+    for fit, side in (("", "min"), ("[fit=cover]", "max")):
+        style += f"pd4-player{fit}>img{{width:calc({still.reach}*{side}(100cqw,100cqh*{still.aspect:.4f}))}}"
+    style += "</style>"
     return f'{style}<img alt="" src="data:image/webp;base64,{base64.b64encode(still.data).decode()}">'
 
 

@@ -53,6 +53,15 @@ export function lookAlong(eye, forward, down, { K, width, height }) {
   return { viewmat: new Float32Array([...rows, 0, 0, 0, 1]), K, width, height };
 }
 
+/** Where a camera shows a point, in pixels, and its depth. @param {Camera} camera @param {ArrayLike<number>} points
+ * @param {number} i of the point's x @returns {Vector} */
+export function project({ viewmat: v, K }, points, i) {
+  const [x, y, z] = [0, 4, 8].map(
+    (r) => v[r] * points[i] + v[r + 1] * points[i + 1] + v[r + 2] * points[i + 2] + v[r + 3],
+  );
+  return [(K[0] * x) / z + K[2], (K[4] * y) / z + K[5], z];
+}
+
 /** Strips along the left, right and upper side of a picture, as shares of it, and how densely anchors lie there at least
  * where a scene goes on beyond it, relative to all of the picture. */
 const STRIP = 0.1;
@@ -62,19 +71,16 @@ const DENSITY = 0.25;
  * Whether a scene goes on beyond its camera's picture, as a place does; a thing ends within it, and was seen from all
  * around more likely. The ground below says nothing.
  *
- * @param {Scene} scene @returns {boolean}
+ * @param {Scene} scene @param {Camera} camera @returns {boolean}
  */
-export function goesOn({ anchor, mask, info: { camera, near } }) {
-  if (!camera) return false;
-  const { viewmat: v, K, width, height } = camera;
+export function goesOn({ anchor, mask, info: { near } }, camera) {
   const codes = mask[mask.length - 1];
   const strips = [0, 0, 0];
   let inside = 0;
   for (let i = 0; i < codes.length; i++) {
     if (!codes[i]) continue;
-    const [x, y, z] = [0, 4, 8].map((r) => dot(anchor.subarray(3 * i, 3 * i + 3), v.subarray(r, r + 3)) + v[r + 3]);
-    const px = (K[0] * x / z + K[2]) / width;
-    const py = (K[4] * y / z + K[5]) / height;
+    const [x, y, z] = project(camera, anchor, 3 * i);
+    const [px, py] = [x / camera.width, y / camera.height];
     if (!(z > near && px >= 0 && px <= 1 && py >= 0 && py <= 1)) continue;
     inside++;
     [px, 1 - px, py].forEach((share, k) => (strips[k] += Number(share < STRIP)));

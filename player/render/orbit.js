@@ -1,7 +1,7 @@
 // Moving the camera: about a point of the scene, along the picture, towards it.
 
-import { centreOf, cross, defaultCamera, downOf, dot, forwardOf, goesOn, lookAlong, magnification } from "./camera.js";
-import { middleOf, plus, turn, unit } from "./camera.js";
+import { centreOf, cross, downOf, dot, forwardOf, goesOn, lookAlong, magnification } from "./camera.js";
+import { middleOf, plus, project, turn, unit } from "./camera.js";
 /** @import { Camera, Scene } from "../decode/scene.js" */
 /** @import { Vector } from "./camera.js" */
 /** @import { Player } from "./player.js" */
@@ -223,8 +223,8 @@ export class Orbit {
 
   /** @param {Scene} scene @returns {Limits | null} */
   _findLimits(scene) {
-    if (!goesOn(scene)) return null;
-    const home = defaultCamera(scene.info);
+    const home = scene.info.camera;
+    if (!home || !goesOn(scene, home)) return null;
     const eye = centreOf(home);
     const forward = forwardOf(home);
     return { eye, forward, distance: dot(plus(this._findPivot(home), eye, -1), forward) };
@@ -235,18 +235,14 @@ export class Orbit {
   _findPivot(camera) {
     const { scene } = this._player;
     if (!scene || !camera) return /** @type {Vector} */ ([0, 0, 0]);
-    const { viewmat: v, K, width, height } = camera;
+    const { width, height } = camera;
     const { anchor, info } = scene;
     const depths = [];
     const step = 3 * Math.max(1, Math.floor(anchor.length / 3 / SAMPLES));
     for (let i = 0; i < anchor.length; i += step) {
-      const [x, y, z] = [0, 4, 8].map(
-        (r) => v[r] * anchor[i] + v[r + 1] * anchor[i + 1] + v[r + 2] * anchor[i + 2] + v[r + 3],
-      );
-      if (!(z > info.near)) continue;
-      const px = (K[0] * x) / z + K[2] - width / 2;
-      const py = (K[4] * y) / z + K[5] - height / 2;
-      if (Math.abs(px) < width / 4 && Math.abs(py) < height / 4) depths.push(z);
+      const [x, y, z] = project(camera, anchor, i);
+      const inMiddle = Math.abs(x - width / 2) < width / 4 && Math.abs(y - height / 2) < height / 4;
+      if (z > info.near && inMiddle) depths.push(z);
     }
     depths.sort((a, b) => a - b);
     const depth = depths.length

@@ -18,6 +18,7 @@ import threading
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -49,6 +50,7 @@ from pd4dgs_codec.format.info import info
 from pd4dgs_codec.format.metadata import Metadata
 from pd4dgs_codec.interchange.splats import Splats, ply_bytes
 from pd4dgs_codec.scene import Camera, Deformation, Scene, SceneInfo, Steps, Widths
+from pd4dgs_codec.web.page import Still
 from pd4dgs_codec.web.page import page as packed_page
 from pd4dgs_codec.web.server import Link, Server
 
@@ -868,7 +870,8 @@ def test_text_of_controls_is_legible_on_a_white_scene(page, server):
     player = element(page, server, f'controls src="{server.url_of("white.pd4")}"')
     wait_for_level(page, 2)
     page.evaluate(f"{ELEMENT}.player.settled()")
-    player.locator("[part=status]", has_text=re.compile(r"^level 2 of 2, \d+ kB( · no GPU found)?$")).wait_for()  # to stay
+    at_rest = re.compile(r"^level 2 of 2, \d+ kB( · no GPU found)?$")  # else the line still changes its width
+    player.locator("[part=status]", has_text=at_rest).wait_for()
     picture = screenshot(page) / 255
     for part in ("[part=status]", "select"):
         box = player.locator(part).bounding_box()
@@ -1134,6 +1137,18 @@ def test_a_page_shows_its_scene_before_any_script(browser, lively, tmp_path):
     moved = np.pad(smaller / 255, ((0, 0), (0, window[0] - smaller.shape[1]), (0, 0)), mode="edge")
     there, elsewhere = decibels(shown[True], shown[False]), decibels(shown[True], moved)
     assert there > 20 and there > elsewhere + 3, (there, elsewhere)
+
+
+def test_the_picture_of_a_page_is_as_large_as_its_scene(page, server):
+    """The window is 480 x 360, the camera's picture two units wide and one high."""
+    file = BytesIO()
+    Image.new("RGB", (200, 100)).save(file, "webp")
+    still = Still(file.getvalue(), 1.5, 2.0, "rgb(0,0,0)")
+    (server.root / "begun.html").write_text(packed_page("missing.pd4", still=still))
+    for fit, width in (("contain", 1.5 * 480), ("cover", 1.5 * 720)):
+        page.goto(server.url_of("begun.html") + f"?fit={fit}")
+        page.wait_for_selector("[role=alert]:visible")
+        assert page.locator("pd4-player > img").first.bounding_box()["width"] == pytest.approx(width, abs=1)
 
 
 @pytest.mark.parametrize("place", ["notebook", "file"])
