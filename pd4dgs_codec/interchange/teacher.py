@@ -85,12 +85,7 @@ class Options:
 
 
 def load_source(
-    source: str,
-    *,
-    downscale: int = 1,
-    holdout: int = 8,
-    background: Triple | None = None,
-    fps: float | None = None,
+    source: str, *, downscale: int = 1, holdout: int = 8, background: Triple | None = None, fps: float | None = None
 ) -> Dataset:
     """Loads a `teacher:` source, or any other as `data.dataset.load` does. Raises DataError."""
     if not source.startswith(PREFIX):
