@@ -99,12 +99,13 @@ def load_source(
     teacher = read_model(place, options.fps)
     if not options.cameras:
         return _around(source, Path(place), teacher, options, downscale, holdout)
-    data = load(options.cameras, downscale=downscale, holdout=holdout, background=options.background)
+    data = load(options.cameras, downscale=downscale, holdout=holdout, background=options.background, fps=fps)
     if data.place:
         raise DataError(f"{options.cameras}: the cameras are too far from 0 ({data.place}), expected a model near 0")
     poses = [(view.camera, view.time) for view in data.train]  # the held-out pictures stay
-    train = _pictures(teacher, poses, data.background, data.near)
-    return replace(data, name=source, train=tuple(train), points=_points(teacher, _solid(source, teacher, MIDDLE)))
+    train = tuple(_pictures(teacher, poses, data.background, data.near))
+    points, origin = _points(teacher, _solid(source, teacher, MIDDLE)), replace(data.origin, points="the teacher")
+    return replace(data, name=source, train=train, points=points, flat_points=0, origin=origin)
 
 
 def _around(source: str, place: Path, teacher: Teacher, options: Options, downscale: int, holdout: int) -> Dataset:

@@ -181,6 +181,18 @@ def test_cameras_of_a_dataset_keep_its_held_out_pictures(tmp_path):
     for mine, theirs in zip(data.train, truth.train, strict=True):
         np.testing.assert_array_equal(mine.viewmat, theirs.viewmat)
         assert mine.image.tobytes() != theirs.image.tobytes()
+    assert data.origin.points == "the teacher"
+
+
+def test_frame_rates_and_cameras_of_another_source(tmp_path):
+    folder, like = _sequence(tmp_path / "seq"), write_views(tmp_path / "set")
+    file = like / "transforms.json"
+    about = json.loads(file.read_text())
+    for frame in about["frames"]:
+        frame.pop("time", None)
+    file.write_text(json.dumps(about))
+    assert load_source(f"teacher:{folder}?cameras={like}", fps=5).time_range == load(like, fps=5).time_range
+    assert load(like, fps=5).time_range != load(like).time_range
 
 
 def test_cameras_json_beside_the_frames_is_used(tmp_path):
