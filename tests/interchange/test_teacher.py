@@ -18,7 +18,6 @@ from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.splats import (
     Splats,
-    camera_eye,
     fourdgs_bytes,
     picture,
     ply_bytes,
@@ -202,7 +201,7 @@ def test_cameras_json_beside_the_frames_is_used(tmp_path):
     (folder / "cameras.json").write_text(json.dumps(rows))
     data = load_source(f"teacher:{folder}?size=40x30", holdout=0)
     assert len(data.train) == 3 and data.up == (0.0, -1.0, 0.0) and data.train[0].width == 40
-    np.testing.assert_allclose([camera_eye(v.camera) for v in data.train], [r["position"] for r in rows], atol=1e-6)
+    np.testing.assert_allclose([v.camera.eye for v in data.train], [r["position"] for r in rows], atol=1e-6)
 
 
 def test_an_instant_without_gaussians_is_one_line(tmp_path):
