@@ -262,12 +262,10 @@ def _done_once(job: Job, command: Command) -> Outcome:
     record = root.record(line.output, job.overwrite)
     inputs = {"": line.source} | {name: line.options[name] for name in OPS[job.verb].inputs if name in line.options}
     options = {name: value for name, value in line.options.items() if name not in inputs}
-    stamps = {
-        name: place
-        if place.startswith(SYNTHETIC)
-        else store.stamp(place, dataset=bool(name) or not OPS[job.verb].finds)
-        for name, place in inputs.items()
-    }
+    stamps = dict(inputs)
+    for name, place in inputs.items():
+        if not place.startswith(SYNTHETIC):
+            stamps[name] = store.stamp(place, dataset=bool(name) or not OPS[job.verb].finds)
     made_of = {"op": job.verb, "options": options, "inputs": stamps, "version": __version__}
     same = record is not None and made_of.items() <= record.items()
     if record and same and root.holds(line.output, record):

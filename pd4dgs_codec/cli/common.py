@@ -267,10 +267,14 @@ def write_checkpoint(path: str, scene: Scene, overwrite: bool) -> None:
 
 
 def read_dataset(source: str, args: argparse.Namespace, info: SceneInfo) -> Dataset:
-    """Reads the dataset `source` with the options of `add_reading`, over the background of the scene to compare."""
+    """Reads the dataset `source` with the options of `add_reading`, over the background of the scene to compare; says
+    what was assumed or left out."""
     from pd4dgs_codec.interchange.teacher import load_source
 
-    return load_source(source, downscale=args.downscale, holdout=args.holdout, background=info.background)
+    dataset = load_source(source, downscale=args.downscale, holdout=args.holdout, background=info.background)
+    for remark in dataset.origin.notes:
+        say(f"note: {remark}")
+    return dataset
 
 
 def check_output(path: str, overwrite: bool) -> None:

@@ -197,7 +197,7 @@ def stored_frames(path: Path, how: str, treat: Callable[[np.ndarray], np.ndarray
     how: identifies `treat` in the cache. Raises DataError for a video that cannot be decoded or holds no frame, and if
     the cache has no room.
     """
-    folder = Path(os.environ.get(FOLDER) or Path.home() / ".cache" / "pd4dgs-frames")
+    folder = Path(os.environ.get(FOLDER) or Path.home() / ".cache" / "pd4dgs-frames").absolute()
     try:
         check_regular(path)
         stat = path.stat()

@@ -542,15 +542,9 @@ def geometry(
     box = (box - shift).astype(np.float32)
     points = None if points is None else (points - shift).astype(np.float32)
     near, far = depth or depth_range([f.viewmat for f in frames], box, points)
-    fields = {
-        "points": points,
-        "box": box,
-        "near": near,
-        "far": far,
-        "up": up_direction([f.viewmat for f in frames]),
-        "masked": False,
-    }
-    return frames, fields | {"shift": tuple(shift.tolist()), "flat_points": flat}
+    fields = {"points": points, "box": box, "near": near, "far": far, "masked": False, "flat_points": flat}
+    up = up_direction([f.viewmat for f in frames])
+    return frames, fields | {"up": up, "shift": tuple(shift.tolist())}
 
 
 def spans_volume(points: np.ndarray) -> bool:
@@ -639,10 +633,9 @@ def cameras_box(frames: Sequence[UnreadView], depth: tuple[float, float] | None 
     if np.linalg.eigvalsh(total)[0] > 1e-3 * len(frames):
         middle = np.linalg.solve(total, (normal @ origins[:, :, None]).sum(axis=0)[:, 0])
     else:
-        apart = float(
-            np.ptp(origins, axis=0).max()
-        )  # 0 up to rounding if there is one viewpoint: any distance is right
-        ahead = sum(depth) / 2 if depth else 4.0 * apart if apart > 1e-9 * float(np.abs(origins).max()) else 1.0
+        apart = float(np.ptp(origins, axis=0).max())
+        several = apart > 1e-9 * float(np.abs(origins).max())  # from one viewpoint, any distance is right
+        ahead = sum(depth) / 2 if depth else 4.0 * apart if several else 1.0
         middle = origins.mean(axis=0) + ahead * axes.mean(axis=0)
     distance = float(np.median(np.linalg.norm(origins - middle, axis=1)))
     half = (depth[1] - depth[0]) / 2 if depth else BOX_OVER_DISTANCE * distance

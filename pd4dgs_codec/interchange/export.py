@@ -21,7 +21,6 @@ from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.draw.rasteriser import Geometry, backward, composite, project
 from pd4dgs_codec.interchange.splats import (
     Splats,
-    camera_eye,
     harmonics,
     looking,
     picture,
@@ -74,7 +73,7 @@ class Eyes:
     @property
     def places(self) -> np.ndarray:
         """float32 [E, 3], world."""
-        return np.stack([camera_eye(camera) for camera in self.cameras]).astype(np.float32)
+        return np.stack([camera.eye for camera in self.cameras])
 
 
 def eyes_of_cameras(cameras: Sequence[Camera]) -> Eyes:
@@ -100,7 +99,7 @@ def eyes_of_scene(player: Player, count: int = EYES) -> Eyes:
         K = np.array([[PIXELS, 0, PIXELS / 2], [0, PIXELS, PIXELS / 2], [0, 0, 1]], np.float32)
         like, weights = Camera(np.eye(4, dtype=np.float32), K, PIXELS, PIXELS), np.ones(count)
     else:
-        away = camera_eye(camera) - middle
+        away = camera.eye - middle
         distance = max(float(np.linalg.norm(away)), LEAST_NEAR)
         like, weights = camera, np.exp(CONCENTRATION * (places @ (away / distance) - 1))
     up = np.asarray(info.up, np.float64)
@@ -243,7 +242,7 @@ def _gradients(
 ) -> dict[str, np.ndarray]:
     """Returns the gradients of one picture's mean squared error by the names of `values`."""
     splats = _splats(values, size)
-    basis = harmonics(unit(splats.means - camera_eye(camera).astype(np.float32)), splats.degree)
+    basis = harmonics(unit(splats.means - camera.eye), splats.degree)
     raw = np.einsum("nj,njc->nc", basis, splats.sh) + np.float32(0.5)
     colors = np.maximum(raw, 0)
     geometry = Geometry(splats.means, splats.quats, splats.scales, splats.opacities)

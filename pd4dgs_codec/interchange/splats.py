@@ -105,17 +105,9 @@ class Splats:
 
 def picture(splats: Splats, camera: Camera, background: tuple[float, float, float], near: float = 0.01) -> np.ndarray:
     """Draws the Gaussians by our rasteriser, float32 [H, W, 3] in 0..1. near: scene units."""
-    colors = splats.colors(camera_eye(camera))
-    image, _ = draw(
-        splats.means, splats.quats, splats.scales, splats.opacities, colors, camera, background, near_plane=near
-    )
+    shapes, colors = (splats.means, splats.quats, splats.scales, splats.opacities), splats.colors(camera.eye)
+    image, _ = draw(*shapes, colors, camera, background, near_plane=near)
     return np.asarray(np.clip(image, 0, 1))
-
-
-def camera_eye(camera: Camera) -> np.ndarray:
-    """Returns the centre of a camera, float64 [3], world."""
-    viewmat = camera.viewmat.astype(np.float64)
-    return np.asarray(-viewmat[:3, :3].T @ viewmat[:3, 3])
 
 
 def looking(eye: np.ndarray, ahead: np.ndarray, up: np.ndarray, like: Camera) -> Camera:

@@ -85,12 +85,7 @@ class Options:
 
 
 def load_source(
-    source: str,
-    *,
-    downscale: int = 1,
-    holdout: int = 8,
-    background: Triple | None = None,
-    fps: float | None = None,
+    source: str, *, downscale: int = 1, holdout: int = 8, background: Triple | None = None, fps: float | None = None
 ) -> Dataset:
     """Loads a `teacher:` source, or any other as `data.dataset.load` does. Raises DataError."""
     if not source.startswith(PREFIX):
@@ -104,12 +99,13 @@ def load_source(
     teacher = read_model(place, options.fps)
     if not options.cameras:
         return _around(source, Path(place), teacher, options, downscale, holdout)
-    data = load(options.cameras, downscale=downscale, holdout=holdout, background=options.background)
+    data = load(options.cameras, downscale=downscale, holdout=holdout, background=options.background, fps=fps)
     if data.place:
         raise DataError(f"{options.cameras}: the cameras are too far from 0 ({data.place}), expected a model near 0")
     poses = [(view.camera, view.time) for view in data.train]  # the held-out pictures stay
-    train = _pictures(teacher, poses, data.background, data.near)
-    return replace(data, name=source, train=tuple(train), points=_points(teacher, _solid(source, teacher, MIDDLE)))
+    train = tuple(_pictures(teacher, poses, data.background, data.near))
+    points, origin = _points(teacher, _solid(source, teacher, MIDDLE)), replace(data.origin, points="the teacher")
+    return replace(data, name=source, train=train, points=points, flat_points=0, origin=origin)
 
 
 def _around(source: str, place: Path, teacher: Teacher, options: Options, downscale: int, holdout: int) -> Dataset:
@@ -187,8 +183,7 @@ def _cameras(place: Path, points: np.ndarray, options: Options, downscale: int) 
     radius = max(float(np.percentile(np.linalg.norm(points - middle, axis=1), 90)), 1e-6)
     axis = np.asarray(options.up) / max(float(np.linalg.norm(options.up)), 1e-12)
     places = sphere(2 * options.views)
-    places = places[places @ axis >= LOWEST]
-    places = places[np.linspace(0, len(places) - 1, options.views).round().astype(int)]
+    places = np.stack(spread(places[places @ axis >= LOWEST], options.views))
     width, height = options.size
     focal = 0.5 * max(width, height) / math.tan(FIELD_OF_VIEW / 2)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32)

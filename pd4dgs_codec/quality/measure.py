@@ -48,11 +48,7 @@ def own_views(scene: Scene, viewpoints: Sequence[Viewpoint]) -> list[View]:
 
 
 def level_psnr(
-    model: Model,
-    level: int,
-    views: Sequence[View],
-    step: Callable[[], None] = lambda: None,
-    rounding: Rounding = EXACT,
+    model: Model, level: int, views: Sequence[View], step: Callable[[], None] = lambda: None, rounding: Rounding = EXACT
 ) -> float:
     """Returns the mean mPSNR of a level over `views`, dB, of each at most MOST_DB. step is called after each."""
 

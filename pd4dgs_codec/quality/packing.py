@@ -133,11 +133,7 @@ class _Pictures:
         return () if self.views is None else self.views.held_out
 
     def fit(
-        self,
-        scene: Scene,
-        options: EncodeOptions,
-        target_sizes: Mapping[int | None, int],
-        metadata: Metadata | None,
+        self, scene: Scene, options: EncodeOptions, target_sizes: Mapping[int | None, int], metadata: Metadata | None
     ) -> Packed:
         """Returns the file whose layers meet the sizes."""
         from pd4dgs_codec.quality.measure import RenderedLoss, true_psnr
@@ -172,13 +168,7 @@ class _Pictures:
         return Packed(data, fitted, report, target, slices)
 
     def write(
-        self,
-        scene: Scene,
-        options: EncodeOptions,
-        left_out: list[LeftOut],
-        metadata: Metadata | None,
-        *,
-        passing: bool,
+        self, scene: Scene, options: EncodeOptions, left_out: list[LeftOut], metadata: Metadata | None, *, passing: bool
     ) -> tuple[bytes, Report, dict[str, Any] | None]:
         """Returns (file, report, slices of the report if it has slices). passing: whether anchors may then pass to
         later layers."""

@@ -149,18 +149,14 @@ class TrainConfig:
     holdout: int = option(8)
     #: of pictures whose times are numbers of frames; None: the dataset's, or 30
     fps: float | None = option(
-        None,
-        help="frames per second of numbered pictures without times (default: 30)",
-        metavar="F",
-        least=0.01,
-        most=1000,
+        None, help="frames per second of numbered pictures (default: 30)", metavar="F", least=0.01, most=1000
     )
     #: RGB of the scene's background and behind pictures with alpha; None: see `dataset.load`
     background: tuple[float, float, float] | None = option(None, least=0, most=1, count=3)
     #: None: the preset's default, or as many as `max_seconds` allows
     iterations: int | None = option(
         None,
-        help=f"training steps (default: {_STEPS}; with --max-seconds as many as fit)",
+        help=f"training steps (default: {_STEPS}; what --max-seconds allows)",
         metavar="N",
         least=1,
         most=MOST_STEPS,

@@ -310,13 +310,8 @@ class TrainState:
             if state["densifier"][name].shape != value.shape:
                 found, expected = tuple(state["densifier"][name].shape), tuple(value.shape)
                 raise ValueError(f"{name} has shape {found}, expected {expected}")
-        steps, fewest = MOST_STEPS, int(self.share is None)  # a timed run may not have estimated its total yet
-        for name, least, most in (
-            ("iteration", 0, steps),
-            ("skipped", 0, steps),
-            ("total", fewest, steps),
-            ("share", 0, 1),
-        ):
+        for name, most in (("iteration", MOST_STEPS), ("skipped", MOST_STEPS), ("total", MOST_STEPS), ("share", 1)):
+            least = int(name == "total" and self.share is None)  # a timed run may not have estimated its total yet
             if not least <= state[name] <= most:
                 raise ValueError(f"{name} is {state[name]!r}, expected a number from {least} to {most}")
         if not math.isfinite(state["rho"]):

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PIL import Image
-from tiny import TINY
+from tiny import TINY, write_views
 
 from pd4dgs_codec import decode, render
 from pd4dgs_codec.data.dataset import load
@@ -35,6 +35,12 @@ def test_eval_states_quality_and_bytes_per_level(cli, scene_pd4, shared_dataset)
     assert [row["anchors"] for row in report["levels"]] == [40, 50, 60]
     for row in report["levels"]:
         assert 0 < row["mpsnr"] < 60 and -1 <= row["mssim"] <= 1 and row["decode_seconds"] > 0
+
+
+def test_eval_says_which_pictures_are_missing(cli, scene_pd4, tmp_path):
+    (write_views(tmp_path / "set") / "000.png").unlink()
+    result = cli("eval", scene_pd4, tmp_path / "set", "--level", 0)
+    assert "note: views left out, as their picture is missing (1): 000.png" in result.error_lines
 
 
 def test_eval_averages_the_views_of_each_levels_own_prefix(scene_pd4, shared_dataset):

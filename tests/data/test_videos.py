@@ -61,6 +61,14 @@ def test_frames_are_decoded_once(folder, monkeypatch, cache):
         load(folder, downscale=2)
 
 
+def test_a_relative_cache_is_found_from_another_folder(stored, monkeypatch, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PD4DGS_CACHE", "cache")
+    frames = stored()
+    monkeypatch.chdir("/")
+    assert frames.read(0).shape == frames.shape
+
+
 def test_videos_of_other_lengths_are_refused(scene, folder, refused):
     write_video(folder / "videos" / "cam1.mp4", [view.image for view in rig_views(scene, 1)[:3]], FPS)
     refused(folder, "cam1.mp4: has 3 frames at 10 per second and cam0.mp4 4")

@@ -19,7 +19,6 @@ from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.splats import (
     SH_C0,
     Splats,
-    camera_eye,
     fourdgs_bytes,
     glb_bytes,
     harmonics,
@@ -63,8 +62,8 @@ def test_a_splat_shows_its_colour_to_the_eye_that_sees_it_along_z():
     one = np.ones(1, np.float32)
     splats = Splats(np.zeros((1, 3), np.float32), np.float32([[1, 0, 0, 0]]), np.full((1, 3), 0.5, np.float32), one, sh)
     camera = camera_ahead(3.0, width=31, height=23)
-    np.testing.assert_allclose(camera_eye(camera), (0, 0, -3))
-    np.testing.assert_allclose(splats.colors(camera_eye(camera)), [[0.9, 0.7, 0.1]], atol=1e-6)
+    np.testing.assert_allclose(camera.eye, (0, 0, -3))
+    np.testing.assert_allclose(splats.colors(camera.eye), [[0.9, 0.7, 0.1]], atol=1e-6)
     np.testing.assert_allclose(splats.colors(np.array([0, 0, 3.0])), [[0.9, 0.3, 0.1]], atol=1e-6)
     image = picture(splats, camera, (0.0, 0.0, 0.0))
     np.testing.assert_allclose(image[11, 15], (0.9, 0.7, 0.1), atol=2e-2)

@@ -18,7 +18,6 @@ from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.splats import (
     Splats,
-    camera_eye,
     fourdgs_bytes,
     picture,
     ply_bytes,
@@ -181,6 +180,18 @@ def test_cameras_of_a_dataset_keep_its_held_out_pictures(tmp_path):
     for mine, theirs in zip(data.train, truth.train, strict=True):
         np.testing.assert_array_equal(mine.viewmat, theirs.viewmat)
         assert mine.image.tobytes() != theirs.image.tobytes()
+    assert data.origin.points == "the teacher"
+
+
+def test_frame_rates_and_cameras_of_another_source(tmp_path):
+    folder, like = _sequence(tmp_path / "seq"), write_views(tmp_path / "set")
+    file = like / "transforms.json"
+    about = json.loads(file.read_text())
+    for frame in about["frames"]:
+        frame.pop("time", None)
+    file.write_text(json.dumps(about))
+    assert load_source(f"teacher:{folder}?cameras={like}", fps=5).time_range == load(like, fps=5).time_range
+    assert load(like, fps=5).time_range != load(like).time_range
 
 
 def test_cameras_json_beside_the_frames_is_used(tmp_path):
@@ -190,7 +201,7 @@ def test_cameras_json_beside_the_frames_is_used(tmp_path):
     (folder / "cameras.json").write_text(json.dumps(rows))
     data = load_source(f"teacher:{folder}?size=40x30", holdout=0)
     assert len(data.train) == 3 and data.up == (0.0, -1.0, 0.0) and data.train[0].width == 40
-    np.testing.assert_allclose([camera_eye(v.camera) for v in data.train], [r["position"] for r in rows], atol=1e-6)
+    np.testing.assert_allclose([v.camera.eye for v in data.train], [r["position"] for r in rows], atol=1e-6)
 
 
 def test_an_instant_without_gaussians_is_one_line(tmp_path):
