@@ -500,7 +500,7 @@ def _header(path: Path, raw: bytes) -> tuple[str, int, np.dtype, int, int]:
     names = [name for _, name in properties]
     if len(set(names)) != len(names) or not {"x", "y", "z"} <= set(names):
         found = one_line(", ".join(names), 120)
-        raise DataError(f"{path}: vertex properties are {found}, expected x, y, z once each")
+        raise DataError(f"{path}: vertex properties are {found or 'none'}, expected x, y, z once each")
     fields = [(name, ORDERS[kind] + SCALARS[scalar]) for scalar, name in properties]
     return kind, count, np.dtype(fields), end.end(), skipped
 
@@ -538,5 +538,6 @@ def read_only_ply(folder: Path) -> np.ndarray | None:
 def read_ply(path: Path) -> np.ndarray:
     """Points float64 [M, 3], without points that are not finite or beyond LARGEST."""
     vertices = read_vertices(path)
-    points = np.stack([vertices[c] for c in "xyz"], axis=1, dtype=np.float64)
+    with np.errstate(invalid="ignore"):  # of a signalling NaN
+        points = np.stack([vertices[c] for c in "xyz"], axis=1, dtype=np.float64)
     return np.asarray(points[(np.abs(points) <= LARGEST).all(axis=1)])  # without NaN, too

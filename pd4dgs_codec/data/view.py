@@ -56,8 +56,8 @@ RESIZED = 0.1
 NO_TERM = 1e-30  #: a distortion coefficient up to which it changes no pixel, and by which roots cannot be divided
 BAND_PIXELS = 1 << 18  #: resampled at once, some 100 bytes each
 USES = 4  #: of a picture at most, such as for training and for testing
-#: Views whose pixels count in a fingerprint, evenly spread, and the step between such pixels in lines and columns.
-SAMPLED, STEP = 16, 16
+#: Views whose pixels count in a fingerprint, evenly spread, and how many such pixels the shorter side has about.
+SAMPLED, PER_SIDE = 16, 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,7 +160,8 @@ class Dataset:
             digest.update(view.viewmat.tobytes() + view.K.tobytes())
             digest.update(repr((view.width, view.height, float(view.time))).encode())
         for view in self.train[:: -(-len(self.train) // SAMPLED)]:
-            digest.update(view.image[::STEP, ::STEP].tobytes())
+            step = max(1, min(view.width, view.height) // PER_SIDE)
+            digest.update(view.image[::step, ::step].tobytes())
         return digest.hexdigest()[:16]
 
     @property

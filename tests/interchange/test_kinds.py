@@ -94,6 +94,14 @@ def test_layouts_of_ply_files(tmp_path, data):
     np.testing.assert_array_equal(read_ply(path), SPLATS.means)
 
 
+def test_points_that_signal_are_left_out(tmp_path, recwarn):
+    """A NaN of the kind whose conversion raises a flag of the processor."""
+    path = tmp_path / "a.ply"
+    path.write_bytes(ply().replace(SPLATS.means[:1].tobytes(), np.array([0x7FA00000, 0, 0], "<u4").tobytes()))
+    np.testing.assert_array_equal(read_ply(path), SPLATS.means[1:])
+    assert not recwarn.list
+
+
 def test_infinite_logarithms_are_flat_and_solid(tmp_path):
     path = tmp_path / "a.ply"
     path.write_bytes(ply(infinite("scale_2", -np.inf)))
@@ -191,6 +199,7 @@ POINTS = {name: COLUMNS[name] for name in "xyz"}
     "data, message",
     [
         (ply(POINTS), "is a point cloud without f_dc_0, expected the properties of 3D Gaussian"),
+        (b"ply\nformat ascii 1.0\nelement vertex 0\nend_header\n", "vertex properties are none, expected x, y, z"),
         (ply(POINTS | {"red": POINTS["x"]}, types={"red": "uchar"}), "is a point cloud without f_dc_0, expected the"),
         (ply(without("scale_2")), "has no property scale_2, expected the properties"),
         (ply({name: column[:0] for name, column in COLUMNS.items()}), "none of 0 Gaussians is finite"),

@@ -12,9 +12,11 @@ import torch
 from strategies import LAYER_SETS, assert_same_info, flipped, make_scene
 from tiny import Trap
 
+from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.model import checkpoint
-from pd4dgs_codec.model.model import from_scene
+from pd4dgs_codec.model.model import from_scene, to_scene
+from pd4dgs_codec.morton import MAX_VOXEL
 
 
 def model(layers=(0, 1, 2), **options):
@@ -95,6 +97,19 @@ def test_no_camera_and_no_anchors(tmp_path):
     checkpoint.save(tmp_path / "m.pt", from_scene(scene))
     loaded, training = checkpoint.load(tmp_path / "m.pt")
     assert loaded.info.camera is None and len(loaded.anchor_q) == 0 and training == {}
+
+
+def test_anchors_beyond_the_limits_of_the_format_are_not_saved(tmp_path):
+    """Such a checkpoint replaces none; anchors at a limit come back and are in a file too."""
+    path, given = tmp_path / "m.pt", model()
+    given.anchor_q[1] = MAX_VOXEL
+    checkpoint.save(path, given)
+    assert decode(encode(to_scene(checkpoint.load(path)[0]), effort=1)).anchor_q.max() == MAX_VOXEL
+    before = path.read_bytes()
+    given.anchor_q[1] += 1
+    with pytest.raises(DataError, match="m.pt: the model cannot be stored: anchor_q: voxel index of magnitude 1048577"):
+        checkpoint.save(path, given)
+    assert path.read_bytes() == before and os.listdir(tmp_path) == ["m.pt"]
 
 
 # -- files that are refused --------------------------------------------------------------------------------------------

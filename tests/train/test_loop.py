@@ -295,7 +295,11 @@ def test_other_pictures_and_other_cameras_are_refused_and_the_same_under_another
     trainer_of(dataset, 5).save(tmp_path / "m.pt")
     trainer_of(dataclasses.replace(dataset, name="moved"), 5).resume(tmp_path / "m.pt")
     view = dataset.train[2]
-    for change in ({"image": view.image[::-1].copy()}, {"viewmat": view.viewmat + np.float32(0.001)}, {"time": 0.41}):
+    for change in (
+        {"image": view.image[:, ::-1].copy()},
+        {"viewmat": view.viewmat + np.float32(0.001)},
+        {"time": 0.41},
+    ):
         train = (*dataset.train[:2], dataclasses.replace(view, **change), *dataset.train[3:])
         with pytest.raises(DataError, match="other pictures or cameras in disc than it was trained on"):
             trainer_of(dataclasses.replace(dataset, train=train), 5).resume(tmp_path / "m.pt")
