@@ -52,7 +52,7 @@ def test_a_release_has_public_addresses_and_no_dead_links(tmp_path):
     for name in ("README.md", "player/README.md"):
         links = re.findall(r"\]\(([^)]+)\)", text(name, tmp_path))
         assert links and all(link.startswith(("https:", "#")) for link in links)
-    assert f"plays]({URL}/raw/HEAD/docs/img/refining.gif)" in text("README.md", tmp_path)
+    assert f"then finer parts]({URL}/raw/HEAD/docs/img/refining.gif)" in text("README.md", tmp_path)
 
 
 def test_the_repository_names_no_address_of_its_own():
@@ -88,4 +88,4 @@ def test_the_wheel_gets_every_package_and_what_the_page_needs():
     listed = set(re.findall(r'^    "(pd4dgs_codec[\w.]*)",$', text("pyproject.toml"), flags=re.MULTILINE))
     rooms = {str(p.parent.relative_to(ROOT)).replace("/", ".") for p in (ROOT / "pd4dgs_codec").rglob("__init__.py")}
     player = {".".join(["pd4dgs_codec", "player", *Path(part).with_suffix("").parts]) for part in ("decode", "render")}
-    assert listed == rooms | player | {"pd4dgs_codec.player"}
+    assert listed == rooms | player | {"pd4dgs_codec.player", "pd4dgs_codec.samples"}

@@ -11,7 +11,7 @@ mkdir -p out/demo
 cd out/demo
 set -x
 pd4dgs-train "$scene" -o model.pt --preset tiny --slots 5 --keep-layers --max-seconds 120 -f
-pd4dgs-encode model.pt -o scene.pd4 --slices 20k -f
+pd4dgs-encode model.pt -o scene.pd4 --slices 20k --keep-levels -f
 pd4dgs-eval scene.pd4 "$scene"
 pd4dgs-render scene.pd4 -o levels.png --side-by-side --data "$scene" --frames 3 -f
 python ../../benchmarks/refining_gif.py scene.pd4 -o arriving.gif

@@ -117,7 +117,7 @@ def _check_usage(args: argparse.Namespace) -> None:
         if suffix not in KINDS:
             raise UsageError(f"found -o {args.output}, expected a name that ends in {FILES}, or --to KIND")
         args.to = suffix
-    if suffix in KINDS if args.to == "ply-seq" else suffix not in ("", args.to):
+    if suffix in (*KINDS, "pt", "pd4") and suffix != args.to:
         raise UsageError(f"-o {args.output} ends in .{suffix}, but --to is {args.to}")
     options.conditional(args, args.to not in SEQUENCES, "needs --to ply, spz or glb", time=0.0)
     options.conditional(args, args.to in SEQUENCES, "needs --to ply-seq or 4dgs", fps=FPS)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 from torch.nn.functional import avg_pool2d
 
 from pd4dgs_codec.data.view import View
@@ -32,6 +33,7 @@ def doubts(state: TrainState, views: Sequence[View], psnr: Sequence[float]) -> l
     return found + [lack for level in range(1, state.model.level + 1) if (lack := _lack(state, level))]
 
 
+@torch.no_grad()
 def _lack(state: TrainState, level: int) -> str:
     """The place where `level` shows least of what level 0 shows, in words; "" if it lacks nothing. The views are near
     the key instant, where level 0 has each object in its place."""

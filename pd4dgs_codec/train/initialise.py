@@ -138,7 +138,7 @@ def check_visible(model: Model, dataset: Dataset) -> None:
     for view in _carving_views(dataset):
         line, column, inside = view.project(x, y, z)
         most = max(most, len(np.unique((line * view.width + column)[inside])))
-        if most >= min(LEAST_PIXELS, view.width * view.height):
+        if most >= min(LEAST_PIXELS, view.width * view.height, len(x)):
             return
     found = f"the {len(x):,} start points are at {most} different pixels of a training picture at most"
     expected = "poses, focal lengths and units that belong together"

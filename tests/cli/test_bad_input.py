@@ -29,7 +29,7 @@ from pd4dgs_codec.quality.levels import load_levels
 CASES = [
     # wrong usage
     (2, "train synthetic:local", "-o"),
-    (2, "train synthetic:local -o m.pt --iterations 0", "at least 1"),
+    (2, "train synthetic:local -o m.pt --iterations 0", "from 1 to"),
     (2, "train synthetic:local -o m.pt --max-seconds nan", "more than 0"),
     (2, "train synthetic:local -o m.pt --quality 101", "0 to 100"),
     (2, "train synthetic:local -o m.pt --seed 9223372036854775807", "--seed"),
@@ -165,7 +165,7 @@ CASES = [
         for source in ("missing", "empty", "notes", "synthetic:nothing")
         for command in ("train {} -o m.pt", "eval SCENE {}", "render SCENE -o a.gif --data {}")
     ),
-    (1, "train hole -o m.pt --iterations 3 --log log.jsonl", "001"),
+    (1, "train hole -o m.pt --iterations 3 --log log.jsonl", "image is missing, and so are the others (6 in all)"),
     # checkpoints
     *(
         (1, command, "evil.pt")
@@ -205,9 +205,10 @@ def bad_files(tmp_path_factory, model_pt, scene_pd4, scene):
     (folder / "late.pd4").write_bytes(flipped(data, -30))
     (folder / "blind.pd4").write_bytes(encode(replace(scene, info=replace(scene.info, camera=None)), effort=1))
     for name, value in (("nan", float("nan")), ("inf", float("inf")), ("huge", 1e20)):
-        model, _ = checkpoint.load(model_pt)
-        model.feature.data[3, 2] = value
-        checkpoint.save(folder / f"{name}.pt", model)
+        content = torch.load(model_pt, weights_only=True)
+        content["state"]["feature"][3, 2] = value
+        content["digest"] = checkpoint._digest(content)
+        torch.save(content, folder / f"{name}.pt")
     torch.save({"format": "pd4dgs-checkpoint", "version": 1, "state": Trap(folder / "ran")}, folder / "evil.pt")
     (folder / "cut.pt").write_bytes(model_pt.read_bytes()[:-200])
     for name in ("kept.npz", "kept.gif", "kept.html", "notes"):
@@ -217,7 +218,8 @@ def bad_files(tmp_path_factory, model_pt, scene_pd4, scene):
     views["frames"][1] |= {"w": 8, "h": 6}
     (folder / "sizes" / "transforms.json").write_text(json.dumps(views))
     Image.new("RGB", (8, 6)).save(folder / "sizes" / "001.png")
-    (write_views(folder / "hole") / "001.png").unlink()
+    for picture in write_views(folder / "hole").glob("*.png"):
+        picture.unlink()
     return folder
 
 

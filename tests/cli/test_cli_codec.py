@@ -104,12 +104,12 @@ def test_partial_input_exits_3_only_when_allowed(cli, scene_pd4, tmp_path):
 
 
 def test_info_states_layers_and_first_frame(cli, scene_pd4):
-    result = cli("info", scene_pd4, "--json", "--check", "--at", "500k,2M,1G,1e9,64")
+    result = cli("info", scene_pd4, "--json", "--check", "--at", "500k,2M,1G,1e9,64k")
     report, size = result.json, scene_pd4.stat().st_size
     assert report["format_version"] == "3.0" and report["bytes"] == size and report["checked"] is True
     assert report["layers"][-1]["end"] == size
     end = report["layers"][0]["end"]
-    rates = {"500k": 5e5, "2M": 2e6, "1G": 1e9, "1e9": 1e9, "64": 64}
+    rates = {"500k": 5e5, "2M": 2e6, "1G": 1e9, "1e9": 1e9, "64k": 64e3}
     assert report["first_frame_seconds"] == {name: 8 * end / rate for name, rate in rates.items()}
     text = cli("info", scene_pd4).out.decode()
     assert "first frame" in text and f"{size:,} bytes" in text

@@ -375,9 +375,9 @@ def test_a_checkpoint_keeps_the_step_classes(tmp_path):
     found = checkpoint.load(tmp_path / "m.pt")[0]
     assert torch.equal(found.step_class, model.step_class) and torch.equal(found.centre, model.centre)
     model.step_class[3] = 7
-    checkpoint.save(tmp_path / "bad.pt", model)
     with pytest.raises(DataError, match="step classes: 7, expected at most 6"):
-        checkpoint.load(tmp_path / "bad.pt")
+        checkpoint.save(tmp_path / "bad.pt", model)
+    assert not (tmp_path / "bad.pt").exists()
 
 
 def test_a_model_with_a_nan_becomes_no_scene():
