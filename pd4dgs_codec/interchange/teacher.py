@@ -183,7 +183,7 @@ def _cameras(place: Path, points: np.ndarray, options: Options, downscale: int) 
     radius = max(float(np.percentile(np.linalg.norm(points - middle, axis=1), 90)), 1e-6)
     axis = np.asarray(options.up) / max(float(np.linalg.norm(options.up)), 1e-12)
     places = sphere(2 * options.views)
-    places = np.stack(spread(places[places @ axis >= LOWEST], options.views))
+    places = np.stack(spread(list(places[places @ axis >= LOWEST]), options.views))
     width, height = options.size
     focal = 0.5 * max(width, height) / math.tan(FIELD_OF_VIEW / 2)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32)

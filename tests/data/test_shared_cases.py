@@ -130,7 +130,8 @@ def test_7_files_of_gaussians_are_known_by_their_content(made):
         if name in REFUSED:
             with pytest.raises(DataError, match=re.escape(REFUSED[name])) as error:
                 read_splats(folder / name)
-            assert "\n" not in str(error.value) and "-1" not in str(error.value)
+            told = str(error.value).removeprefix(str(folder))
+            assert "\n" not in told and "-1" not in told
         elif name == "nanny.ply":
             with pytest.warns(DamageWarning, match="20 of 400 Gaussians are left out"):
                 assert len(read_splats(folder / name).means) == 380
