@@ -34,13 +34,14 @@ def measure(file: Path, source: str, folder: Path) -> list[tuple[str, int, int, 
     export, (start, end) = Export(player, eyes_of_scene(player), 0, 0), player.info.time_range
     seconds = end - start
     times = np.linspace(0, 1, round(seconds * FPS))
-    frames = [(float(t), *export.splats(float(t))) for t in times]
+    frames = [(float(t), splats, learnt.slots) for t in times for splats, learnt in [export.splats(float(t))]]
     quality = {kind: [] for kind in ("ply", "spz", "pd4")}
     for view in views:
         quality["pd4"].append(mpsnr(player.picture(view.camera, view.time), view.image))
+        splats, _ = export.splats(view.time)
         for kind, pack in (("ply", ply_bytes), ("spz", spz_bytes)):
             path = folder / f"frame.{kind}"
-            path.write_bytes(pack(export.splats(view.time)[0]))
+            path.write_bytes(pack(splats))
             shown = picture(read_splats(path), view.camera, player.info.background, near_plane(player.info))
             quality[kind].append(mpsnr(shown, view.image))
     rows = []
