@@ -34,6 +34,7 @@ import selection
 from common import QUICK, ROOT, SCENES, Benchmark, Row, Run, available, commit, git, say
 from page import write
 
+from pd4dgs_codec import sample
 from pd4dgs_codec.bench.report import machine, machine_line
 from pd4dgs_codec.errors import DataError, Pd4Error
 
@@ -52,8 +53,6 @@ ALL = (
     codec.BATCH,
     codec.EXPORT,
 )
-#: The scene of the animation.
-ANIMATED = "shelf-hand"
 #: What a docstring can begin.
 DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
@@ -152,10 +151,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 kept[benchmark.name] = section(benchmark, run, scenes, made)
                 write(docs, ALL, kept)
                 if benchmark is delivery.SLICES:
-                    scene = QUICK if args.quick else SCENES[ANIMATED]
-                    file = run.folder(scene) / "slices.pd4"
-                    if file.is_file():
-                        refining_gif.draw(file.read_bytes(), scene.source, run.images / "refining.gif")
+                    refining_gif.draw(sample().read_bytes(), None, run.images / "refining.gif")
         if args.render:
             write(docs, ALL, kept)
     except (Pd4Error, OSError, KeyboardInterrupt) as error:
