@@ -16,6 +16,7 @@ import struct
 import sys
 import zlib
 from bisect import bisect_right
+from itertools import repeat
 
 SIGNATURE = bytes.fromhex("89504434 0D0A1A0A")
 K = 1 << 24  # clause 14: coded symbols
@@ -65,6 +66,11 @@ def a_list(value, what, least, most=None):
     else:
         limited(len(value), most, f"the length of {what}", least)
     return value
+
+
+def ranged(symbols, low, high, what):
+    need(all(low <= k <= high for k in symbols), f"{what} outside {low}..{high}")
+    return symbols
 
 
 def integers(values, high, what, low=0):
@@ -197,6 +203,7 @@ def fields(value, known, required, what):
     return value
 
 
+# 3.3 Scene identity: "the first 8 bytes of the SHA-256 of the header from the end of its chunk list"
 # 3.1 Preamble: "It checks the signature, then the major version, then H against its limit, then the CRC-32."
 def read_preamble(data):
     need(SIGNATURE.startswith(data[:8]), "not a .pd4 file", "BadSignature")
@@ -207,7 +214,11 @@ def read_preamble(data):
     need(len(data) >= 20 + size, "the file ends in the header", "Truncated")
     header = data[20 : 20 + size]
     need(zlib.crc32(data[:16] + header) == crc, "the header's CRC-32 differs", "ChecksumMismatch")
-    return read_header(header), 20 + size
+    fields_of, reader = read_header(header), Reader(header)
+    reader.take({0xDE: 3, 0xDF: 5}.get(header[0], 1))  # the head of the map
+    for _ in ("key 1", "the chunk list"):
+        msgpack(reader, 1)
+    return fields_of, hashlib.sha256(reader.take(reader.left)).digest()[:8], 20 + size
 
 
 # 5.1 Header map: "The time at 1 MUST NOT precede the time at 0, the background MUST lie in 0..1, 0 ≤ near < far and
@@ -260,13 +271,10 @@ def read_rows(header):
         last = read_id(a_list(tensor, "a tensor of rows", 3), last)
         limited(tensor[1], 256, "the number of channels", 1)
         a_step(tensor[2])
-    width = limited(row_width(header), 512, "the number of channels of all rows")
-    if 5 in header:
-        integers(a_list(header[5], "the centres", width), MAX_SYMBOL, "a centre", -MAX_SYMBOL)
-
-
-def row_width(header):
-    return sum(channels for _, channels, _ in header[4])
+    width = limited(sum(channels for _, channels, _ in header[4]), 512, "the number of channels of all rows")
+    header["graded"] = 5 in header
+    header["centres"] = a_list(header.get(5, [0] * width), "the centres", width)
+    integers(header["centres"], MAX_SYMBOL, "a centre", -MAX_SYMBOL)
 
 
 def read_id(tensor, last):
@@ -281,15 +289,6 @@ def read_camera(value):
     fx, fy, _, _ = reals(camera[2], 4, "the camera's intrinsics")
     need(fx > 0 and fy > 0, f"focal lengths {fx} and {fy}, expected both positive")
     integers([camera[3], camera[4]], 65535, "a side of the camera's image", 1)
-
-
-# 3.3 Scene identity: "the header from the end of its chunk list (the value of key 1, the first entry of the map)"
-def scene_identity(header):
-    reader = Reader(header)
-    reader.take({0xDE: 3, 0xDF: 5}.get(header[0], 1))  # the head of the map
-    for _ in ("key 1", "the chunk list"):
-        msgpack(reader, 1)
-    return hashlib.sha256(reader.take(reader.left)).digest()[:8]
 
 
 # 3.2 Chunks: "Type and length MUST equal those in the chunk list. Checks come in this order: L against its limit, L
@@ -395,7 +394,7 @@ def read_chains(layer, value):
 def check_sizes(layer, payload_bytes, before):
     samples = sum(c * h * w for _, _, (c, h, w) in layer.planes)
     need(samples <= 1 << 28, f"{samples} plane samples, limit 2^28", "LimitExceeded")
-    row = row_width(layer.header) + 4 + (5 in layer.header)
+    row = len(layer.header["centres"]) + 4 + (layer.header["graded"])
     layer.count = layer.rises + row * layer.rows + samples + sum(size for _, size in layer.weights)
     layer.declared = [a + b for a, b in zip(before, (layer.rows, layer.count, payload_bytes))]
     rows, symbols, size = layer.declared
@@ -407,14 +406,14 @@ def check_sizes(layer, payload_bytes, before):
 # 8 Coded channels: "one for item 1, one for items 2 to 5, one for items 6 and 7"
 def decode_ans(layer, codes, stream):
     """The voxels and the channels of items 2 to 7, none split."""
-    n, graded = layer.rows, 5 in layer.header
+    n, graded = layer.rows, layer.header["graded"]
     coder = Coder(codes, stream, layer.count + (1 << (10 if layer.later else 18)))
     coder.priors = layer.priors[0]
     cells = decode_positions(coder, n) if n else []
     coder.priors = layer.priors[1]
     channels = [coder.channel(size) for size in (layer.rises, n, *[n] * graded)]
-    classes = step_classes(channels[2]) if graded else []
-    channels += [coder.split(classes, 7) if graded else coder.channel(n) for _ in range(row_width(layer.header))]
+    classes = ranged(channels[2], 0, 6, "a step class") if graded else []
+    channels += [coder.split(classes, 7) if graded else coder.channel(n) for _ in range(len(layer.header["centres"]))]
     coder.priors = []
     channels += decode_grids(coder, [shape for _, _, shape in layer.planes])
     channels += [coder.channel(size) for _, size in layer.weights]
@@ -425,31 +424,30 @@ def decode_ans(layer, codes, stream):
 # 11.1 Masks: "Layer ℓ codes a rise 0..255 for each earlier row and a code 3..255 for each own row."
 # 11.2 Rows: "Symbols of rows, plane samples (11.3), weights and biases MUST lie in −2^23..2^23, else Malformed."
 def name_channels(layer, channels):
-    symbols = {name: [next(channels)] for name in ("rise", "own")}
-    need(all(v >= 0 for v in symbols["rise"][0]), "a mask code decreases")  # finish_last finds those over 255
-    need(all(v >= 3 for v in symbols["own"][0]), "a mask code under 3")
-    if 5 in layer.header:
+    symbols = {
+        "rise": [ranged(next(channels), 0, 255, "a rise")],
+        "own": [ranged(next(channels), 3, 255, "a mask code")],
+    }
+    if layer.header["graded"]:
         symbols["class"] = [next(channels)]
     symbols |= {f"row.{tensor}": [next(channels) for _ in range(width)] for tensor, width, _ in layer.header[4]}
-    for name, predictor, (c, h, w) in layer.planes:
-        symbols[name] = [restore(next(channels), predictor, h, w) for _ in range(c)]
+    for name, predictor, (c, _, w) in layer.planes:
+        symbols[name] = [restore(next(channels), predictor, w) for _ in range(c)]
     symbols |= {name: [next(channels)] for name, _ in layer.weights}
-    need(all(abs(k) <= MAX_SYMBOL for own in symbols.values() for c in own for k in c), "a symbol over 2^23")
+    for channel in (channel for own in symbols.values() for channel in own):
+        ranged(channel, -MAX_SYMBOL, MAX_SYMBOL, "a symbol")
     return symbols
 
 
 # 11.3 Planes: "in row 0 N and NW are taken equal to W, in column 0 W and NW are taken equal to N, and at (0, 0) all
 # three are 0."
-def restore(residuals, predictor, h, w):
+def restore(residuals, predictor, w):
     k = list(residuals)
     for at in range(len(k)):
         i, j = divmod(at, w)
-        west, north = k[at - 1] if j else 0, k[at - w] if i else 0
-        corner = k[at - w - 1] if i and j else 0
-        if i == 0:
-            north = corner = west
-        elif j == 0:
-            west = corner = north
+        west = k[at - 1] if j else k[at - w] if i else 0
+        north = k[at - w] if i else west
+        corner = k[at - w - 1] if i and j else north
         k[at] += max(min(west, north), min(max(west, north), west + north - corner)) if predictor else north
     return k
 
@@ -585,12 +583,6 @@ class Coder:
         return [next(parts[q]) for q in classes]
 
 
-# 11.2 Rows: "A step class MUST lie in 0..6, else Malformed."
-def step_classes(symbols):
-    need(all(0 <= c <= 6 for c in symbols), "a step class over 6")
-    return symbols
-
-
 # 8.6 Grids in stages: "Stage 0 codes the channels 0 and 1 of each plane, stage s ≥ 1 the channels 2^s .. 2^(s+1) − 1,
 # as far as the plane has them." "A stage codes grid by grid, plane by plane, channel by channel." "In stage 0 each
 # channel is one coded channel"
@@ -637,16 +629,17 @@ def classes_by_activity(activity):
 # Malformed." "If no channel has symbols, codes and stream are empty."
 def decode_lzma(layer, codes, stream):
     """As decode_ans."""
-    n, graded = layer.rows, 5 in layer.header
-    counts = [n, n, n, layer.rises] + [n] * (1 + graded + row_width(layer.header))
+    n, graded = layer.rows, layer.header["graded"]
+    counts = [n, n, n, layer.rises] + [n] * (1 + graded + len(layer.header["centres"]))
     counts += [h * w for _, _, (c, h, w) in layer.planes for _ in range(c)] + [size for _, size in layer.weights]
     heads = [(codes.varint(8 * K + 3) if count else 0, count) for count in counts]
     need(all(code & 3 < 3 for code, _ in heads), "a channel of 8-byte symbols")
     size = sum(count << (code & 3) for code, count in heads)
     reader = Reader(unpack_lzma(stream, size) if size or stream else b"")
-    channels = [take_numbers(reader, count, code & 3, unzigzag(code >> 2)) for code, count in heads]
-    need(all(abs(k) <= K for channel in channels for k in channel), "a symbol over K")
-    step_classes(channels[5] if graded else [])
+    channels = [
+        ranged(take_numbers(reader, count, code & 3, unzigzag(code >> 2)), -K, K, "a symbol") for code, count in heads
+    ]
+    ranged(channels[5] if graded else [], 0, 6, "a step class")
     return voxels_in_order(zip(*channels[:3])), channels[3:]
 
 
@@ -758,16 +751,13 @@ class Lzma:
     def take_literal(self, out, place):
         before = out[-1] if place else 0
         context = (place & (1 << self.lp) - 1) << self.lc | before >> 8 - self.lc
-        expected = out[-self.distances[0]] if self.state >= 7 else None
-        symbol = 1
-        while symbol < 256:
-            if expected is None:
-                bit = self.bit("literal", context, symbol)
-            else:  # behind a match: given the byte that would have gone on with it, as long as it is that
-                guess = expected >> 8 - symbol.bit_length() & 1
-                bit = self.bit("literal", context, guess, symbol)
-                expected = expected if bit == guess else None
-            symbol = symbol << 1 | bit
+        symbol, expected = 1, out[-self.distances[0]] if self.state >= 7 else None
+        for place in reversed(
+            range(8)
+        ):  # behind a match: given the byte that would go on with it, as long as it is that
+            guess = None if expected is None else expected >> place & 1
+            bit = self.bit("literal", context, guess, symbol)
+            symbol, expected = symbol << 1 | bit, expected if bit == guess else None
         out.append(symbol & 255)
 
     def take_length(self, kind, low):
@@ -799,11 +789,7 @@ class Lzma:
         return symbol - (1 << bits)
 
     def take_reverse(self, bits, *context):
-        symbol, value = 1, 0
-        for place in range(bits):
-            bit = self.bit(*context, symbol)
-            symbol, value = symbol << 1 | bit, value | bit << place
-        return value
+        return int(f"{self.take_tree(bits, *context):0{bits}b}"[::-1], 2)
 
     def bit(self, *context):
         p = self.probabilities.get(context, 1 << 10)
@@ -860,12 +846,6 @@ def read_levels(codes, depth, count):
     return levels
 
 
-# 10.3 Channels: "Symbols of item 1 MUST lie in 0..7, indices within their list, else Malformed."
-def within(channel, size):
-    need(all(0 <= k < size for k in channel), f"a symbol of the octree outside 0..{size - 1}")
-    return iter(channel)
-
-
 # 10.3 Channels: "if N < n, one channel of the numbers of children less 1 of the nodes whose parent has one child, then
 # one channel of the same numbers of the other nodes, the root included" "the child c of each node with one child" "The
 # numbers of children MUST agree with 10.2, else Malformed: at each level s of them are 1 and their sum is the number of
@@ -877,31 +857,29 @@ def grow(levels, coder, count, sizes):
         children = [1] * nodes
         if nodes < count:
             only = sum(only_child)
-            of_one, of_more = within(coder.channel(only), 8), within(coder.channel(nodes - only), 8)
+            of_one, of_more = indices_of(coder, only, 8), indices_of(coder, nodes - only, 8)
             children = [1 + next(of_one if only else of_more) for only in only_child]
             need(children.count(1) == single, f"{children.count(1)} nodes with one child, expected {single}")
             need(sum(children) == after, f"{sum(children)} children, expected {after}")
         only_child = [k == 1 for k in children for _ in range(k)]
-        steps.append((children, within(coder.channel(single), 8)))
+        steps.append((children, indices_of(coder, single, 8)))
     numbers = [k for children, _ in steps for k in children]
     need(not sizes or sizes == [numbers.count(k) for k in range(2, 8)], "other numbers of children than stated")
-    indices = {k: within(coder.channel(size), len(PATTERNS[k])) for k, size in enumerate(sizes, 2)}
+    indices = {k: indices_of(coder, size, len(PATTERNS[k])) for k, size in enumerate(sizes, 2)} | {8: repeat(0)}
     nodes = [(0, 0, 0)]
-    for children, octants in steps:
+    for children, indices[1] in steps:
+        patterns = [PATTERNS[k][next(indices[k])] for k in children]
         nodes = [
-            tuple(2 * p + (child >> axis & 1) for axis, p in enumerate(node))
-            for node, k in zip(nodes, children)
-            for child in children_of(k, octants, indices)
+            tuple(2 * v + (child >> axis & 1) for axis, v in enumerate(node))
+            for node, pattern in zip(nodes, patterns)
+            for child in range(8)
+            if pattern >> child & 1
         ]
     return nodes
 
 
-# 10.3 Channels: "Eight children have one pattern and no symbol."
-def children_of(k, octants, indices):
-    if k == 1:
-        return [next(octants)]
-    byte = PATTERNS[k][next(indices[k])] if k < 8 else 255
-    return [child for child in range(8) if byte >> child & 1]
+def indices_of(coder, count, size):
+    return iter(ranged(coder.channel(count), 0, size - 1, "a symbol of the octree"))
 
 
 # 11.5 Dequantisation: "x̂ = binary32(binary64(k) · binary64(Q)): the product is exact, and the one rounding is to
@@ -918,7 +896,7 @@ def dequantise(symbols, step):
 def dequantise_layer(layer):
     header, symbols = layer.header, layer.symbols
     layer.tensors = {"position": dequantise([v for cell in layer.cells for v in cell], header[6])}
-    classes, centres = symbols.get("class", [[0] * layer.rows])[0], iter(header.get(5, [0] * row_width(header)))
+    classes, centres = symbols.get("class", [[0] * layer.rows])[0], iter(header["centres"])
     for tensor, width, step in header[4]:  # [C, n] -> [n, C]
         own = [next(centres) for _ in range(width)]
         values = [m + (k << c) for row, c in zip(zip(*symbols[f"row.{tensor}"]), classes) for m, k in zip(own, row)]
@@ -961,8 +939,7 @@ def finish_last(layers):
 # 3.2 Chunks: "Bytes after the last chunk make the file Malformed."
 def decode(data, max_layer=2):
     """The layers of a file's bytes, or of prefix max_layer, with cells, symbols and tensors."""
-    header, at = read_preamble(data)
-    scene_id = scene_identity(data[20:at])
+    header, scene_id, at = read_preamble(data)
     layers, declared, chunks = [], (0, 0, 0), header[1]
     stop = len(chunks) if max_layer == 2 else 1 + max(i for i, (kind, _) in enumerate(chunks) if kind <= max_layer)
     for i, (kind, size) in enumerate(chunks[:stop]):
