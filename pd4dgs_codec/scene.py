@@ -351,7 +351,8 @@ class Scene:
     mask: per present layer i, uint8 [rows[i]] codes (see MASK_STEP), non-decreasing from layer to layer.
     networks: "opacity", "covariance", "color". global_deformation belongs to layer 1, local_deformation to layer 2;
     each may be None (left out). The trunk of layer 2 reads the planes of layer 1 as well, see `motion`.
-    grading: None if all anchors have the same steps.
+    grading: None if all anchors have the same steps. fills: per present layer, what `background` is while this layer is
+    the highest one, RGB 0..255; None for that of `info`. Without entries all are None.
     """
 
     info: SceneInfo
@@ -367,6 +368,14 @@ class Scene:
     global_deformation: Deformation | None = None
     local_deformation: Deformation | None = None
     grading: Grading | None = None
+    fills: tuple[tuple[int, int, int] | None, ...] = ()
+
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """RGB as displayed, 0..1, behind every Gaussian at the highest level: the fill of an incomplete file, or that
+        of `info`. Of a lower level it is `prefix(level).background`."""
+        fill = self.fills[-1] if self.fills else None
+        return self.info.background if fill is None else (fill[0] / 255, fill[1] / 255, fill[2] / 255)
 
     @property
     def widths(self) -> Widths:
@@ -465,21 +474,11 @@ class Scene:
         """Returns mask codes uint8 [N] per layer present; anchors that a layer's prefix lacks have code 0."""
         return [np.concatenate([codes, np.zeros(self.rows[-1] - codes.size, np.uint8)]) for codes in self.mask]
 
-    def tensors(self, layer: int) -> Deformation:
-        """Returns the planes and networks of layer 0, 1 or 2. Layer 0 has no planes; a layer without a deformation has
-        neither planes nor networks."""
-        if layer == 0:
-            return Deformation((), self.networks)
-        return self.deformation(layer) or Deformation((), {})
-
-    def with_tensors(self, layer: int, tensors: Deformation | None) -> Scene:
-        """Returns the scene with these planes and networks in a layer; None removes the deformation of layer 1 or 2."""
+    def with_deformation(self, layer: int, deformation: Deformation | None) -> Scene:
+        """Returns the scene with this deformation in layer 1 or 2."""
         if layer == 1:
-            return replace(self, global_deformation=tensors)
-        if layer == 2:
-            return replace(self, local_deformation=tensors)
-        assert tensors is not None and not tensors.planes
-        return replace(self, networks=tensors.networks)
+            return replace(self, global_deformation=deformation)
+        return replace(self, local_deformation=deformation)
 
     def prefix(self, max_layer: int) -> Scene:
         """Returns the layers <= max_layer, or `self` if it has no others. Raises ValueError if max_layer < 0."""
@@ -496,5 +495,6 @@ class Scene:
             mask=self.mask[:n],
             global_deformation=self.global_deformation if 1 in self.layers[:n] else None,
             local_deformation=self.local_deformation if 2 in self.layers[:n] else None,
+            fills=self.fills[:n],
             **self.of_anchors(slice(rows)),
         )

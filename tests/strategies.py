@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from pd4dgs_codec import encode
 from pd4dgs_codec.entropy.priors import norm_cdf28_of_each, tables_of_each
 from pd4dgs_codec.format.info import info as info_of
-from pd4dgs_codec.format.quantise import NO_CLASSES, Grid, attribute_rows, dequantise
+from pd4dgs_codec.format.quantise import NO_CLASSES, Rows, RowTable, dequantise
 from pd4dgs_codec.scene import (
     DEFAULT_WIDTHS,
     INSTANTS,
@@ -128,18 +128,19 @@ def make_scene(
     codes = np.sort(rng.choice(np.array([0, 0, 3, 4, 77, 255], np.uint8), (n, len(layers))), axis=1)
     values = [symbols(rng, (n, *shape), kind) for shape in widths.attributes.values()]
     k = np.concatenate([x.reshape(n, math.prod(x.shape[1:])).T for x in values])
-    centre, classes, grading = np.zeros(widths.channels, np.int32), NO_CLASSES, None
+    centre, classes, grading = None, NO_CLASSES, None
     if widths.graded:
         classes = rng.integers(0, MAX_CLASS + 1, n).astype(np.int32)
+        centre = np.zeros(widths.channels, np.int32)
         if kind == "huge":
             k = k // (1 << classes)
         else:
             centre = rng.integers(-3, 4, widths.channels).astype(np.int32)
-    grid = Grid(steps.attributes, widths, centre)
+    pairs = zip(widths.attributes.values(), steps.attributes.values(), strict=True)
+    table = RowTable(tuple(Rows(i, math.prod(shape), step) for i, (shape, step) in enumerate(pairs)), centre)
     if widths.graded:
-        rows = attribute_rows(centre, widths)
-        values_of_centre = np.concatenate([dequantise(m, steps.attributes[name]) for name, m in rows])
-        grading = Grading(classes.astype(np.uint8), values_of_centre)
+        grading = Grading(classes.astype(np.uint8), table.centre_values)
+    rows = zip(widths.attributes.items(), table.dequantise(k, classes), strict=True)
     networks = {
         name: network(rng, (widths.inputs[name], *hidden, outputs), steps.weights_scaffold, kind)
         for name, outputs in widths.networks.items()
@@ -155,7 +156,7 @@ def make_scene(
         layers=layers,
         rows=(n,) * len(layers),
         anchor_q=cells,
-        **grid.dequantise(k, classes),
+        **{name: x.reshape(n, *shape) for (name, shape), x in rows},
         grading=grading,
         mask=tuple(codes.T.copy()),
         networks=networks,

@@ -18,10 +18,8 @@ import numpy as np
 
 from pd4dgs_codec.entropy.priors import (
     BIT,
-    FREE_ENTRIES,
     K_MAX,
     MAX_WINDOW,
-    MORE_ENTRIES,
     Const,
     Gauss,
     Mixture,
@@ -193,14 +191,24 @@ def _fullest_window(h: Histogram) -> Window:
     return Window(low, high - low + 1)
 
 
+def bits_under(h: Histogram, fitted: Fitted) -> float:
+    """Bits of a channel's symbols within the window of a prior."""
+    window = fitted.prior.window
+    inside = (h.values >= window.kmin) & (h.values < window.end)
+    return float(h.counts[inside] @ fitted.costs[h.values[inside] - window.kmin]) / BIT
+
+
 # -- sharing -----------------------------------------------------------------------------------------------------------
 
 Fit = Callable[[Histogram], Fitted]
 
 
-def plan_priors(histograms: Sequence[Histogram], fit: Fit, share: bool, known: Sequence[Fitted]) -> list[Fitted]:
+def plan_priors(
+    histograms: Sequence[Histogram], fit: Fit, share: bool, known: Sequence[Fitted], room: int
+) -> list[Fitted]:
     """Returns the prior of each channel; channels that share one get the same object. share: whether channels may share
-    new priors. known: priors that were described earlier, at no cost now."""
+    new priors. known: priors that were described earlier, at no cost now. room: most entries of all new tables, at
+    least one per channel."""
     plan = [fit(h) for h in histograms]
     free = [replace(fitted, price=0) for fitted in known]
     if free and plan:
@@ -215,24 +223,28 @@ def plan_priors(histograms: Sequence[Histogram], fit: Fit, share: bool, known: S
         shared = _shared([histograms[c] for c in block], [plan[c] for c in block], free)
         for c, prior in zip(block, shared, strict=True):
             plan[c] = prior
-    return _within_limit(histograms, plan, free, fit)
+    return _within(room, histograms, plan, free, fit)
 
 
-def _within_limit(histograms: Sequence[Histogram], plan: list[Fitted], free: list[Fitted], fit: Fit) -> list[Fitted]:
-    """Returns the plan, changed if its tables have more entries than a section may define: then one prior for all their
-    channels replaces the widest new priors, or known priors do if there is no room for one."""
+def _within(
+    room: int, histograms: Sequence[Histogram], plan: list[Fitted], free: list[Fitted], fit: Fit
+) -> list[Fitted]:
+    """Returns the plan, changed if its new tables have more than `room` entries: then one prior for all their channels
+    replaces the widest new ones, or known priors and constants do if there is no room for one."""
     known = {id(p.prior) for p in free}
     distinct = {id(p.prior): p for p in plan if id(p.prior) not in known}.values()
     ordered = sorted(distinct, key=lambda p: p.prior.window.n)
     ends = np.cumsum([p.prior.window.n for p in ordered])
-    left = sum(int(h.counts.sum()) for h in histograms) + (MORE_ENTRIES if free else FREE_ENTRIES)
-    if not ordered or ends[-1] <= left:
+    if not ordered or ends[-1] <= room:
         return plan
-    kept = known | {id(p.prior) for p, end in zip(ordered, ends, strict=True) if end <= left - MAX_WINDOW}
+    kept = known | {id(p.prior) for p, end in zip(ordered, ends, strict=True) if end <= room - MAX_WINDOW}
     rest = [c for c, p in enumerate(plan) if id(p.prior) not in kept]
-    if free and left < MAX_WINDOW:
-        nearest = costs_of([histograms[c] for c in rest], free).argmin(axis=1)
-        replaced = dict(zip(rest, [free[i] for i in nearest], strict=True))
+    if room < MAX_WINDOW:
+        replaced = {}
+        for c in rest:
+            mode = int(histograms[c].counts.argmax())
+            candidates = [*free, _const(histograms[c], mode)]
+            replaced[c] = candidates[int(costs_of([histograms[c]], candidates)[0].argmin())]
     else:
         replaced = dict.fromkeys(rest, fit(pool([histograms[c] for c in rest])))
     return [replaced.get(c, p) for c, p in enumerate(plan)]

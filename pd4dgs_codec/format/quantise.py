@@ -1,15 +1,14 @@
-"""Uniform scalar quantisation between float32 values and int32 symbols, and the quantisation grid of attributes."""
+"""Uniform scalar quantisation between float32 values and int32 symbols, and the quantisation of rows."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from pd4dgs_codec.errors import EncodeError
-from pd4dgs_codec.scene import ATTRIBUTES, MASK_MIN_CODE, MASK_THRESHOLD, Scene, Widths
+from pd4dgs_codec.scene import MASK_MIN_CODE, MASK_THRESHOLD
 
 #: Symbols k satisfy |k| <= MAX_SYMBOL: binary64(k) * binary64(Q) is exact, and no two symbols of one step share a
 #: binary32 value, so that quantising a dequantised value gives the same symbol.
@@ -108,7 +107,7 @@ def mask_codes(mask: np.ndarray) -> np.ndarray:
     return np.where(m <= MASK_THRESHOLD, 0, np.maximum(MASK_MIN_CODE, np.rint(m * 255.0))).astype(np.uint8)
 
 
-# -- attributes --------------------------------------------------------------------------------------------------------
+# -- rows --------------------------------------------------------------------------------------------------------------
 
 #: Anchors that are quantised or dequantised at a time, because intermediate values are twice as wide.
 BLOCK = 4096
@@ -119,81 +118,86 @@ def row_blocks(n: int) -> Iterator[slice]:
     yield from (slice(first, min(first + BLOCK, n)) for first in range(0, max(n, 1), BLOCK))
 
 
-def attribute_rows(channels: np.ndarray, widths: Widths) -> Iterator[tuple[str, np.ndarray]]:
-    """Yields (name of an attribute, its rows) of an array with a row per channel, in coding order."""
-    first = 0
-    for name in ATTRIBUTES:
-        last = first + math.prod(widths.attributes[name])
-        yield name, channels[first:last]
-        first = last
+@dataclass(frozen=True)
+class Rows:
+    """A tensor of the form rows: its id, its channels C per anchor, and its step."""
 
-
-def classes_of(scene: Scene) -> np.ndarray:
-    """Returns the step classes int32 [N] of a scene, or NO_CLASSES."""
-    return NO_CLASSES if scene.grading is None else scene.grading.classes.astype(np.int32)
+    id: int
+    channels: int
+    step: float
 
 
 @dataclass(frozen=True, eq=False)
-class Grid:
-    """The values that attributes can have: (m + k 2^c) Q with a symbol k, the step Q of the attribute, the centre m of
-    the channel and the step class c of the anchor (clause 11.5).
+class RowTable:
+    """The tensors of an anchor's row. Their values are (m + k 2^c) Q with a symbol k, the step Q of the tensor, the
+    centre m of the channel and the step class c of the anchor (clause 11.5).
 
-    steps: Q by attribute. centre: int32 [channels] in steps, 0 if the anchors are not graded. Symbols are int32
-    [channels, n], channel-major; classes are int32 [n], or NO_CLASSES.
+    tensors: by ascending id. centre: int32 [W] in steps, None if anchors have no step classes. Symbols are int32 [W,
+    n], channel-major; classes are int32 [n], or NO_CLASSES.
     """
 
-    steps: dict[str, float]
-    widths: Widths
-    centre: np.ndarray
+    tensors: tuple[Rows, ...]
+    centre: np.ndarray | None = None
 
-    @staticmethod
-    def of(scene: Scene) -> Grid:
-        """Returns the grid of a scene's attributes. Raises EncodeError for a centre that has no symbol."""
-        steps, widths = scene.steps.attributes, scene.widths
-        centre = np.zeros(widths.channels, np.int32)
-        if scene.grading is not None:
-            rows = attribute_rows(scene.grading.centre, widths)
-            centre = np.concatenate([quantise(x, steps[name], f"centre of {name}") for name, x in rows])
-        return Grid(steps, widths, centre)
+    @property
+    def channels(self) -> int:
+        """W, the number of scalars of a row."""
+        return sum(tensor.channels for tensor in self.tensors)
+
+    @property
+    def graded(self) -> bool:
+        """Whether anchors have step classes."""
+        return self.centre is not None
+
+    def of_each(self, channels: np.ndarray) -> Iterator[tuple[Rows, np.ndarray]]:
+        """Yields (tensor, its rows) of an array [W, ...]."""
+        first = 0
+        for tensor in self.tensors:
+            last = first + tensor.channels
+            yield tensor, channels[first:last]
+            first = last
 
     @property
     def centre_values(self) -> np.ndarray:
-        """float32 [channels]: the value of symbol 0 in each channel."""
-        rows = attribute_rows(self.centre, self.widths)
-        return np.concatenate([dequantise(m, self.steps[name]) for name, m in rows])
+        """float32 [W]: the value of symbol 0 in each channel."""
+        return np.concatenate([dequantise(m, tensor.step) for tensor, m in self.of_each(self._centres)])
+
+    @property
+    def _centres(self) -> np.ndarray:
+        return np.zeros(self.channels, np.int32) if self.centre is None else self.centre
 
     def _spacing(self, classes: np.ndarray) -> np.ndarray | int:
-        return 1 << classes.astype(np.int64) if self.widths.graded else 1
+        return 1 << classes.astype(np.int64) if self.graded else 1
 
-    def _with_centres(self, symbols: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-        """Yields (name of an attribute, its rows of symbols [channels, n], their centres [rows, 1])."""
-        both = (attribute_rows(rows, self.widths) for rows in (symbols, self.centre[:, None]))
-        yield from ((name, own, centre) for (name, own), (_, centre) in zip(*both, strict=True))
+    def _with_centres(self, symbols: np.ndarray) -> Iterator[tuple[Rows, np.ndarray, np.ndarray]]:
+        """Yields (tensor, its rows of symbols [W, n], their centres [rows, 1])."""
+        both = self.of_each(symbols), self.of_each(self._centres[:, None])
+        yield from ((tensor, own, centre) for (tensor, own), (_, centre) in zip(*both, strict=True))
 
-    def farthest(self, symbols: np.ndarray, classes: np.ndarray) -> dict[str, int]:
-        """Returns the largest |m + k 2^c| by attribute; 0 without anchors."""
-        most = dict.fromkeys(ATTRIBUTES, 0)
-        for rows in row_blocks(symbols.shape[1]) if self.widths.graded else [slice(None)]:
+    def farthest(self, symbols: np.ndarray, classes: np.ndarray) -> list[int]:
+        """Returns the largest |m + k 2^c| of each tensor; 0 without anchors."""
+        most = [0] * len(self.tensors)
+        for rows in row_blocks(symbols.shape[1]) if self.graded else [slice(None)]:
             at = symbols[:, rows]
-            if self.widths.graded:
-                at = self.centre[:, None] + at.astype(np.int64) * self._spacing(classes[rows])
-            for name, own in attribute_rows(at, self.widths):
-                most[name] = max(most[name], magnitude(own))
+            if self.graded:
+                at = self._centres[:, None] + at.astype(np.int64) * self._spacing(classes[rows])
+            most = [max(m, magnitude(own)) for m, (_, own) in zip(most, self.of_each(at), strict=True)]
         return most
 
-    def quantise(self, values: dict[str, np.ndarray], classes: np.ndarray) -> np.ndarray:
-        """Returns the symbols of float32 [n, *shape] by attribute. Raises EncodeError for a value without a symbol."""
-        symbols = np.empty((self.widths.channels, len(values[ATTRIBUTES[0]])), np.int32)
-        for name, own, centre in self._with_centres(symbols):
+    def quantise(self, values: Sequence[np.ndarray], classes: np.ndarray, names: Sequence[str]) -> np.ndarray:
+        """Returns the symbols of float32 [n, any], one array per tensor. names: for messages. Raises EncodeError for a
+        value without a symbol."""
+        symbols = np.empty((self.channels, len(values[0])), np.int32)
+        for x, name, (tensor, own, centre) in zip(values, names, self._with_centres(symbols), strict=True):
             for rows in row_blocks(symbols.shape[1]):
-                channels = values[name][rows].reshape(-1, len(centre)).T
-                own[:, rows] = quantise(channels, self.steps[name], name, centre, self._spacing(classes[rows]))
+                channels = x[rows].reshape(-1, tensor.channels).T
+                own[:, rows] = quantise(channels, tensor.step, name, centre, self._spacing(classes[rows]))
         return symbols
 
-    def dequantise(self, symbols: np.ndarray, classes: np.ndarray) -> dict[str, np.ndarray]:
-        """The inverse of `quantise`: float32 [n, *shape] by attribute, C-contiguous."""
-        values, spacing = {}, self._spacing(classes)
-        for name, own, centre in self._with_centres(symbols):
-            found = np.ascontiguousarray(dequantise(own, self.steps[name], centre, spacing).T)
-            values[name] = found.reshape(-1, *self.widths.attributes[name])
-        return values
+    def dequantise(self, symbols: np.ndarray, classes: np.ndarray) -> list[np.ndarray]:
+        """The inverse of `quantise`: float32 [n, C] of each tensor, C-contiguous."""
+        spacing = self._spacing(classes)
+        return [
+            np.ascontiguousarray(dequantise(own, tensor.step, centre, spacing).T)
+            for tensor, own, centre in self._with_centres(symbols)
+        ]

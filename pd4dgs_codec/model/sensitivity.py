@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.format.symbols import layer_symbols
+from pd4dgs_codec.format.plan import layer_symbols
 from pd4dgs_codec.model.model import Gaussians, Model, from_scene
 from pd4dgs_codec.model.networks import EXACT, Rounding
 from pd4dgs_codec.model.picture import draw, render_image

@@ -10,9 +10,7 @@ import torch
 
 from pd4dgs_codec.data.view import View
 from pd4dgs_codec.format.options import EncodeOptions
-from pd4dgs_codec.format.plan import in_file_order, passed, tensor_bytes
-from pd4dgs_codec.format.registry import LAYER_KINDS
-from pd4dgs_codec.format.symbols import layer_symbols
+from pd4dgs_codec.format.plan import in_file_order, layer_symbols, passed, symbols_of, tensor_bytes
 from pd4dgs_codec.model.model import Model, from_scene
 from pd4dgs_codec.model.networks import EXACT, Rounding
 from pd4dgs_codec.model.picture import render_image
@@ -163,7 +161,7 @@ def _enough(
         shown = pictures(model, level, viewpoints)
         return float(sum(np.square(a - b).sum() for a, b in zip(shown, whole, strict=True)))
 
-    motion = tensor_bytes(scene.tensors(above), LAYER_KINDS[above], scene.steps, options)
+    motion = tensor_bytes(symbols_of(scene, above), options)
     size = np.cumsum(layer_symbols(scene, index).bits_per_row()[order - (scene.rows[index] - len(order))]) / 8
     parts = np.linspace(0.0, size[-1] if len(size) else 0.0, PARTS + 1)
     counts = np.searchsorted(size, parts, side="right")
