@@ -152,18 +152,25 @@ CHANNELS = [
 ]  # fmt: skip
 
 
+def _coded(*arrays: np.ndarray, priors: str = "best", effort: int = 5) -> tuple[bytes, bytes]:
+    writer = channels.ChannelWriter(priors, effort)
+    writer.write(arrays, [])
+    return bytes(writer.codes), writer.stream()
+
+
 def _lost_symbols(*arrays: np.ndarray) -> Found:
     wrong, sizes = 0, []
     for priors, effort in SETTINGS:
-        coded = channels.encode_channels(arrays, priors=priors, effort=effort)
-        decoded = channels.decode_channels(coded.payload, [a.size for a in arrays])
-        wrong += sum(int((a != b).sum()) for a, b in zip(arrays, decoded, strict=True))
-        sizes.append(len(coded.payload))
+        codes, stream = _coded(*arrays, priors=priors, effort=effort)
+        reader = channels.ChannelReader(codes, stream, sum(a.size for a in arrays))
+        wrong += int((reader.read([a.size for a in arrays], []) != np.concatenate(arrays)).sum())
+        reader.finish()
+        sizes.append(len(codes) + len(stream))
     return f"{wrong} wrong symbols, {' / '.join(f'{s:,}' for s in sizes)} bytes", float(wrong)
 
 
 def _against_plain_binary(symbols: np.ndarray) -> Found:
-    coded = channels.encode_channels([symbols]).payload_bits
+    coded = 8 * sum(map(len, _coded(symbols)))
     spread = int(symbols.max()) - int(symbols.min()) if symbols.size else 0
     plain = symbols.size * math.log2(spread + 1)
     return f"{coded:,} bits, plain binary {plain:,.0f}", max(coded - OVERHEAD, 0) / max(plain, 1.0)
@@ -279,7 +286,7 @@ PROMISES = [
     *(Promise("fitting", f"at most {slack} of plain binary over its range, and {OVERHEAD} bits", _against_plain_binary,
               [(f"size: {name}", fed, given) for name, fed, given in CHANNELS if wide == (name in EXCEPTIONS)], slack)
       for wide, slack in ((False, SLACK), (True, SLACK_OF_EXCEPTIONS))),
-    refusal("fitting", EncodeError, lambda value: channels.encode_channels([np.array([0, value], np.int32)]),
+    refusal("fitting", EncodeError, lambda value: _coded(np.array([0, value], np.int32)),
             *((f"beyond the limit: {k}", "an int32 extreme; the limit is 2^24", k) for k in (2**31 - 1, -(2**31)))),
     Promise("quantiser", "|x - x_hat| <= Q/2 + half a float32 unit, exactly", _error_in_bounds,
             [(f"step {name}", "4,000 values up to 2^23 steps, at halves of a step and around them", step)

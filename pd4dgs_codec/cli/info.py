@@ -70,6 +70,7 @@ def _parts(result: dict[str, Any]) -> list[dict[str, Any]]:
     missing = [row["layer"] for row in layers if "codes" not in row]
     if missing:
         raise DataError(f"{result['input']}: layer {missing[0]} is truncated, expected a complete file for --bytes")
+    parts: list[dict[str, Any]]
     parts = [{"part": name, "layers": [row[name] for row in layers]} for name in ("codes", "stream")]
     frames = [row["bytes"] - row["codes"] - row["stream"] for row in layers]
     frames[0] += result["header_bytes"]
