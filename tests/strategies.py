@@ -10,11 +10,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 from hypothesis import strategies as st
 
 from pd4dgs_codec import encode
+from pd4dgs_codec.entropy.channels import ChannelReader, ChannelWriter, split
+from pd4dgs_codec.entropy.fitting import Fitted
 from pd4dgs_codec.entropy.priors import norm_cdf28_of_each, tables_of_each
 from pd4dgs_codec.format.info import info as info_of
 from pd4dgs_codec.format.quantise import NO_CLASSES, Rows, RowTable, dequantise
@@ -257,6 +260,21 @@ def assert_same_symbols(found: Sequence[np.ndarray], expected: Sequence[np.ndarr
     for a, b in zip(found, expected, strict=True):
         assert a.dtype == np.int32
         np.testing.assert_array_equal(a, b)
+
+
+def coded(channels: Sequence[np.ndarray], known: list[Fitted] | None = None, **options: Any) -> tuple[bytes, bytes]:
+    """(codes, stream) of channels in one batch. known: the prior list. options: of ChannelWriter."""
+    writer = ChannelWriter(**options)
+    writer.write(channels, [] if known is None else known)
+    return bytes(writer.codes), writer.stream()
+
+
+def decoded(codes: bytes, stream: bytes, counts: Sequence[int]) -> list[np.ndarray]:
+    """The channels of these lengths, the inverse of `coded`."""
+    reader = ChannelReader(codes, stream, sum(counts))
+    symbols = reader.read(counts, [])
+    reader.finish()
+    return split(symbols, counts)
 
 
 def slice_ends(data: bytes) -> list[int]:
