@@ -3,7 +3,7 @@
 import { evaluate } from "./evaluate.js";
 import { serve } from "./remote.js";
 
-/** @type {import("../decode/scene.js").Scene} */
+/** @type {import("../kinds/index.js").Scene} */
 let scene;
 
 serve({

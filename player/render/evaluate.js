@@ -2,11 +2,12 @@
 // machines whose GPU is missing or slow, and the reference of the evaluator on the GPU.
 
 import { Column } from "../decode/columns.js";
-import { anchorColumns } from "../decode/heads.js";
 import { Arena } from "./kernel.js";
 import { cellsOf, eachAttribute, GAUSSIAN_COLUMNS as COLUMNS, headsIn, levelOf } from "./level.js";
 import { MIN_OPACITY, SPATIAL, sliceAt } from "./level.js";
-/** @import { Deformation, Network, Scale, Scene } from "../decode/scene.js" */
+import { anchorColumns } from "./record.js";
+/** @import { Network } from "../decode/tensors.js" */
+/** @import { Deformation, Scale, Scene } from "../kinds/index.js" */
 
 /**
  * The visible Gaussians in ascending order of their slot, anchor · slots + i. records: [count, GAUSSIAN_COLUMNS], all
@@ -87,12 +88,13 @@ class Sampler {
   }
 }
 
-/** Spatial planes with their channels last, by scale: levels share scales. @type {WeakMap<object, Sampler[]>} */
+/** Spatial planes with their channels last, by the first of a scale: levels share planes.
+ * @type {WeakMap<object, Sampler[]>} */
 const transposed = new WeakMap();
 
 /** @param {Scale} planes */
 function spatialPlanes(planes) {
-  let samplers = transposed.get(planes);
+  let samplers = transposed.get(planes.xy);
   if (!samplers) {
     samplers = SPATIAL.map(([name]) => {
       const { data, channels, height, width } = planes[name];
@@ -101,7 +103,7 @@ function spatialPlanes(planes) {
       for (let c = 0; c < channels; c++) for (let i = 0; i < cells; i++) out[i * channels + c] = data[c * cells + i];
       return new Sampler(out, width, height, channels);
     });
-    transposed.set(planes, samplers);
+    transposed.set(planes.xy, samplers);
   }
   return samplers;
 }
@@ -119,7 +121,7 @@ class Field {
     this._channels = deformation.planes[0].xy.channels;
     this._width = this._channels * this._spatial.length;
     this._features = arena.take(BATCH * this._width);
-    this._trunk = new Chain(arena, deformation.networks.trunk, true);
+    this._trunk = new Chain(arena, deformation.trunk, true);
     this._stride = anchorColumns(scene.widths);
     this._heads = headsIn(deformation, scene).map(({ network, columns, unit }) => {
       return { chain: new Chain(arena, network), columns: Int32Array.from(columns), unit };

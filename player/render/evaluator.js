@@ -5,12 +5,13 @@
 // are evaluated further, when time or the camera's centre changes. Opacities and shapes that do not take the view
 // direction change with time alone.
 
-import { anchorColumns } from "../decode/heads.js";
 import { FieldPass } from "./field.js";
 import { blocksOf, Linear, pack, repeat, targets, TooLarge } from "./layers.js";
 import { eachAttribute, GAUSSIAN_COLUMNS, levelOf } from "./level.js";
+import { anchorColumns } from "./record.js";
 import { ANCHOR_BITS, NO_ENTRY } from "./sort.js";
-/** @import { Deformation, Network, Scene } from "../decode/scene.js" */
+/** @import { Network } from "../decode/tensors.js" */
+/** @import { Deformation, Scene } from "../kinds/index.js" */
 /** @import { Field, Gpu } from "./gl.js" */
 /** @import { List, Lister } from "./sort.js" */
 

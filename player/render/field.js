@@ -1,9 +1,10 @@
 // A deformation on the GPU: planes, trunk and heads at points that lie in a texture.
 
-import { anchorColumns } from "../decode/heads.js";
 import { blocksOf, Linear, repeat, targets, TooLarge } from "./layers.js";
 import { cellsOf, headsIn, sliceAt, SPATIAL } from "./level.js";
-/** @import { Deformation, Network, Scale, Scene } from "../decode/scene.js" */
+import { anchorColumns } from "./record.js";
+/** @import { Network } from "../decode/tensors.js" */
+/** @import { Deformation, Scale, Scene } from "../kinds/index.js" */
 /** @import { Field, Gpu } from "./gl.js" */
 
 /** Source of the functions that sample planes. */
@@ -33,7 +34,7 @@ export class FieldPass {
     const { channels } = deformation.planes[0].xy;
     this._scales = deformation.planes.length;
     this._channelBlocks = blocksOf(channels);
-    const { trunk } = deformation.networks;
+    const { trunk } = deformation;
     // a scale's channels are padded to whole blocks; so are the columns that take them
     const first = padInputs(trunk[0], channels, this._scales);
     const layers = [first, ...trunk.slice(1), joinHeads(deformation, scene)];

@@ -1,7 +1,7 @@
 // Linear layers over many rows, for evaluating without a GPU: in WebAssembly with vectors of four, and the same in
 // plain JavaScript for where a page's policy forbids the former.
 
-/** @import { Network } from "../decode/scene.js" */
+/** @import { Network } from "../decode/tensors.js" */
 
 /** Outputs that are summed up together: four vectors, so that no addition waits for the one before it. */
 const GROUP = 16;

@@ -2,7 +2,7 @@
 
 import { SceneSource } from "../decode/fetch.js";
 import { serve, tell } from "./remote.js";
-/** @import { Scene } from "../decode/scene.js" */
+/** @import { Scene } from "../kinds/index.js" */
 
 /** Between two messages about progress, milliseconds. */
 const PROGRESS_MS = 100;
@@ -13,7 +13,7 @@ const REST = 4;
  * A message while a scene loads. arrived and decoded: milliseconds since the epoch.
  *
  * @typedef {object} News
- * @property {import("../decode/scene.js").Scene} [scene]
+ * @property {import("../kinds/index.js").Scene} [scene]
  * @property {number} arrived when the last byte of the scene came
  * @property {number} decoded when it was decoded
  * @property {number} bytes

@@ -10,7 +10,8 @@ import { Pace } from "./pace.js";
 import { Painter } from "./painter.js";
 import { Remote } from "./remote.js";
 import { WORKERS } from "./workers.js";
-/** @import { Camera, Scene } from "../decode/scene.js" */
+/** @import { Camera } from "../decode/tensors.js" */
+/** @import { Scene } from "../kinds/index.js" */
 /** @import { Evaluated, Splats } from "./evaluator.js" */
 /** @import { State } from "./level.js" */
 
@@ -604,9 +605,9 @@ export class Player extends Clip {
   _draw(eyes, target) {
     const { camera, _painter: painter, _front: front } = this;
     if (!camera || !painter || !front) return false;
-    const { info } = front.state.scene;
+    const { scene, level } = front.state;
     const views = eyes ?? [fitted(camera, this.canvas.width, this.canvas.height, this.fit)];
-    painter.draw(front.splats, views, info.background, info.near, target);
+    painter.draw(front.splats, views, levelOf(scene, level).fill, scene.info.near, target);
     return true;
   }
 

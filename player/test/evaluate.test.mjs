@@ -77,10 +77,11 @@ for (const [name, key] of /** @type {[string, number][]} */ ([["least", 0], ["la
     const file = decode(readVector(`uncommon/key-instant-${name}`));
     const rows = file.rows.map(() => file.anchor.length / 3); // the levels have the same anchors
     const scene = { ...file, rows, mask: rows.map((count) => new Uint8Array(count).fill(255)) };
-    for (const { data } of scene.globalDeformation?.planes.flatMap((planes) => Object.values(planes)) ?? []) {
+    const motion = scene.motion[1];
+    for (const { data } of motion?.planes.flatMap((planes) => Object.values(planes)) ?? []) {
       data.set(numbers(data.length).map((v) => 1 + v)); // and layer 1 moves them
     }
-    scene.globalDeformation?.networks.trunk[0].bias.fill(1);
+    motion?.trunk[0].bias.fill(1);
     const [still, same, other] = [[0, 0.4], [1, key], [1, 0.4]].map(([level, t]) => {
       return evaluate(scene, level, t, [0, 0, -3]).records;
     });

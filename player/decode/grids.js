@@ -1,10 +1,11 @@
-// Clauses 8.6, 8.7 and 11.3: the planes section, and samples from its residuals.
+// Clauses 8.6, 8.7 and 11.3: grids in stages, and samples from their residuals.
 
-import { ByteReader } from "./bytes.js";
-import { channelsOf, decodeSplit, groupByClass } from "./channels.js";
+import { channelsOf, groupByClass } from "./channels.js";
 import { malformed } from "./errors.js";
 import { MAX_SYMBOL } from "./limits.js";
+/** @import { ChannelReader } from "./channels.js" */
 /** @import { PlaneShape } from "./parameters.js" */
+/** @import { Prior } from "./tables.js" */
 
 /** How many predictors 11.3 has. */
 export const PREDICTORS = 2;
@@ -14,55 +15,30 @@ const CLASSES = 8;
 const LOOKED_UP = 256;
 
 /**
- * The samples of each plane.
+ * The samples of each plane of all grids.
  *
- * @param {Uint8Array} bytes the section @param {PlaneShape[]} shapes at least one, of equally many channels
+ * @param {ChannelReader} reader @param {PlaneShape[]} shapes @param {Prior[]} priors see ChannelReader
  * @returns {Int32Array[]} [channels, height, width] each
  */
-export function decodePlanes(bytes, shapes) {
-  const { channels } = shapes[0];
-  const planes = shapes.map(({ height, width }) => new Int32Array(channels * height * width));
-  const all = planes.map((plane) => channelsOf(plane, channels));
-  const stages = readStages(new ByteReader(bytes), Math.max(1, 32 - Math.clz32(channels - 1)));
+export function decodePlanes(reader, shapes, priors) {
+  const planes = shapes.map(({ channels, height, width }) => new Int32Array(channels * height * width));
+  const all = planes.map((plane, i) => channelsOf(plane, shapes[i].channels));
   /** @type {Float64Array[]} */
-  const magnitudes = []; // sums over the stages before, per plane
-  stages.forEach((section, stage) => {
-    const first = stage ? 2 ** stage : 0;
-    const decoded = all.map((plane) => plane.slice(first, 2 ** (stage + 1)));
-    const groups = shapes.flatMap(({ height, width }, i) => {
-      const own = stage ? groupByActivity(sumOfNine(magnitudes[i], height, width)) : null;
-      return decoded[i].map(() => own);
+  const magnitudes = shapes.map(() => new Float64Array(0)); // sums over the stages before, per plane
+  const most = Math.max(0, ...shapes.map(({ channels }) => channels));
+  for (let first = 0, end = 2; first < most; first = end, end *= 2) {
+    shapes.forEach(({ channels, height, width }, i) => {
+      const stage = all[i].slice(first, end);
+      if (!stage.length) return;
+      const groups = first ? groupByActivity(sumOfNine(magnitudes[i], height, width)) : null;
+      for (const channel of stage) reader.fill(channel, priors, groups);
+      if (end >= channels) return;
+      if (!first) magnitudes[i] = new Float64Array(height * width);
+      for (const residuals of stage) addRelativeMagnitudes(residuals, magnitudes[i]);
     });
-    decodeSplit(section, decoded.flat(), groups);
-    if (stage + 1 === stages.length) return;
-    decoded.forEach((plane, i) => {
-      magnitudes[i] ??= new Float64Array(shapes[i].height * shapes[i].width);
-      for (const residuals of plane) addRelativeMagnitudes(residuals, magnitudes[i]);
-    });
-  });
+  }
   all.forEach((plane, i) => plane.forEach((channel) => restore(channel, shapes[i])));
   return planes;
-}
-
-/**
- * The stages: the lengths of all but the last, then their bytes, to the section's end.
- *
- * @param {ByteReader} reader @param {number} count
- * @returns {Uint8Array[]} [count]
- */
-function readStages(reader, count) {
-  const lengths = [];
-  let sum = 0;
-  for (let i = 1; i < count; i++) {
-    const length = reader.varint(reader.remaining, "the length of a stage");
-    lengths.push(length);
-    sum += length;
-  }
-  const rest = reader.rest();
-  if (sum > rest.length) throw malformed(`stages of ${sum} bytes or more, ${rest.length} bytes are left`);
-  let at = 0;
-  const stages = lengths.map((length) => rest.subarray(at, (at += length)));
-  return [...stages, rest.subarray(at)];
 }
 
 /** Adds the relative magnitude of each cell in one channel to `sums`. @param {Int32Array} residuals
