@@ -49,16 +49,14 @@ def limited(value, high, what, low=0):
     return value
 
 
-# 15 Errors and security: "UnsupportedFeature is an integer of whatever size and sign that is not a registered mode,
-# predictor or prior family"
+# 15 Errors and security: "an integer of whatever size and sign that is not a registered mode, predictor"
 def registered(value, what):
     need(type(value) is int, f"{what} is not an integer")
     need(value in (0, 1), f"{what} is {value}, which is not registered", "UnsupportedFeature")
     return value
 
 
-# 4 Canonical msgpack: "A list whose length this text gives as a range is LimitExceeded if it is longer. Any other list
-# of another length than stated is Malformed"
+# 4 Canonical msgpack: "A list whose length this text gives as a range is LimitExceeded if it is longer."
 def a_list(value, what, least, most=None):
     need(type(value) is list, f"{what}: expected a list")
     if most is None:
@@ -108,8 +106,7 @@ class Reader:
     def number(self, form):
         return struct.unpack(form, self.take(struct.calcsize(form)))[0]
 
-    # 7.1 Variable-length integers: "A varint holds seven bits per byte, least significant first; the high bit of a byte
-    # says that another follows. It takes at most 5 bytes and MUST be in the shortest form"
+    # 7.1 Variable-length integers: "It takes at most 5 bytes and MUST be in the shortest form"
     def varint(self, high):
         value = shift = 0
         while True:
@@ -121,7 +118,7 @@ class Reader:
             shift += 7
             need(shift < 35, "a varint of more than 5 bytes")
 
-    # 7.1 Variable-length integers: "A zigzag integer v is the varint 2v for v ≥ 0 and −2v − 1 for v < 0."
+    # 7.1 Variable-length integers: "2v for v ≥ 0 and −2v − 1 for v < 0"
     def zigzag(self, high):
         return unzigzag(self.varint(2 * high))
 
@@ -144,9 +141,7 @@ MSGPACK = {  # first byte: (kind, form of the number behind it, least bits of th
 }
 
 
-# 4 Canonical msgpack: "the shortest of positive fixint, uint 8, 16, 32, 64" "the shortest of negative fixint, int 8,
-# 16, 32, 64" "float 32, finite." "nil, float 64, ext and timestamp MUST NOT occur. Lists and maps are nested at most 4
-# deep, the outermost counted."
+# 4 Canonical msgpack: "No nil, float 64, ext and timestamp may occur." "float 32, finite."
 def msgpack(reader, depth=0):
     b = reader.number("B")
     if b < 0x80 or b >= 0xE0:
@@ -167,7 +162,7 @@ def msgpack(reader, depth=0):
     return size if kind == "int" else msgpack_items(reader, kind, size, depth)
 
 
-# 4 Canonical msgpack: "(well-formed UTF-8)" "keys are integers 0..2^32 − 1, ascending, each once"
+# 4 Canonical msgpack: "Lists and maps are nested at most 4 deep, the outermost counted."
 def msgpack_items(reader, kind, size, depth):
     if kind in ("bin", "str"):
         data = bytes(reader.take(size))
@@ -184,7 +179,7 @@ def msgpack_items(reader, kind, size, depth):
     return result
 
 
-# 4 Canonical msgpack: "No bytes follow the value."
+# 4 Canonical msgpack: "Any other form, and bytes behind the value, are Malformed."
 def unpack(data):
     reader = Reader(data)
     value = msgpack(reader)
@@ -192,8 +187,7 @@ def unpack(data):
     return value
 
 
-# 4 Canonical msgpack: "a key under 64 that this text does not define is an UnsupportedFeature; unknown keys from 64 on
-# MUST be ignored. A missing required key is Malformed"
+# 4 Canonical msgpack: "a key under 64 that this text does not define is an UnsupportedFeature"
 def fields(value, known, required, what):
     need(type(value) is dict, f"the {what} is not a map")
     unknown = [key for key in value if key not in known and key < 64]
@@ -203,8 +197,8 @@ def fields(value, known, required, what):
     return value
 
 
-# 3.3 Scene identity: "the first 8 bytes of the SHA-256 of the header from the end of its chunk list"
 # 3.1 Preamble: "It checks the signature, then the major version, then H against its limit, then the CRC-32."
+# 3.3 Scene identity: "the first 8 bytes of the SHA-256 of the header from the end of its chunk list"
 def read_preamble(data):
     need(SIGNATURE.startswith(data[:8]), "not a .pd4 file", "BadSignature")
     need(len(data) >= 20, "the file ends in the preamble", "Truncated")
@@ -221,8 +215,7 @@ def read_preamble(data):
     return fields_of, hashlib.sha256(reader.take(reader.left)).digest()[:8], 20 + size
 
 
-# 5.1 Header map: "The time at 1 MUST NOT precede the time at 0, the background MUST lie in 0..1, 0 ≤ near < far and
-# unit ≥ 0 MUST hold." "coding mode: 0 ans, 1 lzma; others UnsupportedFeature"
+# 5.1 Header map: "The time at 1 MUST NOT precede the time at 0, the background MUST lie in 0..1"
 # 5.5 Digest: "The first 16 bytes of the SHA-256 of the payloads of all critical chunks that were encoded together"
 def read_header(data):
     header = fields(unpack(data), range(1, 15), (1, 2, 3, 4, *range(6, 13), 14), "header")
@@ -244,8 +237,7 @@ def read_header(data):
     return header
 
 
-# 5.2 Chunk list: "The first type MUST be 0; the types of layers among all entries MUST NOT descend. In mode lzma each
-# of them occurs at most once."
+# 5.2 Chunk list: "The first type MUST be 0; the types of layers among all entries MUST NOT descend."
 def read_chunk_list(rows, mode):
     for row in a_list(rows, "the chunk list", 1, 1024):
         kind, size = a_list(row, "a chunk", 2)
@@ -257,14 +249,12 @@ def read_chunk_list(rows, mode):
     need(mode == 0 or len(layers) == len(set(layers)), "a layer in several slices in mode lzma")
 
 
-# 13.1 Kinds: "a list of 1..16 integers 0..65535: its number (17.1), then its parameters" "A decoder of tensors checks
-# this form and nothing else of a kind."
+# 13.1 Kinds: "A decoder of tensors checks this form and nothing else of a kind."
 def read_kind(value):
     integers(a_list(value, "a kind", 1, 16), 65535, "a number of a kind")
 
 
-# 5.4 Rows: "Each tensor is [id, C, Q] with an id 0..255, C = 1..256 channels and a step Q; ids ascend." "the sum of C
-# over the tensors, at most 512, else LimitExceeded"
+# 5.4 Rows: "Each tensor is [id, C, Q] with an id 0..255, C = 1..256 channels and a step Q; ids ascend."
 def read_rows(header):
     last = -1
     for tensor in a_list(header[4], "the rows", 1, 32):
@@ -277,6 +267,8 @@ def read_rows(header):
     integers(header["centres"], MAX_SYMBOL, "a centre", -MAX_SYMBOL)
 
 
+# 5.4 Rows: "ids ascend"
+# 6.3 Grids and chains: "Ids of grids ascend, and so do those of chains."
 def read_id(tensor, last):
     need(limited(tensor[0], 255, "an id") > last, f"id {tensor[0]} after {last}, expected ascending ids")
     return tensor[0]
@@ -291,11 +283,9 @@ def read_camera(value):
     integers([camera[3], camera[4]], 65535, "a side of the camera's image", 1)
 
 
-# 3.2 Chunks: "Type and length MUST equal those in the chunk list. Checks come in this order: L against its limit, L
-# against the list, presence of the whole chunk, CRC-32, reserved flags, type, scene id, flag bit 0 against the type"
-# 3.3 Scene identity: "Every chunk of a file, ancillary ones included, MUST carry it"
-# 3.4 Critical and ancillary chunks: "The chunk types of layers are critical: flag bit 0 MUST be zero there." "A
-# critical chunk that holds no layer is an UnsupportedFeature when a decoder reaches it"
+# 3.2 Chunks: "Type and length MUST equal those in the chunk list."
+# 3.3 Scene identity: "Every chunk of a file, ancillary ones included, MUST carry it."
+# 3.4 Critical and ancillary chunks: "The chunk types of layers are critical: flag bit 0 MUST be zero there."
 def read_chunk(data, at, kind, size, scene_id):
     need(len(data) >= at + 16, "the file ends in a chunk's head", "Truncated")
     found_kind, flags, found_size, found_id = struct.unpack_from("<HHI8s", data, at)
@@ -313,17 +303,7 @@ def read_chunk(data, at, kind, size, scene_id):
     return data[at + 16 : end], flags, end + 4
 
 
-# 3.6 Slices: "The slices of a layer are numbered from 0 in their order" "Bit 1 MUST be 1 if the next layer chunk in the
-# list is of the same layer, and 0 if it is of another one."
-def check_slice(flags, number, kind, following):
-    """following: the layers of the chunks behind it."""
-    need(flags >> 6 == number, f"slice {flags >> 6} of layer {kind}, expected {number}")
-    need(not following or (flags >> 1 & 1) == (following[0] == kind), f"flags {flags:#x} before layers {following}")
-
-
-# 6.1 Layout: "u32: length P of the layer parameters, ≤ 4096"
-# 8 Coded channels: "The first two begin with the priors that the earlier slices of the layer have defined in the same
-# list; the third begins empty."
+# 6.1 Layout: "u32: length P of the layer parameters, ≤ 4096" "A slice MUST use up its codes and its stream"
 class Layer:
     """One slice; the first becomes the whole layer (add_slice). cells: [(x, y, z)] of its rows; symbols: {name:
     [channel]} in the order of clause 12.4; tensors: {name: [float]}, every one a binary32 value."""
@@ -335,112 +315,143 @@ class Layer:
         self.priors = first.priors if first else ([], [])
         reader = Reader(payload)
         parameters = reader.take(limited(reader.number("<I"), 4096, "the parameters' length"))
-        codes = read_parameters(self, parameters, before[0])
+        codes = self.read_parameters(parameters, before[0])
         self.rises = 0 if first else before[0]
-        check_sizes(self, len(payload), before)
+        self.check_sizes(len(payload), before)
         codes, stream = Reader(reader.take(codes)), reader.take(reader.left)
-        self.cells, channels = (decode_lzma if header[2] else decode_ans)(self, codes, stream)
+        self.cells, channels = (self.decode_lzma if header[2] else self.decode_ans)(codes, stream)
         need(not codes.left, f"{codes.left} bytes after the last code")
-        self.symbols = name_channels(self, iter(channels))
+        self.symbols = self.name_channels(iter(channels))
+
+    # 6.2 Layer parameters: "Later slices have none of keys 4 to 6, else Malformed."
+    def read_parameters(self, data, rows_before):
+        """The length of the codes."""
+        parameters = fields(unpack(data), range(1, 7), (1, 2), "layer parameters")
+        self.rows = limited(parameters[1], (1 << 24) - rows_before, "own rows")
+        length = limited(parameters[2], MAX_LENGTH, "the length of the codes")
+        if 3 in parameters:
+            integers(a_list(parameters[3], "the fill", 3), 255, "a colour of the fill")
+        need(not (self.later and {4, 5, 6} & set(parameters)), "grids, chains or a kind in a later slice")
+        if 4 in parameters:
+            self.read_grids(parameters[4])
+        if 5 in parameters:
+            self.read_chains(parameters[5])
+        if 6 in parameters:
+            read_kind(parameters[6])
+        return length
+
+    # 6.3 Grids and chains: "one plane for each pair (i, j), i < j, in lexicographic order" "its columns follow side i"
+    def read_grids(self, value):
+        step, *grids = a_list(value, "the grids", 2, 17)
+        self.steps["plane"], last = a_step(step), -1
+        for grid in grids:
+            last = read_id(a_list(grid, "a grid", 4), last)
+            limited(grid[1], 256, "the number of channels", 1)
+            sides = integers(a_list(grid[2], "the sides", 1, 4), 4096, "a side", 1)
+            shapes = [(h, w) for i, w in enumerate(sides) for h in sides[i + 1 :]] or [(1, sides[0])]
+            for i, predictor in enumerate(a_list(grid[3], "the predictors", len(shapes))):
+                registered(predictor, "a predictor")
+                self.planes.append((f"plane.{last}.{i}", predictor, (grid[1], *shapes[i])))
+
+    # 6.3 Grids and chains: "Linear layer i, 1..m, has a weight [o_i, o_{i−1}] and a bias [o_i]."
+    def read_chains(self, value):
+        step, *chains = a_list(value, "the chains", 2, 65)
+        self.steps["weight"], last = a_step(step), -1
+        for chain in chains:
+            last = read_id(a_list(chain, "a chain", 3, 18), last)
+            widths = integers(chain[1:], 4096, "a width", 1)
+            for i, (inputs, outputs) in enumerate(zip(widths, widths[1:])):
+                self.weights += [(f"weight.{last}.{i}", outputs * inputs), (f"bias.{last}.{i}", outputs)]
+
+    # 6.5 Declared sizes: "c MUST NOT exceed 2^28, N MUST NOT exceed 2^13 + 2·B, and S MUST NOT exceed 2^22 + 256·B."
+    def check_sizes(self, payload_bytes, before):
+        samples = sum(c * h * w for _, _, (c, h, w) in self.planes)
+        need(samples <= 1 << 28, f"{samples} plane samples, limit 2^28", "LimitExceeded")
+        row = len(self.header["centres"]) + 4 + self.header["graded"]
+        self.count = self.rises + row * self.rows + samples + sum(size for _, size in self.weights)
+        self.declared = [a + b for a, b in zip(before, (self.rows, self.count, payload_bytes))]
+        rows, symbols, size = self.declared
+        need(rows <= (1 << 13) + 2 * size, f"{rows} rows", "LimitExceeded")
+        need(symbols <= (1 << 22) + 256 * size, f"{symbols} symbols", "LimitExceeded")
+
+    # 6.4 Channels: "In mode ans a slice codes the channels in this order:"
+    # 8 Coded channels: "one for item 1 of 6.4, one for items 2 to 5, one for items 6 and 7"
+    # 11.2 Rows: "A step class MUST lie in 0..6, else Malformed."
+    def decode_ans(self, codes, stream):
+        """The voxels and the channels of items 2 to 7, none split."""
+        n, graded = self.rows, self.header["graded"]
+        coder = Coder(codes, stream, self.count + (1 << (10 if self.later else 18)))
+        coder.priors = self.priors[0]
+        cells = coder.decode_positions(n) if n else []
+        coder.priors = self.priors[1]
+        channels = [coder.channel(size) for size in (self.rises, n, *[n] * graded)]
+        classes = ranged(channels[2], 0, 6, "a step class") if graded else []
+        channels += [
+            coder.split(classes, 7) if graded else coder.channel(n) for _ in range(len(self.header["centres"]))
+        ]
+        coder.priors = []
+        channels += coder.decode_grids([shape for _, _, shape in self.planes])
+        channels += [coder.channel(size) for _, size in self.weights]
+        coder.stream.finish()
+        return cells, channels
+
+    # 9.1 Channels and codes: "the symbol is base + v, which MUST lie in −K..K (8.2), else Malformed"
+    def decode_lzma(self, codes, stream):
+        """As decode_ans."""
+        n, graded = self.rows, self.header["graded"]
+        counts = [n, n, n, self.rises] + [n] * (1 + graded + len(self.header["centres"]))
+        counts += [h * w for _, _, (c, h, w) in self.planes for _ in range(c)] + [size for _, size in self.weights]
+        heads = [(codes.varint(8 * K + 3) if count else 0, count) for count in counts]
+        need(all(code & 3 < 3 for code, _ in heads), "a channel of 8-byte symbols")
+        size = sum(count << (code & 3) for code, count in heads)
+        reader = Reader(unpack_lzma(stream, size) if size or stream else b"")
+        channels = [
+            ranged(take_numbers(reader, count, code & 3, unzigzag(code >> 2)), -K, K, "a symbol")
+            for code, count in heads
+        ]
+        ranged(channels[5] if graded else [], 0, 6, "a step class")
+        return voxels_in_order(zip(*channels[:3])), channels[3:]
+
+    # 11.1 Masks: "Layer ℓ codes a rise 0..255 for each earlier row and a code 3..255 for each own row."
+    # 11.2 Rows: "Symbols of rows, plane samples (11.3), weights and biases MUST lie in −2^23..2^23, else Malformed."
+    def name_channels(self, channels):
+        symbols = {name: [ranged(next(channels), low, 255, name)] for name, low in (("rise", 0), ("own", 3))}
+        if self.header["graded"]:
+            symbols["class"] = [next(channels)]
+        symbols |= {f"row.{tensor}": [next(channels) for _ in range(width)] for tensor, width, _ in self.header[4]}
+        for name, predictor, (c, _, w) in self.planes:
+            symbols[name] = [restore(next(channels), predictor, w) for _ in range(c)]
+        symbols |= {name: [next(channels)] for name, _ in self.weights}
+        ranged((k for own in symbols.values() for channel in own for k in channel), -MAX_SYMBOL, MAX_SYMBOL, "a symbol")
+        return symbols
+
+    # 11.5 Dequantisation: "m + k·2^c MUST lie in −2^23..2^23, else Malformed."
+    def dequantise(self):
+        header, symbols = self.header, self.symbols
+        self.tensors = {"position": dequantise([v for cell in self.cells for v in cell], header[6])}
+        classes, centres = symbols.get("class", [[0] * self.rows])[0], iter(header["centres"])
+        for tensor, width, step in header[4]:  # [C, n] -> [n, C]
+            own = [next(centres) for _ in range(width)]
+            values = [m + (k << c) for row, c in zip(zip(*symbols[f"row.{tensor}"]), classes) for m, k in zip(own, row)]
+            need(all(abs(k) <= MAX_SYMBOL for k in values), "a value of a row over 2^23 steps")
+            self.tensors[f"row.{tensor}"] = dequantise(values, step)
+        for name, *_ in self.planes + self.weights:
+            step = self.steps["plane" if name.startswith("plane") else "weight"]
+            self.tensors[name] = dequantise([k for channel in symbols[name] for k in channel], step)
+
+    # 12.2 Prefixes: "sorted by the Morton code (10.1) of the voxel index less the minimum over these rows"
+    def add_slice(self, part):
+        """Makes `part` its last slice."""
+        cells = self.cells + part.cells
+        codes = [morton_code(cell) for cell in less_minimum(cells)]
+        order = sorted(range(len(cells)), key=codes.__getitem__)
+        for name in part.symbols.keys() - {"rise"}:
+            both = [a + b for a, b in zip(self.symbols[name], part.symbols[name])]
+            self.symbols[name] = [[channel[row] for row in order] for channel in both]
+        self.cells, self.rows, self.slices = [cells[row] for row in order], len(cells), self.slices + 1
 
 
-# 6.2 Layer parameters: "own rows n: 0..2^24 minus the rows of all slices before" "Later slices have none of keys 4 to
-# 6"
-def read_parameters(layer, data, rows_before):
-    """The length of the codes."""
-    parameters = fields(unpack(data), range(1, 7), (1, 2), "layer parameters")
-    layer.rows = limited(parameters[1], (1 << 24) - rows_before, "own rows")
-    length = limited(parameters[2], MAX_LENGTH, "the length of the codes")
-    if 3 in parameters:
-        integers(a_list(parameters[3], "the fill", 3), 255, "a colour of the fill")
-    need(not (layer.later and {4, 5, 6} & set(parameters)), "grids, chains or a kind in a later slice")
-    if 4 in parameters:
-        read_grids(layer, parameters[4])
-    if 5 in parameters:
-        read_chains(layer, parameters[5])
-    if 6 in parameters:
-        read_kind(parameters[6])
-    return length
-
-
-# 6.3 Grids and chains: "With a ≥ 2 sides it has one plane for each pair (i, j), i < j, in lexicographic order" "Plane
-# (i, j) is an array [C, H, W] with H = s_j and W = s_i" "With one side it has one plane [C, 1, s_0]."
-def read_grids(layer, value):
-    step, *grids = a_list(value, "the grids", 2, 17)
-    layer.steps["plane"], last = a_step(step), -1
-    for grid in grids:
-        last = read_id(a_list(grid, "a grid", 4), last)
-        limited(grid[1], 256, "the number of channels", 1)
-        sides = integers(a_list(grid[2], "the sides", 1, 4), 4096, "a side", 1)
-        shapes = [(h, w) for i, w in enumerate(sides) for h in sides[i + 1 :]] or [(1, sides[0])]
-        for i, predictor in enumerate(a_list(grid[3], "the predictors", len(shapes))):
-            registered(predictor, "a predictor")
-            layer.planes.append((f"plane.{last}.{i}", predictor, (grid[1], *shapes[i])))
-
-
-# 6.3 Grids and chains: "Linear layer i, 1..m, has a weight [o_i, o_{i−1}] and a bias [o_i]"
-def read_chains(layer, value):
-    step, *chains = a_list(value, "the chains", 2, 65)
-    layer.steps["weight"], last = a_step(step), -1
-    for chain in chains:
-        last = read_id(a_list(chain, "a chain", 3, 18), last)
-        widths = integers(chain[1:], 4096, "a width", 1)
-        for i, (inputs, outputs) in enumerate(zip(widths, widths[1:])):
-            layer.weights += [(f"weight.{last}.{i}", outputs * inputs), (f"bias.{last}.{i}", outputs)]
-
-
-# 6.5 Declared sizes: "let N, S and B be sums over this slice and all slices before it in the file" "c MUST NOT exceed
-# 2^28, N MUST NOT exceed 2^13 + 2·B, and S MUST NOT exceed 2^22 + 256·B."
-def check_sizes(layer, payload_bytes, before):
-    samples = sum(c * h * w for _, _, (c, h, w) in layer.planes)
-    need(samples <= 1 << 28, f"{samples} plane samples, limit 2^28", "LimitExceeded")
-    row = len(layer.header["centres"]) + 4 + (layer.header["graded"])
-    layer.count = layer.rises + row * layer.rows + samples + sum(size for _, size in layer.weights)
-    layer.declared = [a + b for a, b in zip(before, (layer.rows, layer.count, payload_bytes))]
-    rows, symbols, size = layer.declared
-    need(rows <= (1 << 13) + 2 * size, f"{rows} rows", "LimitExceeded")
-    need(symbols <= (1 << 22) + 256 * size, f"{symbols} symbols", "LimitExceeded")
-
-
-# 6.4 Channels: "the channels in this order"
-# 8 Coded channels: "one for item 1, one for items 2 to 5, one for items 6 and 7"
-def decode_ans(layer, codes, stream):
-    """The voxels and the channels of items 2 to 7, none split."""
-    n, graded = layer.rows, layer.header["graded"]
-    coder = Coder(codes, stream, layer.count + (1 << (10 if layer.later else 18)))
-    coder.priors = layer.priors[0]
-    cells = decode_positions(coder, n) if n else []
-    coder.priors = layer.priors[1]
-    channels = [coder.channel(size) for size in (layer.rises, n, *[n] * graded)]
-    classes = ranged(channels[2], 0, 6, "a step class") if graded else []
-    channels += [coder.split(classes, 7) if graded else coder.channel(n) for _ in range(len(layer.header["centres"]))]
-    coder.priors = []
-    channels += decode_grids(coder, [shape for _, _, shape in layer.planes])
-    channels += [coder.channel(size) for _, size in layer.weights]
-    coder.stream.finish()
-    return cells, channels
-
-
-# 11.1 Masks: "Layer ℓ codes a rise 0..255 for each earlier row and a code 3..255 for each own row."
-# 11.2 Rows: "Symbols of rows, plane samples (11.3), weights and biases MUST lie in −2^23..2^23, else Malformed."
-def name_channels(layer, channels):
-    symbols = {
-        "rise": [ranged(next(channels), 0, 255, "a rise")],
-        "own": [ranged(next(channels), 3, 255, "a mask code")],
-    }
-    if layer.header["graded"]:
-        symbols["class"] = [next(channels)]
-    symbols |= {f"row.{tensor}": [next(channels) for _ in range(width)] for tensor, width, _ in layer.header[4]}
-    for name, predictor, (c, _, w) in layer.planes:
-        symbols[name] = [restore(next(channels), predictor, w) for _ in range(c)]
-    symbols |= {name: [next(channels)] for name, _ in layer.weights}
-    for channel in (channel for own in symbols.values() for channel in own):
-        ranged(channel, -MAX_SYMBOL, MAX_SYMBOL, "a symbol")
-    return symbols
-
-
-# 11.3 Planes: "in row 0 N and NW are taken equal to W, in column 0 W and NW are taken equal to N, and at (0, 0) all
-# three are 0."
+# 11.3 Planes: "in row 0 N and NW are taken equal to W, in column 0 W and NW are taken equal to N"
 def restore(residuals, predictor, w):
     k = list(residuals)
     for at in range(len(k)):
@@ -452,8 +463,7 @@ def restore(residuals, predictor, w):
     return k
 
 
-# 7.3 NormTable: "T[i] = round(2^28 (Φ(i/32) − 1/2)) for i = 0..256, T[257] = T[256] = 2^27 M[j] = round(2^(31 − j/64))
-# for j = 0..63"
+# 7.3 NormTable: "T[257] = T[256] = 2^27 M[j] = round(2^(31 − j/64)) for j = 0..63"
 T = [round(2**27 * math.erf(i / (32 * math.sqrt(2)))) for i in range(257)]
 T.append(T[-1])
 M = [round(2 ** (31 - j / 64)) for j in range(64)]
@@ -474,14 +484,13 @@ def norm_cdf(n, mu8, si):
     return result
 
 
-# 7.3 NormTable: "and the table cum[q] = ((C(q−1) · (2^24 − 16·n)) >> 28) + 16·q for 0 < q < n."
+# 7.3 NormTable: "the table cum[q] = ((C(q−1) · (2^24 − 16·n)) >> 28) + 16·q for 0 < q < n"
 def table_of(cdf):
     n = len(cdf) + 1
     return [0, *(((c * (TOTAL - 16 * n)) >> 28) + 16 * q for q, c in enumerate(cdf, 1)), TOTAL]
 
 
-# 7.5 ANS streams: "A stream is a multiple of 4 bytes: u32 words in the order in which the decoder takes them. It may be
-# empty; its first word MUST NOT be 0."
+# 7.5 ANS streams: "A stream is a multiple of 4 bytes" "its first word MUST NOT be 0"
 class Ans:
     def __init__(self, data):
         need(len(data) % 4 == 0, "the ANS stream is not a multiple of 4 bytes")
@@ -495,8 +504,7 @@ class Ans:
             self.x = self.x << 32 | self.words[self.at]
             self.at += 1
 
-    # 7.5 ANS streams: "x = (x >> 24)·(cum[s+1] − cum[s]) + q − cum[s] if x < 2^32 and words are left: x = x·2^32 + next
-    # word"
+    # 7.5 ANS streams: "x = (x >> 24)·(cum[s+1] − cum[s]) + q − cum[s]"
     def take(self, count, cum):
         result = [0] * count
         for i in range(count if len(cum) > 2 else 0):
@@ -512,8 +520,7 @@ class Ans:
         need(self.x == 0 and self.at == len(self.words), "the ANS stream does not end in state 0")
 
 
-# 8.2 Priors: "In a window, kmin + n − 1 MUST NOT exceed K, else Malformed." "Of a normal, mu8 = g + 128·(n − 1) and si
-# = v − 640." "u8 weight 1..255 of the second"
+# 8.2 Priors: "kmin + n − 1 MUST NOT exceed K, else Malformed." "mu8 = g + 128·(n − 1) and si = v − 640"
 # 7.4 Mixture tables: "C(k) = ((256 − w)·C1(k) + w·C2(k)) >> 8"
 def read_prior(codes, family):
     """(kmin, n, cum) of clause 8.2."""
@@ -531,8 +538,7 @@ def read_prior(codes, family):
     return kmin, n, table_of(cdfs[0])
 
 
-# 8.3 Exceptions: "the symbol is kmin − 1 − (c >> 1) if c is odd, else kmin + n + (c >> 1)." "There MUST NOT be more
-# exceptions than symbols, the symbol MUST lie in −K..K and its position within the channel, else Malformed."
+# 8.3 Exceptions: "the symbol is kmin − 1 − (c >> 1) if c is odd, else kmin + n + (c >> 1)"
 def read_exceptions(codes, count, kmin, n):
     number = 1 + codes.varint(VARINT_MAX)
     most = min(count, codes.left // 2)
@@ -548,18 +554,21 @@ def read_exceptions(codes, count, kmin, n):
     return result
 
 
-# 8 Coded channels: "Each coded channel with at least one symbol reads its codes when it is reached, then its symbols"
+# 10.3 Channels: "an index into the ascending list of the bytes in which k bits are 1"
+PATTERNS = [[byte for byte in range(256) if bin(byte).count("1") == k] for k in range(9)]
+
+
+# 8 Coded channels: "Mode ans reads a slice with two cursors, one in the codes and one in the ANS stream."
 class Coder:
     """The two cursors of a slice, in its codes and its stream; priors: the prior list in use."""
 
     def __init__(self, codes, stream, most_entries):
         self.codes, self.stream, self.entries, self.priors = codes, Ans(stream), most_entries, []
 
-    # 8.1 Tokens: "a varint token, at most 2·(2^26 + 8); the parameters of a new prior (8.2), if any; its exceptions
-    # (8.3), if bit 0 of the token is set."
     # 8 Coded channels: "Channels of length 0 leave no trace."
-    # 8.4 Symbols: "the entries s of the prior's table. The symbol is kmin + s. Exceptions are then put in their
-    # places."
+    # 8.1 Tokens: "the prior F − 8 places before the last one of the prior list"
+    # 8.2 Priors: "The entries of all windows that a slice defines, n each, MUST NOT exceed the symbols that 6.5 counts"
+    # 8.4 Symbols: "The symbol is kmin + s. Exceptions are then put in their places."
     def channel(self, count):
         if count == 0:
             return []
@@ -576,30 +585,71 @@ class Coder:
         return [exceptions[at] if at in exceptions else kmin + next(inside) for at in range(count)]
 
     # 8.5 Rows by step class: "for each step class 0..6 in order, the symbols of the rows of that class, in row order"
-    # 8.6 Grids in stages: "one per class (8.7), ascending, each with the residuals of the cells of that class in
-    # row-major order."
+    # 8.6 Grids in stages: "one per class (8.7), ascending, each with the residuals of the cells of that class"
     def split(self, classes, class_count):
         parts = [iter(self.channel(classes.count(q))) for q in range(class_count)]
         return [next(parts[q]) for q in classes]
 
+    # 8.6 Grids in stages: "Stage 0 codes the channels 0 and 1 of each plane, stage s ≥ 1 the channels"
+    def decode_grids(self, shapes):
+        """The residuals, one list per plane and channel; shapes: (channels, height, width) of each plane."""
+        planes, first, end = [[] for _ in shapes], 0, 2
+        while any(c > first for c, _, _ in shapes):
+            for e, (c, h, w) in zip(planes, shapes):
+                classes = classes_by_activity(cell_activity(e, h, w)) if 0 < first < c else []
+                e += [self.split(classes, 8) if first else self.channel(h * w) for _ in range(first, min(end, c))]
+            first, end = end, 2 * end
+        return [channel for e in planes for channel in e]
 
-# 8.6 Grids in stages: "Stage 0 codes the channels 0 and 1 of each plane, stage s ≥ 1 the channels 2^s .. 2^(s+1) − 1,
-# as far as the plane has them." "A stage codes grid by grid, plane by plane, channel by channel." "In stage 0 each
-# channel is one coded channel"
-def decode_grids(coder, shapes):
-    """The residuals, one list per plane and channel; shapes: (channels, height, width) of each plane."""
-    planes, first, end = [[] for _ in shapes], 0, 2
-    while any(c > first for c, _, _ in shapes):
-        for e, (c, h, w) in zip(planes, shapes):
-            classes = classes_by_activity(cell_activity(e, h, w)) if 0 < first < c else []
-            e += [coder.split(classes, 8) if first else coder.channel(h * w) for _ in range(first, min(end, c))]
-        first, end = end, 2 * end
-    return [channel for e in planes for channel in e]
+    # 10.1 Head: "The smallest relative index along each axis MUST be 0, the largest along any axis MUST have R bits"
+    # 10.2 Counts: "Their sum MUST NOT exceed the number of nodes with more than one child, else Malformed."
+    def decode_positions(self, count):
+        codes = self.codes
+        low, depth = [codes.zigzag(MAX_VOXEL) for _ in range(3)], limited(codes.number("B"), 21, "the depth")
+        levels = read_levels(codes, depth, count)
+        sizes = [codes.varint(MAX_COUNT) for _ in range(2, 8)] if count > 1 else []
+        several = sum(nodes - single for nodes, single in levels)
+        need(sum(sizes) <= several, f"{sum(sizes)} nodes with 2 to 7 children, expected at most {several}")
+        nodes = self.grow(levels, count, sizes)
+        need(nodes == less_minimum(nodes), "no anchor at the minimum")
+        need(max(v for node in nodes for v in node).bit_length() == depth, "another depth than declared")
+        cells = [tuple(p + m for p, m in zip(node, low)) for node in nodes]
+        need(all(v <= MAX_VOXEL for cell in cells for v in cell), "a voxel index over 2^20")
+        return cells
+
+    # 10.3 Channels: "The numbers of children MUST agree with 10.2, else Malformed"
+    def grow(self, levels, count, sizes):
+        """The relative indices (x, y, z) of the anchors, in Morton order."""
+        steps, only_child = [], [False]
+        for (nodes, single), (after, _) in zip(levels, [*levels[1:], (count, 0)]):
+            children = [1] * nodes
+            if nodes < count:
+                only = sum(only_child)
+                of_one, of_more = self.indices_of(only, 8), self.indices_of(nodes - only, 8)
+                children = [1 + next(of_one if only else of_more) for only in only_child]
+                need(children.count(1) == single, f"{children.count(1)} nodes with one child, expected {single}")
+                need(sum(children) == after, f"{sum(children)} children, expected {after}")
+            only_child = [k == 1 for k in children for _ in range(k)]
+            steps.append((children, self.indices_of(single, 8)))
+        numbers = [k for children, _ in steps for k in children]
+        need(not sizes or sizes == [numbers.count(k) for k in range(2, 8)], "other numbers of children than stated")
+        indices = {k: self.indices_of(size, len(PATTERNS[k])) for k, size in enumerate(sizes, 2)} | {8: repeat(0)}
+        nodes = [(0, 0, 0)]
+        for children, indices[1] in steps:
+            patterns = [PATTERNS[k][next(indices[k])] for k in children]
+            nodes = [
+                tuple(2 * v + (child >> axis & 1) for axis, v in enumerate(node))
+                for node, pattern in zip(nodes, patterns)
+                for child in range(8)
+                if pattern >> child & 1
+            ]
+        return nodes
+
+    def indices_of(self, count, size):
+        return iter(ranged(self.channel(count), 0, size - 1, "a symbol of the octree"))
 
 
-# 8.6 Grids in stages: "The activity of cell (i, j), row i and column j, is the sum, over the nine cells (clip(i + a, 0,
-# H − 1), clip(j + b, 0, W − 1)) with a and b in −1..1, of their relative magnitudes (8.7) in the residuals of the
-# plane's channels in the stages before."
+# 8.6 Grids in stages: "over the nine cells (clip(i + a, 0, H − 1), clip(j + b, 0, W − 1)) with a and b in −1..1"
 def cell_activity(channels, h, w):
     magnitude = relative_magnitude(channels, h * w)
     rows = [[min(max(i + a, 0), h - 1) for a in (-1, 0, 1)] for i in range(h)]
@@ -607,7 +657,7 @@ def cell_activity(channels, h, w):
     return [sum(magnitude[i * w + j] for i in near_i for j in near_j) for near_i in rows for near_j in columns]
 
 
-# 8.7 Classes by activity: "Σ over channels c of (|e_c[p]| · 256·N) // (1 + s_c), s_c the sum over cells q of |e_c[q]|"
+# 8.7 Classes by activity: "(|e_c[p]| · 256·N) // (1 + s_c), s_c the sum over cells q of |e_c[q]|"
 def relative_magnitude(channels, n):
     """Of each of the n cells."""
     magnitude = [0] * n
@@ -617,30 +667,11 @@ def relative_magnitude(channels, n):
     return magnitude
 
 
-# 8.7 Classes by activity: "Let A be the activities of the cells in ascending order. The bounds are A[(i·N) // 8] for i
-# in 1 .. 7, and the class of a cell, 0..7, is the number of bounds that are at most its activity."
+# 8.7 Classes by activity: "the class of a cell, 0..7, is the number of bounds that are at most its activity"
 def classes_by_activity(activity):
     ascending = sorted(activity)
     bounds = [ascending[i * len(ascending) // 8] for i in range(1, 8)]
     return [bisect_right(bounds, value) for value in activity]
-
-
-# 9.1 Channels and codes: "a varint 4·z + w, at most 8·K + 3" "the symbol is base + v, which MUST lie in −K..K, else
-# Malformed." "If no channel has symbols, codes and stream are empty."
-def decode_lzma(layer, codes, stream):
-    """As decode_ans."""
-    n, graded = layer.rows, layer.header["graded"]
-    counts = [n, n, n, layer.rises] + [n] * (1 + graded + len(layer.header["centres"]))
-    counts += [h * w for _, _, (c, h, w) in layer.planes for _ in range(c)] + [size for _, size in layer.weights]
-    heads = [(codes.varint(8 * K + 3) if count else 0, count) for count in counts]
-    need(all(code & 3 < 3 for code, _ in heads), "a channel of 8-byte symbols")
-    size = sum(count << (code & 3) for code, count in heads)
-    reader = Reader(unpack_lzma(stream, size) if size or stream else b"")
-    channels = [
-        ranged(take_numbers(reader, count, code & 3, unzigzag(code >> 2)), -K, K, "a symbol") for code, count in heads
-    ]
-    ranged(channels[5] if graded else [], 0, 6, "a step class")
-    return voxels_in_order(zip(*channels[:3])), channels[3:]
 
 
 # 9.2 Byte planes: "Each channel's data are all least significant bytes first, then the next, and so on."
@@ -650,8 +681,7 @@ def take_numbers(reader, count, w, base):
     return [base + int.from_bytes(bytes(number), "little", signed=True) for number in zip(*planes)]
 
 
-# 9.4 Voxels: "A voxel index MUST lie in −2^20..2^20, two of a slice MUST NOT differ by more than 2^21 − 1 along an
-# axis, and the own rows MUST be in strictly ascending Morton order (10.1), else Malformed."
+# 9.4 Voxels: "the own rows MUST be in strictly ascending Morton order (10.1), else Malformed"
 def voxels_in_order(differences):
     cells, at = [], (0, 0, 0)
     for difference in differences:
@@ -671,7 +701,6 @@ def less_minimum(cells):
 
 
 # 10.1 Head: "bit 3i of the code is bit i of x, 3i + 1 of y, 3i + 2 of z"
-# 12.2 Prefixes: "These codes may take 66 bits."
 def morton_code(offset):
     return sum((v >> i & 1) << 3 * i + axis for axis, v in enumerate(offset) for i in range(22))
 
@@ -710,8 +739,7 @@ class Lzma:
         self.lc, self.lp, self.pb = properties % 9, properties // 9 % 5, properties // 45
         need(self.lc + self.lp <= 4, f"LZMA properties lc {self.lc}, lp {self.lp}")
 
-    # 9.3 LZMA2: "A match MUST NOT reach back over the dictionary's reset nor beyond its chunk." "Its first packed byte
-    # MUST be 0. After its last symbol and the normalisation that follows, the code MUST be 0"
+    # 9.3 LZMA2: "A match MUST NOT reach back over the dictionary's reset nor beyond its chunk."
     def unpack(self, data, out, start, end):
         """Appends the bytes of a chunk to `out`, up to `end`; the dictionary begins at `start`."""
         self.reader = Reader(data)
@@ -752,9 +780,7 @@ class Lzma:
         before = out[-1] if place else 0
         context = (place & (1 << self.lp) - 1) << self.lc | before >> 8 - self.lc
         symbol, expected = 1, out[-self.distances[0]] if self.state >= 7 else None
-        for place in reversed(
-            range(8)
-        ):  # behind a match: given the byte that would go on with it, as long as it is that
+        for place in reversed(range(8)):  # behind a match: as long as the byte is the one that would go on with it
             guess = None if expected is None else expected >> place & 1
             bit = self.bit("literal", context, guess, symbol)
             symbol, expected = symbol << 1 | bit, expected if bit == guess else None
@@ -805,32 +831,7 @@ class Lzma:
             self.range, self.code = self.range << 8, self.code << 8 | self.reader.number("B")
 
 
-# 10.3 Channels: "an index into the ascending list of the bytes in which k bits are 1"
-PATTERNS = [[byte for byte in range(256) if bin(byte).count("1") == k] for k in range(9)]
-
-
-# 10.1 Head: "three zigzag varints, the minimum of the voxel indices along x, y, z, each at most 2^20 in magnitude; then
-# a u8, the depth R, 0..21"
-# 10.2 Counts: "Then, if n > 1, six varints, at most 2^26 each: how many nodes of all levels have 2, 3, .. 7 children.
-# Their sum MUST NOT exceed the number of nodes with more than one child, else Malformed."
-def decode_positions(coder, count):
-    codes = coder.codes
-    low, depth = [codes.zigzag(MAX_VOXEL) for _ in range(3)], limited(codes.number("B"), 21, "the depth")
-    levels = read_levels(codes, depth, count)
-    sizes = [codes.varint(MAX_COUNT) for _ in range(2, 8)] if count > 1 else []
-    several = sum(nodes - single for nodes, single in levels)
-    need(sum(sizes) <= several, f"{sum(sizes)} nodes with 2 to 7 children, expected at most {several}")
-    nodes = grow(levels, coder, count, sizes)
-    need(nodes == less_minimum(nodes), "no anchor at the minimum")
-    need(max(v for node in nodes for v in node).bit_length() == depth, "another depth than declared")
-    cells = [tuple(p + m for p, m in zip(node, low)) for node in nodes]
-    need(all(v <= MAX_VOXEL for cell in cells for v in cell), "a voxel index over 2^20")
-    return cells
-
-
-# 10.2 Counts: "two varints, at most 2^26 each: s, the number of its nodes with one child, and e, the sum of (number of
-# children − 2) over its other nodes" "s ≤ N, e ≤ 6·(N − s) and 2·N − s + e ≤ n MUST hold, and after level 1 there MUST
-# be n nodes, else Malformed."
+# 10.2 Counts: "s ≤ N, e ≤ 6·(N − s) and 2·N − s + e ≤ n MUST hold, and after level 1 there MUST be n nodes"
 def read_levels(codes, depth, count):
     """Per level, from the root's on: (number of nodes, number of nodes with one child)."""
     levels, nodes = [], 1
@@ -846,44 +847,7 @@ def read_levels(codes, depth, count):
     return levels
 
 
-# 10.3 Channels: "if N < n, one channel of the numbers of children less 1 of the nodes whose parent has one child, then
-# one channel of the same numbers of the other nodes, the root included" "the child c of each node with one child" "The
-# numbers of children MUST agree with 10.2, else Malformed: at each level s of them are 1 and their sum is the number of
-# nodes of the next level, and over all levels as many are 2, 3, .. 7 as stated."
-def grow(levels, coder, count, sizes):
-    """The relative indices (x, y, z) of the anchors, in Morton order."""
-    steps, only_child = [], [False]
-    for (nodes, single), (after, _) in zip(levels, [*levels[1:], (count, 0)]):
-        children = [1] * nodes
-        if nodes < count:
-            only = sum(only_child)
-            of_one, of_more = indices_of(coder, only, 8), indices_of(coder, nodes - only, 8)
-            children = [1 + next(of_one if only else of_more) for only in only_child]
-            need(children.count(1) == single, f"{children.count(1)} nodes with one child, expected {single}")
-            need(sum(children) == after, f"{sum(children)} children, expected {after}")
-        only_child = [k == 1 for k in children for _ in range(k)]
-        steps.append((children, indices_of(coder, single, 8)))
-    numbers = [k for children, _ in steps for k in children]
-    need(not sizes or sizes == [numbers.count(k) for k in range(2, 8)], "other numbers of children than stated")
-    indices = {k: indices_of(coder, size, len(PATTERNS[k])) for k, size in enumerate(sizes, 2)} | {8: repeat(0)}
-    nodes = [(0, 0, 0)]
-    for children, indices[1] in steps:
-        patterns = [PATTERNS[k][next(indices[k])] for k in children]
-        nodes = [
-            tuple(2 * v + (child >> axis & 1) for axis, v in enumerate(node))
-            for node, pattern in zip(nodes, patterns)
-            for child in range(8)
-            if pattern >> child & 1
-        ]
-    return nodes
-
-
-def indices_of(coder, count, size):
-    return iter(ranged(coder.channel(count), 0, size - 1, "a symbol of the octree"))
-
-
-# 11.5 Dequantisation: "x̂ = binary32(binary64(k) · binary64(Q)): the product is exact, and the one rounding is to
-# nearest, ties to even."
+# 11.5 Dequantisation: "the product is exact, and the one rounding is to nearest, ties to even"
 def dequantise(symbols, step):
     products = [k * step for k in symbols]
     # From half a unit in the last place above the largest finite binary32 on, the rounding gives infinity.
@@ -891,52 +855,20 @@ def dequantise(symbols, step):
     return list(struct.unpack(f"<{len(products)}f", struct.pack(f"<{len(products)}f", *products)))
 
 
-# 11.5 Dequantisation: "For rows, k is replaced by m + k·2^c" "m + k·2^c MUST lie in −2^23..2^23, else Malformed." "An
-# anchor's position is dequantised from its voxel index with the voxel size as Q."
-def dequantise_layer(layer):
-    header, symbols = layer.header, layer.symbols
-    layer.tensors = {"position": dequantise([v for cell in layer.cells for v in cell], header[6])}
-    classes, centres = symbols.get("class", [[0] * layer.rows])[0], iter(header["centres"])
-    for tensor, width, step in header[4]:  # [C, n] -> [n, C]
-        own = [next(centres) for _ in range(width)]
-        values = [m + (k << c) for row, c in zip(zip(*symbols[f"row.{tensor}"]), classes) for m, k in zip(own, row)]
-        need(all(abs(k) <= MAX_SYMBOL for k in values), "a value of a row over 2^23 steps")
-        layer.tensors[f"row.{tensor}"] = dequantise(values, step)
-    for name, *_ in layer.planes + layer.weights:
-        layer.tensors[name] = dequantise(
-            [k for channel in symbols[name] for k in channel],
-            layer.steps["plane" if name.startswith("plane") else "weight"],
-        )
-
-
-# 12.2 Prefixes: "The rows of a layer are those of its decoded slices, sorted by the Morton code (10.1) of the voxel
-# index less the minimum over these rows."
-def add_slice(layer, part):
-    """Makes `part` the last slice of `layer`."""
-    cells = layer.cells + part.cells
-    codes = [morton_code(cell) for cell in less_minimum(cells)]
-    order = sorted(range(len(cells)), key=codes.__getitem__)
-    for name in part.symbols.keys() - {"rise"}:
-        both = [a + b for a, b in zip(layer.symbols[name], part.symbols[name])]
-        layer.symbols[name] = [[channel[row] for row in order] for channel in both]
-    layer.cells, layer.rows, layer.slices = [cells[row] for row in order], len(cells), layer.slices + 1
-
-
-# 12.1 Order: "For each layer chunk, check before the next chunk is read: parameters and their limits, the ranges of
-# 11.1 and 11.2, sums of mask codes, each voxel at most once over the slices so far, and dequantisation."
-# 11.1 Masks: "its code in the layer before in the file plus its rise, and MUST NOT exceed 255."
+# 11.1 Masks: "its code in the layer before in the file plus its rise, and MUST NOT exceed 255"
+# 12.1 Order: "sums of mask codes, each voxel at most once over the slices so far, and dequantisation"
 def finish_last(layers):
     codes = []
     for layer in layers:
         codes = [code + rise for code, rise in zip(codes, layer.symbols["rise"][0])] + layer.symbols["own"][0]
         need(not codes or max(codes) <= 255, "a mask code over 255")
     need(len({cell for layer in layers for cell in layer.cells}) == len(codes), "a voxel holds more than one anchor")
-    dequantise_layer(layers[-1])
+    layers[-1].dequantise()
 
 
-# 12.1 Order: "Read preamble and header, then the chunks in order." "A decoder of prefix ℓ stops after the last chunk of
-# a layer ≤ ℓ in the list and reads no further."
 # 3.2 Chunks: "Bytes after the last chunk make the file Malformed."
+# 3.6 Slices: "Bit 1 MUST be 1 if the next layer chunk in the list is of the same layer, and 0 if it is of another one."
+# 12.1 Order: "A decoder of prefix ℓ stops after the last chunk of a layer ≤ ℓ in the list and reads no further."
 def decode(data, max_layer=2):
     """The layers of a file's bytes, or of prefix max_layer, with cells, symbols and tensors."""
     header, scene_id, at = read_preamble(data)
@@ -946,10 +878,12 @@ def decode(data, max_layer=2):
         payload, flags, at = read_chunk(data, at, kind, size, scene_id)
         if kind < 3:
             first = layers[-1] if layers and layers[-1].number == kind else None
-            check_slice(flags, first.slices if first else 0, kind, [k for k, _ in chunks[i + 1 :] if k < 3])
+            number, after = first.slices if first else 0, [k for k, _ in chunks[i + 1 :] if k < 3]
+            need(flags >> 6 == number, f"slice {flags >> 6} of layer {kind}, expected {number}")
+            need(not after or (flags >> 1 & 1) == (after[0] == kind), f"flags {flags:#x} before layers {after}")
             read = Layer(kind, payload, header, declared, first)
             if first:
-                add_slice(first, read)
+                first.add_slice(read)
             else:
                 layers.append(read)
             finish_last(layers)
@@ -958,8 +892,7 @@ def decode(data, max_layer=2):
     return layers
 
 
-# 12.4 Hashes: "Conformance is tested with two SHA-256 digests per layer, of its decoded slices with the rows of 12.2,
-# printed in hexadecimal as a JSON list of {"layer", "symbols", "tensors"}."
+# 12.4 Hashes: "two SHA-256 digests per layer, of its decoded slices with the rows of 12.2"
 def hashes(data, max_layer=2):
     rows = []
     for layer in decode(data, max_layer):
@@ -974,16 +907,13 @@ def hashes(data, max_layer=2):
 
 def main(arguments):
     if len(arguments) != 1:
-        print("usage: refdec.py FILE", file=sys.stderr)
-        return 2
+        return "usage: refdec.py FILE"
     try:
         with open(arguments[0], "rb") as stream:
             data = stream.read()
         print(json.dumps(hashes(data)))
     except (Fault, OSError) as error:
-        print(f"refdec: {arguments[0]}: {error}", file=sys.stderr)
-        return 1
-    return 0
+        return f"refdec: {arguments[0]}: {error}"
 
 
 if __name__ == "__main__":
