@@ -4,9 +4,8 @@ import numpy as np
 import torch
 
 from pd4dgs_codec.entropy.fitting import entropy_bits
-from pd4dgs_codec.format.deformation import decorrelate
+from pd4dgs_codec.format.payload import Residuals
 from pd4dgs_codec.format.plan import plan
-from pd4dgs_codec.format.quantise import classes_of
 from pd4dgs_codec.model.rate import channel_moments, rate_bits
 
 
@@ -22,16 +21,16 @@ def train_rate_bits(scene):
     result = []
     for i, symbols in enumerate(found.symbols.layers):
         own = slice(rows[i], rows[i + 1])
-        classes = np.zeros(rows[-1], np.int32) if planned.grading is None else classes_of(planned)
+        classes = np.zeros(rows[-1], np.int32) if planned.grading is None else planned.grading.classes
         attributes = 0.0 if planned.grading is None else entropy_bits(classes[own])
         for c in np.unique(classes[own]).tolist():
             for name, rows_of in planned.attributes.items():
                 values = torch.from_numpy(rows_of[own][classes[own] == c]).double().flatten(1)
                 step = planned.steps.attributes[name] * 2.0**c
                 attributes += float(rate_bits(values, *channel_moments(values), step).sum())
-        coded = decorrelate(symbols.tensors, symbols.kind)
-        row = {"layer": float(symbols.kind.layer), "attributes": attributes}
-        row |= {"planes": gaussian_bits(coded.plane_channels), "weights": gaussian_bits(coded.weights)}
+        planes = [channel.ravel() for plane in Residuals.of(symbols.tensors).planes for channel in plane]
+        row = {"layer": float(symbols.layer), "attributes": attributes, "planes": gaussian_bits(planes)}
+        row["weights"] = gaussian_bits([array.ravel() for array in symbols.tensors.weights])
         result.append(row)
     return result
 

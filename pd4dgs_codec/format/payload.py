@@ -44,19 +44,19 @@ class Past(Generic[Known]):
 
 
 @dataclass(frozen=True, eq=False)
-class _Residuals:
+class Residuals:
     """Planes as they are coded. planes: int32 [C, H, W]. tables: with a predictor per plane."""
 
     planes: list[np.ndarray]
     tables: Tables
 
     @staticmethod
-    def of(tensors: Tensors) -> _Residuals:
+    def of(tensors: Tensors) -> Residuals:
         """Applies to each plane the predictor with the fewest estimated bits."""
         chosen = [choose_predictor(plane) for plane in tensors.planes]
         left = iter(predictor for predictor, *_ in chosen)
         grids = [replace(grid, predictors=tuple(next(left) for _ in grid.planes)) for grid in tensors.tables.grids]
-        return _Residuals([residuals for _, residuals, _ in chosen], replace(tensors.tables, grids=tuple(grids)))
+        return Residuals([residuals for _, residuals, _ in chosen], replace(tensors.tables, grids=tuple(grids)))
 
 
 # -- writing -----------------------------------------------------------------------------------------------------------
@@ -80,7 +80,7 @@ def write_slice(
 
     later: whether it is not the first slice of its layer. past: of the layer's earlier slices; it grows.
     """
-    coded = _Residuals.of(symbols.tensors)
+    coded = Residuals.of(symbols.tensors)
     write = _write_lzma if options.mode == "lzma" else _write_ans
     codes, stream, reports = write(symbols, coded, options, later, past or Past())
     head = pack_parameters(len(symbols.anchor_q), len(codes), symbols.fill, coded.tables)
@@ -88,7 +88,7 @@ def write_slice(
 
 
 def _write_ans(
-    symbols: LayerSymbols, coded: _Residuals, options: EncodeOptions, later: bool, past: Past[Fitted]
+    symbols: LayerSymbols, coded: Residuals, options: EncodeOptions, later: bool, past: Past[Fitted]
 ) -> tuple[bytes, bytes, list[StreamReport]]:
     writer = ChannelWriter(options.priors, options.effort, later)
     positions = encode_positions(symbols.anchor_q, writer, past.positions), 0.0
@@ -117,7 +117,7 @@ def by_class(rows: np.ndarray, classes: np.ndarray) -> Iterator[np.ndarray]:
 
 
 def _write_lzma(
-    symbols: LayerSymbols, coded: _Residuals, options: EncodeOptions, later: bool, past: Past[Fitted]
+    symbols: LayerSymbols, coded: Residuals, options: EncodeOptions, later: bool, past: Past[Fitted]
 ) -> tuple[bytes, bytes, list[StreamReport]]:
     """All channels in one group. Its rate leaves out positions and masks and splits rows by step class."""
     morton_codes(symbols.anchor_q)  # raises EncodeError for cells too far apart
