@@ -64,8 +64,8 @@ class Residuals:
 
 @dataclass(frozen=True)
 class StreamReport:
-    """A group of channels. payload_bits: by the tables, exact but for the rounding of the stream. rate_bits: sum of
-    R(a), the cost in the trainer's rate model; 0 for positions."""
+    """A group of channels. payload_bits: in codes and stream, but for its rounding to words. rate_bits: sum of R(a),
+    the cost in the trainer's rate model; 0 for positions."""
 
     name: str
     payload_bits: int
@@ -91,24 +91,26 @@ def _write_ans(
     symbols: LayerSymbols, coded: Residuals, options: EncodeOptions, later: bool, past: Past[Fitted]
 ) -> tuple[bytes, bytes, list[StreamReport]]:
     writer = ChannelWriter(options.priors, options.effort, later)
-    positions = encode_positions(symbols.anchor_q, writer, past.positions), 0.0
+    encode_positions(symbols.anchor_q, writer, past.positions)
     masks = writer.write([symbols.rises, symbols.codes], past.rows)
-    classes, _ = writer.write([symbols.classes], past.rows)
-    bits, rate = writer.write(list(by_class(symbols.rows, symbols.classes)), past.rows)
-    known, reports = list[Fitted](), list[StreamReport]()
+    writer.write([symbols.classes], past.rows)
+    rows = writer.write(list(by_class(symbols.rows, symbols.classes)), past.rows) + entropy_bits(symbols.classes)
+    known = list[Fitted]()
     planes = write_planes(coded.planes, writer, known)
     weights = writer.write([array.ravel() for array in symbols.tensors.weights], known)
-    for name, cost, arrays in (
-        ("positions", positions, [symbols.anchor_q]),
-        ("masks", masks, [symbols.rises, symbols.codes]),
-        ("attributes", (bits + classes, rate + entropy_bits(symbols.classes)), [symbols.classes, symbols.rows]),
-        ("planes", planes, coded.planes),
-        ("weights", weights, symbols.tensors.weights),
-    ):
-        count = sum(array.size for array in arrays)
-        if count or name == "positions":
-            reports.append(StreamReport(name, round(cost[0]), cost[1], count))
-    return bytes(writer.codes), writer.stream(), reports
+    codes, stream, bits = writer.finish()
+    groups = (
+        ("positions", bits[:1], 0.0, [symbols.anchor_q]),
+        ("masks", bits[1:2], masks, [symbols.rises, symbols.codes]),
+        ("attributes", bits[2:4], rows, [symbols.classes, symbols.rows]),
+        ("planes", bits[4:-1], planes, coded.planes),
+        ("weights", bits[-1:], weights, symbols.tensors.weights),
+    )
+    counts = [sum(array.size for array in arrays) for *_, arrays in groups]
+    reports = [
+        StreamReport(name, sum(own), rate, n) for (name, own, rate, _), n in zip(groups, counts, strict=True) if n
+    ]
+    return codes, stream, reports
 
 
 def by_class(rows: np.ndarray, classes: np.ndarray) -> Iterator[np.ndarray]:
