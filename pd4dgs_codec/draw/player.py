@@ -49,7 +49,7 @@ class Player:
     """
 
     def __init__(self, scene: Scene):
-        self.info, self.level = scene.info, scene.level
+        self.info, self.level, self.background = scene.info, scene.level, scene.background()
         codes = scene.mask[-1]
         self._mask = codes.astype(np.float32) * MASK_STEP
         self._anchor = np.ascontiguousarray(scene.anchor[: len(codes)], np.float32)
@@ -91,7 +91,7 @@ class Player:
         finite = np.isfinite(g.colors).all(axis=1)  # a colour that overflowed hides its Gaussian
         opacities, colors = np.where(finite, g.opacities, np.float32(0)), np.nan_to_num(g.colors)
         near = near_plane(self.info)
-        image, _ = draw(g.means, g.quats, g.scales, opacities, colors, camera, self.info.background, near_plane=near)
+        image, _ = draw(g.means, g.quats, g.scales, opacities, colors, camera, self.background, near_plane=near)
         picture: np.ndarray = np.clip(image, 0, 1)
         return picture
 
