@@ -98,6 +98,12 @@ class AnsDecoder:
         symbols: np.ndarray = self._coder.decode(model, count)
         return symbols
 
+    @property
+    def left(self) -> int:
+        """Number of bits not taken yet."""
+        bits: int = self._coder.num_valid_bits()
+        return bits
+
     def finish(self) -> None:
         """Raises Malformed unless exactly the stream's symbols have been taken: state 0 and no words left.
 

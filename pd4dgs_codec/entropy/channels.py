@@ -179,6 +179,11 @@ class ChannelReader:
             _take_channel(self._stream, known[index], exceptions, symbols[end - count : end])
         return symbols
 
+    @property
+    def bits(self) -> int:
+        """Bits read from codes and stream, up to a constant; the difference of two values is what lies between."""
+        return 8 * self.codes.offset - self._stream.left
+
     def finish(self) -> None:
         """Raises Malformed unless all codes and exactly the stream's symbols have been read."""
         if self.codes.remaining:

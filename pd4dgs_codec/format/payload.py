@@ -27,6 +27,10 @@ from pd4dgs_codec.format.tables import Declared, Parameters, Tables, Tensors, pa
 from pd4dgs_codec.morton import AXIS_BITS, MAX_VOXEL, morton_codes
 from pd4dgs_codec.scene import MASK_MIN_CODE, MAX_CLASS
 
+#: Groups of channels in reports, in coding order, and the one of mode lzma.
+GROUPS = ("positions", "masks", "attributes", "planes", "weights")
+LZMA_GROUP = "symbols"
+
 Known = TypeVar("Known", Prior, Fitted)
 
 
@@ -100,17 +104,17 @@ def _write_ans(
     weights = writer.write([array.ravel() for array in symbols.tensors.weights], known)
     codes, stream, bits = writer.finish()
     groups = (
-        ("positions", bits[:1], 0.0, [symbols.anchor_q]),
-        ("masks", bits[1:2], masks, [symbols.rises, symbols.codes]),
-        ("attributes", bits[2:4], rows, [symbols.classes, symbols.rows]),
-        ("planes", bits[4:-1], planes, coded.planes),
-        ("weights", bits[-1:], weights, symbols.tensors.weights),
+        (bits[:1], 0.0, [symbols.anchor_q]),
+        (bits[1:2], masks, [symbols.rises, symbols.codes]),
+        (bits[2:4], rows, [symbols.classes, symbols.rows]),
+        (bits[4:-1], planes, coded.planes),
+        (bits[-1:], weights, symbols.tensors.weights),
     )
-    counts = [sum(array.size for array in arrays) for *_, arrays in groups]
     reports = [
-        StreamReport(name, sum(own), rate, n) for (name, own, rate, _), n in zip(groups, counts, strict=True) if n
+        StreamReport(name, sum(own), rate, sum(array.size for array in arrays))
+        for name, (own, rate, arrays) in zip(GROUPS, groups, strict=True)
     ]
-    return codes, stream, reports
+    return codes, stream, [report for report in reports if report.symbols]
 
 
 def by_class(rows: np.ndarray, classes: np.ndarray) -> Iterator[np.ndarray]:
@@ -131,7 +135,7 @@ def _write_lzma(
     counted = [channel for channel in (*by_class(symbols.rows, symbols.classes), *rest) if channel.size]
     rate = sum(histogram(channel).rate_bits for channel in counted) + entropy_bits(symbols.classes)
     count = sum(channel.size for channel in channels)
-    return codes, stream, [StreamReport("symbols", 8 * (len(codes) + len(stream)), rate, count)]
+    return codes, stream, [StreamReport(LZMA_GROUP, 8 * (len(codes) + len(stream)), rate, count)]
 
 
 # -- reading -----------------------------------------------------------------------------------------------------------
@@ -171,23 +175,30 @@ def read_slice(
 def _read_ans(
     reader: ChannelReader, layer: int, table: RowTable, parameters: Parameters, past: Past[Prior]
 ) -> LayerSymbols:
-    n, tables = parameters.rows, parameters.tables
+    n, tables, marks = parameters.rows, parameters.tables, [reader.bits]
     anchor_q = decode_positions(reader, n, past.positions)
-    sizes = [parameters.rises, n, n if table.graded else 0]
-    rises, codes, classes = split(reader.read(sizes, past.rows), sizes)
-    if table.graded and n:
+    marks.append(reader.bits)
+    sizes = [parameters.rises, n]
+    rises, codes = split(reader.read(sizes, past.rows), sizes)
+    marks.append(reader.bits)
+    classes = reader.read([n] * table.graded, past.rows)
+    if classes.size:
         _check_classes(classes)
         places, rows = Places.by(classes, MAX_CLASS + 1), np.empty((table.channels, n), np.int32)
         places.put(reader.read(places.sizes * table.channels, past.rows), rows)
     else:
         rows = reader.read([n] * table.channels, past.rows).reshape(table.channels, n)
+    marks.append(reader.bits)
     known = list[Prior]()
     residuals = read_planes(reader, tables.planes, known)
+    marks.append(reader.bits)
     sizes = [math.prod(shape) for shape in tables.weights]
     weights = split(reader.read(sizes, known), sizes)
+    marks.append(reader.bits)
     reader.finish()
-    tensors = _tensors(tables, residuals, weights)
-    return LayerSymbols(layer, anchor_q, rises, codes, classes, rows, tensors, parameters.fill)
+    tensors, bits = _tensors(tables, residuals, weights), np.diff(marks).tolist()
+    spent = dict(zip(GROUPS, bits, strict=True))
+    return LayerSymbols(layer, anchor_q, rises, codes, classes, rows, tensors, parameters.fill, spent)
 
 
 def _read_lzma(
@@ -208,8 +219,8 @@ def _read_lzma(
         for first, end, shape in zip(ends, ends[1:], tables.planes, strict=False)
     ]
     tensors = _tensors(tables, residuals, weights)
-    graded = classes[0] if classes else NO_CLASSES
-    return LayerSymbols(layer, _voxels(steps), rises, own, graded, np.stack(rows), tensors, parameters.fill)
+    graded, spent = classes[0] if classes else NO_CLASSES, {LZMA_GROUP: 8 * (len(codes) + len(stream))}
+    return LayerSymbols(layer, _voxels(steps), rises, own, graded, np.stack(rows), tensors, parameters.fill, spent)
 
 
 def _voxels(steps: Sequence[np.ndarray]) -> np.ndarray:
