@@ -1,4 +1,4 @@
-"""`pd4dgs-bench`: error against run time of codec, renderer and trainer; numerical stability; latency."""
+"""`pd4dgs-bench`: error against run time of codec, renderer and trainer; latency."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pd4dgs_codec.cli import common, options
-from pd4dgs_codec.cli.common import FAILED, OK, STDIO, Console, UsageError, is_pd4, progress_bar, read_bytes, say
+from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError, is_pd4, progress_bar, read_bytes, say
 from pd4dgs_codec.errors import DataError, DecodeError, TrainError
 from pd4dgs_codec.format.options import MODES
 from pd4dgs_codec.io import temporary_folder
@@ -24,13 +24,12 @@ if TYPE_CHECKING:
 
 
 class Outcome(NamedTuple):
-    """The results of a report: JSON, Markdown, the plot with the label of its error axis, and a line per failure."""
+    """The results of a report: JSON, Markdown, the plot and the label of its error axis."""
 
     result: dict[str, Any]
     text: str
     panels: Sequence[Panel] = ()
     error: str = ""
-    failures: Sequence[str] = ()
 
 
 #: Why an option is refused for a file that is not rendered.
@@ -285,46 +284,6 @@ def _with_camera(name: str) -> bytes:
     return data
 
 
-# -- stability ---------------------------------------------------------------------------------------------------------
-
-STABILITY = """\
-Runs stiff and extreme cases through each numerical component. A case passes if its error is within its bound, and is
-refused if invalid input raised the documented error. References come from mpmath or float64. The exit code is 1 if any
-case fails.
-
-groups: rate, fitting, quantiser, masks, hexplane, deformation, rasteriser, training
-
-examples:
-  pd4dgs-bench stability > table.md
-  pd4dgs-bench stability --only rasteriser
-  pd4dgs-bench stability --only needle --json
-  pd4dgs-bench stability --json rows.json > table.md"""
-
-
-def _stability_options(p: options.Parser) -> None:
-    p.add_argument("--only", metavar="NAME", help="run the group NAME, or the cases with NAME in their name")
-
-
-def _stability(args: argparse.Namespace) -> Outcome:
-    from pd4dgs_codec.bench import stability
-
-    stability.mpmath()
-    cases = stability.chosen(args.only)
-    if not cases:
-        raise UsageError(f"--only: found {args.only!r}, expected a group or a part of a case's name")
-    rows = []
-    with progress_bar(len(cases), "cases", "stability") as step:
-        for case in cases:
-            rows.append(stability.run_case(*case))
-            step()
-    failures = [
-        "fail: {group}: {case}: {got}, error {error}, bound {bound}".format(**row)
-        for row in rows
-        if row["status"] == stability.FAIL
-    ]
-    return Outcome({"rows": rows, "counts": stability.counts(rows)}, stability.text(rows), failures=failures)
-
-
 # -- the command -------------------------------------------------------------------------------------------------------
 
 
@@ -346,9 +305,6 @@ REPORTS = {
     "latency": Report(
         "FILE...", "Measure the time to the image of each level.", LATENCY, _latency_options, _latency, False
     ),
-    "stability": Report(
-        "", "Test numerical stability in stiff and extreme cases.", STABILITY, _stability_options, _stability, False
-    ),
 }
 
 
@@ -366,7 +322,7 @@ def parser(name: str | None = None) -> options.Parser:
     lines = [f"  {name:<11} {report.summary}" for name, report in REPORTS.items()]
     examples = [f"  pd4dgs-bench {name} --help" for name in REPORTS]
     details = "\n".join(["REPORT is one of", *lines, "", "examples:", *examples])
-    summary = "Measure error against run time, numerical stability and latency."
+    summary = "Measure error against run time, and latency."
     p = options.Parser("bench", "REPORT", summary, details)
     p.add_argument("report", metavar="REPORT", choices=tuple(REPORTS), help="report to make, see below")
     p.add_common()
@@ -385,7 +341,7 @@ def _misplaced(args: argparse.Namespace, console: Console) -> int:
 
 
 def _report(execute: Callable[[argparse.Namespace], Outcome], args: argparse.Namespace, console: Console) -> int:
-    """Checks the outputs, makes the report and writes it. Returns FAILED if one of its rows failed."""
+    """Checks the outputs, makes the report and writes it."""
     from pd4dgs_codec.io import finite, whole_file
 
     console.json = args.json == STDIO
@@ -402,7 +358,5 @@ def _report(execute: Callable[[argparse.Namespace], Outcome], args: argparse.Nam
     if args.json not in (None, STDIO):
         text = json.dumps(finite(found.result), indent=1) + "\n"
         common.write_bytes(args.json, text.encode(), args.overwrite)
-    for line in found.failures:
-        say(line)
     console.result(found.result, found.text, on_stdout=True)
-    return FAILED if found.failures else OK
+    return OK

@@ -1,4 +1,4 @@
-"""R(a): sums, moments and the kernels beside the plain form; `pd4dgs-bench stability` holds it against mpmath."""
+"""R(a): sums, moments and the kernels beside the plain form; `tests/stability` holds it against mpmath."""
 
 import pytest
 import torch

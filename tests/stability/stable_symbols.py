@@ -11,9 +11,11 @@ from functools import cache
 
 import numpy as np
 import torch
+from mpmath import mp
+from promises import Found, Promise, largest, refusal
+from tiny import trained_like_scene
 from torch import Tensor
 
-from pd4dgs_codec.bench.stability import Found, Promise, largest, mpmath, refusal, small_scene
 from pd4dgs_codec.entropy import channels
 from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.errors import EncodeError
@@ -60,7 +62,6 @@ def _reference(dtype: torch.dtype, floored: bool) -> Tensor:
 
 
 def _exact(*stored: float) -> tuple[float, float, float, float]:
-    mp = mpmath()
     with mp.workdps(60):
         a, mu, sigma, step = (mp.mpf(x) for x in stored)
         d = abs(a - mu)
@@ -207,7 +208,7 @@ def _changed(step: float) -> Found:
 
 
 def _file_error_in_bounds(scale: float) -> Found:
-    scene = small_scene()
+    scene = trained_like_scene()
     decoded = decoder.decode(encoder.encode(scene, step_scale=scale, effort=1, omit="nothing"))
     order, back = np.lexsort(scene.anchor_q.T), np.lexsort(decoded.anchor_q.T)
     errors = {
@@ -218,7 +219,7 @@ def _file_error_in_bounds(scale: float) -> Found:
 
 
 def _encode_with(value: float) -> bytes:
-    scene = small_scene()
+    scene = trained_like_scene()
     offset = scene.offset.copy()
     offset[3, 2, 1] = value
     return encoder.encode(replace(scene, offset=offset))
@@ -228,7 +229,6 @@ def _encode_with(value: float) -> bytes:
 
 
 def _level_mask_error(values: Sequence[float]) -> Found:
-    mp = mpmath()
     logits = torch.tensor(list(itertools.product(values, repeat=3))).requires_grad_()
     levels = [networks.level_mask(logits, level) for level in range(3)]
     slopes = [torch.autograd.grad(mask.sum(), logits)[0] for mask in levels]
@@ -304,7 +304,7 @@ PROMISES = [
     Promise("quantiser", "every attribute within Q/2 and half a float32 unit", _file_error_in_bounds,
             [(f"a whole file at steps times {scale:.0e}", "a scene of 40 anchors, encoded and decoded", scale)
              for scale in (1e-3, 1.0, 1e30)], 1.0),
-    refusal("quantiser", EncodeError, lambda scale: encoder.encode(small_scene(), step_scale=scale),
+    refusal("quantiser", EncodeError, lambda scale: encoder.encode(trained_like_scene(), step_scale=scale),
             ("a whole file at steps times 1e-06", "weights of more than 2^23 steps; the limit is 2^23", 1e-6),
             ("a whole file at steps times 1e-38", "steps below binary32's normal range", 1e-38),
             ("a whole file at steps times 1e+40", "steps above binary32's range", 1e40)),
