@@ -236,11 +236,10 @@ def measure_export(run: Run, scene: Scene) -> list[Row]:
     """A row per kind of file, of one instant or of two frames a second."""
     file = run.packed(scene)
     rows: list[Row] = [{"scene": scene.name, "kind": "pd4, all instants and views", "bytes": file.stat().st_size}]
-    steps = ("--refine", 2, "--sh", 0) if run.quick else ()
     for kind, options in list(KINDS.items())[: 1 if run.quick else None]:
         output = file.with_name(f"exported.{kind}")
         compare = ("--compare", scene.source) if kind == "ply" else ()
-        found = command("export", file, "-o", output, "--to", kind, *options, *scene.data, *steps, *compare, "-f")
+        found = command("export", file, "-o", output, "--to", kind, *options, *scene.data, *compare, "-f")
         keys = ("frames", "gaussians", "bytes", "seconds", "cost")
         rows.append({"scene": scene.name, "kind": kind} | {key: found[key] for key in keys if key in found})
     return rows
@@ -256,7 +255,7 @@ def export_text(rows: Sequence[Row]) -> str:
         cells.append((row["scene"], row["kind"], *numbers, told))
     head = ("scene", "file", "frames", "Gaussians", "bytes", "s", "held-out mPSNR dB")
     return (
-        "`pd4dgs-export` with spherical harmonics of degree 3, refined on the training cameras. The last column "
+        "`pd4dgs-export` with spherical harmonics of degree 3, seen by the training cameras. The last column "
         f"compares the scene with exports at the instants of the held-out views.\n\n{table(head, cells)}"
     )
 
