@@ -31,6 +31,8 @@ from pd4dgs_codec.data.files import (
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.scene import Camera
 
+T = TypeVar("T")
+
 #: Frames per second of pictures that have numbers and no times.
 FPS = 30.0
 #: Largest |R Rᵀ - I| of a rotation, and | |q| - 1 | of a quaternion: files round to 3 or more decimals.
@@ -159,7 +161,7 @@ class Dataset:
         for view in self.train:
             digest.update(view.viewmat.tobytes() + view.K.tobytes())
             digest.update(repr((view.width, view.height, float(view.time))).encode())
-        for view in self.train[:: -(-len(self.train) // SAMPLED)]:
+        for view in thinned(self.train, SAMPLED):
             step = max(1, min(view.width, view.height) // PER_SIDE)
             digest.update(view.image[::step, ::step].tobytes())
         return digest.hexdigest()[:16]
@@ -224,6 +226,11 @@ def spread(views: Sequence[View], most: int) -> list[View]:
         allowed = np.where(far >= 0, uses[cameras], np.inf)
         picked.append(int(np.argmax(np.where(allowed == allowed.min(), far, -1))))
     return [views[i] for i in picked]
+
+
+def thinned(items: Sequence[T], most: int) -> Sequence[T]:
+    """Every k-th item from the first on, so that there are at most `most`."""
+    return items[:: max(1, -(-len(items) // most))]
 
 
 # -- lenses and poses --------------------------------------------------------------------------------------------------
@@ -413,7 +420,6 @@ def read_view(frame: UnreadView, time: float, downscale: int, under: Color | Non
 
 # -- datasets ----------------------------------------------------------------------------------------------------------
 
-T = TypeVar("T")
 Posed = TypeVar("Posed", UnreadView, View)
 
 

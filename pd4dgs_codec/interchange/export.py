@@ -18,13 +18,13 @@ from pd4dgs_codec.draw.gaussians import LEAST_NEAR, near_plane
 from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.interchange.splats import (
     Splats,
+    evenly,
     harmonics,
     looking,
     picture,
     principal_axes,
     quaternions,
     sphere,
-    spread,
     unit,
 )
 from pd4dgs_codec.quality.image import mpsnr
@@ -62,7 +62,7 @@ class Eyes:
 
 def eyes_of_cameras(cameras: Sequence[Camera]) -> Eyes:
     """Picks EYES cameras, evenly spaced in their order, or all if there are fewer. Their weights are equal."""
-    chosen = spread(cameras, EYES)
+    chosen = evenly(cameras, EYES)
     return Eyes(chosen, np.ones(len(chosen)))
 
 

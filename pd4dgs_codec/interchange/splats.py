@@ -120,7 +120,7 @@ def looking(eye: np.ndarray, ahead: np.ndarray, up: np.ndarray, like: Camera) ->
     return replace(like, viewmat=viewmat.astype(np.float32))
 
 
-def spread(items: Sequence[T], count: int) -> tuple[T, ...]:
+def evenly(items: Sequence[T], count: int) -> tuple[T, ...]:
     """Picks `count` items, evenly spaced in their order, or all if there are fewer."""
     rows = np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int))
     return tuple(items[i] for i in rows)
