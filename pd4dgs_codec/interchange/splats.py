@@ -51,6 +51,7 @@ TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 JSON, BINARY = 0x4E4F534A, 0x004E4942  #: types of chunks
 #: SPZ stores positions in 24 bits, 12 of them fractional: multiples of SPZ_STEP below SPZ_REACH, scene units.
 SPZ_STEP, SPZ_REACH = 1 / 4096, 2048.0
+SPZ_SCALE = float(np.exp(255 / 16 - 10))  #: the largest scale of an SPZ file, scene units
 #: SPZ's first bytes; most Gaussians, and least and most unpacked bytes of each: 16 in version 1, 65 with all harmonics,
 #: the rest for extensions.
 SPZ_MAGIC, SPZ_MOST, SPZ_LEAST, SPZ_BYTES = b"NGSP", 10_000_000, 16, 128
@@ -60,8 +61,14 @@ PACKED = b"\nproperty uint packed_position"  #: in the header of a compressed PL
 #: https://github.com/antimatter15/splat
 ROUNDED = 0.05  #: most difference of the length of such a quaternion from 1
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgb", "u1", 3), ("a", "u1"), ("quats", "u1", 4)])
-#: 4dgs files store harmonics from degree 1 on as bytes, for values from -SH_SPAN to SH_SPAN.
+#: 4dgs files store harmonics from degree 1 on as bytes, for values from -SH_SPAN to SH_SPAN; no byte stands for 0.
 SH_SPAN = 4.0
+SH_HALF_STEP = SH_SPAN / 255
+#: fourdgs rounds the instant at which a moving Gaussian is at its position to multiples of TICK seconds.
+TICK = 0.004
+#: What the numbers of our 4dgs files mean, and that no Gaussian fades.
+#: https://github.com/avala-ai/4dgs/blob/main/website/docs/spec/registry.md
+FOURDGS_METADATA = {"color_space": "srgb-rec709-display", "visibility_profile": "box"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -468,19 +475,22 @@ def spz_bytes(splats: Splats) -> bytes:
 def fourdgs_bytes(frames: Sequence[tuple[float, Splats, np.ndarray]], seconds: float) -> bytes:
     """Returns a .4dgs file of `seconds`. Each Gaussian is shown in its frame and moves to its slot in the next frame.
 
-    frames: (start in seconds, Gaussians, their slots int64 [N]), ascending from 0.
+    frames: (start in seconds, Gaussians, their slots int64 [N]), ascending from 0. Harmonics of the highest degrees are
+    left out if their bytes are farther from them than 0. Raises DataError.
     """
     fourdgs = required("fourdgs", EXTRA, ".4dgs files")
+    degree = max(_fourdgs_degree(splats) for _, splats, _ in frames)
     starts = [start for start, _, _ in frames]
     ends = [*starts[1:], seconds]
     parts: dict[str, list[np.ndarray]] = {}
     for i, (start, splats, slots) in enumerate(frames):
-        n, middle = len(slots), (start + ends[i]) / 2
+        n, middle = len(slots), TICK * round((start + ends[i]) / 2 / TICK)
         speed = np.zeros((n, 3), np.float32)
         if i + 1 < len(frames):
             _, later, later_slots = frames[i + 1]
             _, here, there = np.intersect1d(slots, later_slots, assume_unique=True, return_indices=True)
             speed[here] = (later.means[there] - splats.means[here]) / np.float32(ends[i] - start)
+        rest = replace(splats, sh=splats.sh[:, : (degree + 1) ** 2]).rest
         for name, values in {
             "positions": splats.means + speed * np.float32(middle - start),
             "scales": splats.scales,
@@ -491,16 +501,23 @@ def fourdgs_bytes(frames: Sequence[tuple[float, Splats, np.ndarray]], seconds: f
             "sigma_t": np.full(n, np.inf, np.float32),
             "win_lo": np.full(n, start),
             "win_hi": np.full(n, ends[i]),
-            "sh": np.clip(np.rint((splats.rest + SH_SPAN) * (255 / (2 * SH_SPAN))), 0, 255).astype(np.uint8),
+            "sh": np.clip(np.rint((rest + SH_SPAN) * (255 / (2 * SH_SPAN))), 0, 255).astype(np.uint8),
         }.items():
             parts.setdefault(name, []).append(values)
     columns: dict[str, Any] = {name: np.concatenate(values) for name, values in parts.items()}
-    degree = frames[0][1].degree
     if degree == 0:
         columns["sh"] = None
-    stream = io.BytesIO()
+    stream, options = io.BytesIO(), fourdgs.WriteOptions(metadata=FOURDGS_METADATA)
     try:
-        fourdgs.write(stream, fourdgs.GaussianSet(**columns, sh_degree=degree), seconds)
+        fourdgs.write(stream, fourdgs.GaussianSet(**columns, sh_degree=degree), seconds, options=options)
     except (fourdgs.FourdgsError, ValueError) as error:
-        raise DataError(f"fourdgs cannot write this file: {error}") from None
+        wide, scale = (float(x) for x in (np.ptp(columns["positions"], axis=0).max(), np.median(columns["scales"])))
+        found = f"Gaussians {wide:.3g} units apart, with a median scale of {scale:.3g}"
+        raise DataError(f"fourdgs cannot write {found}: {one_line(str(error), 160)}") from None
     return stream.getvalue()
+
+
+def _fourdgs_degree(splats: Splats) -> int:
+    """Returns the highest degree with a coefficient that a byte stands for better than 0 does."""
+    large = (np.abs(splats.sh[:, 1:]) > SH_HALF_STEP).any(axis=(0, 2))
+    return int(np.sqrt(large.nonzero()[0].max(initial=-1) + 1))
