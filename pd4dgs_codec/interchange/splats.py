@@ -57,6 +57,15 @@ SPZ_SCALE = float(np.exp(255 / 16 - 10))  #: the largest scale of an SPZ file, s
 SPZ_MAGIC, SPZ_MOST, SPZ_LEAST, SPZ_BYTES = b"NGSP", 10_000_000, 16, 128
 GZIP, ZIP, PICKLE = b"\x1f\x8b\x08", b"PK\3\4", b"\x80\x02\x8a"  #: first bytes of SPZ below version 4, of torch's files
 PACKED = b"\nproperty uint packed_position"  #: in the header of a compressed PLY
+KINDS = "a PLY, SPZ, .splat or .4dgs file or a checkpoint of gsplat"
+#: Files of Gaussians that are not read: the first bytes, bytes that are in them, and what they are. The first of a
+#: .ksplat file, which has no signature, are its version.
+#: https://github.com/mkkellogg/GaussianSplats3D/blob/main/src/loaders/SplatBuffer.js
+NOT_READ = (
+    (b"\0\1\0\0", bytes(2048), "a .ksplat file"),
+    (ZIP, b"means_l.webp", "a .sog file"),
+    (b"glTF", b"KHR_gaussian_splatting", "a glTF file"),
+)
 #: A row of a .splat file: linear scales, and as 0..255 sRGB, opacity and a quaternion wxyz around 128.
 #: https://github.com/antimatter15/splat
 ROUNDED = 0.05  #: most difference of the length of such a quaternion from 1
@@ -252,6 +261,9 @@ def read_splats(path: Path, raw: bytes | None = None) -> Splats:
     """Reads a PLY file of 3D Gaussian splatting, a compressed PLY, an SPZ or .splat file, or a checkpoint of gsplat,
     whatever its name. raw: its bytes, if known. Raises DataError."""
     raw = read_file(path) if raw is None else raw
+    for first, inside, kind in NOT_READ:
+        if raw.startswith(first) and inside in raw:
+            raise DataError(f"{path}: is {kind}, expected {KINDS}: convert it to PLY first")
     if raw.startswith((ZIP, PICKLE)):
         return _read_gsplat(path, raw)
     return checked(str(path), **activated(read_parameters(path, raw)))
@@ -301,8 +313,7 @@ def _splat_rows(path: Path, raw: bytes) -> dict[str, np.ndarray]:
     quats = (rows["quats"].astype(np.float32) - 128) / 128
     units = np.count_nonzero(np.abs(np.linalg.norm(quats, axis=1) - 1) < ROUNDED)
     if len(raw) % ROW.itemsize or 2 * units <= len(rows):
-        kinds = "a PLY, SPZ, .splat or .4dgs file or a checkpoint of gsplat"
-        raise DataError(f"{path}: begins with {raw[:8]!r} and is of no known kind, expected {kinds}")
+        raise DataError(f"{path}: begins with {raw[:8]!r} and is of no known kind, expected {KINDS}")
     with np.errstate(divide="ignore", invalid="ignore"):
         opacities, scales = rows["a"] / np.float32(255), np.log(rows["scales"])
         return {

@@ -116,7 +116,7 @@ REFUSED = {
     "list_in_vertex.ply": "unknown vertex property 'list uchar int neighbours', expected a scalar",
     "empty.ply": "none of 0 Gaussians is finite",
     "cut.ply": "40600 bytes of vertices, expected 41600",
-    "packed.ksplat": "is of no known kind, expected a PLY, SPZ, .splat or .4dgs file or a checkpoint of gsplat",
+    "packed.ksplat": "is a .ksplat file, expected a PLY, SPZ, .splat or .4dgs file or a checkpoint of gsplat",
 }
 DEGREE_0 = {"degree0.ply", "rgb.ply", "packed.splat"}
 
