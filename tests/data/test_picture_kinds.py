@@ -10,7 +10,7 @@ import pytest
 from PIL import Image, ImageCms
 from PIL.PngImagePlugin import PngInfo
 
-from pd4dgs_codec.data.files import read_image
+from pd4dgs_codec.data.files import read_image, read_mask
 from pd4dgs_codec.errors import DataError
 
 RAMP = np.arange(256, dtype=np.uint8).reshape(16, 16)
@@ -155,3 +155,17 @@ def test_refused_kinds(tmp_path, name):
     with pytest.raises(DataError, match=f"{name}: .*{says}") as caught:
         read_image(tmp_path / name, (16, 16))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("compression", ["tiff_lzw", "tiff_adobe_deflate"])
+def test_a_damaged_tiff_is_one_line_and_none_of_libtiff(tmp_path, compression, capfd):
+    stream, path = io.BytesIO(), tmp_path / "a.tif"
+    Image.fromarray(COLOUR).save(stream, "tiff", compression=compression)
+    raw = bytearray(stream.getvalue())
+    raw[12:20] = b"\xff" * 8  # the pixels start at 8
+    path.write_bytes(raw)
+    for read in (read_image, read_mask):
+        with pytest.raises(DataError, match="(image|mask) data is broken: ") as caught:
+            read(path, (16, 16))
+        assert "\n" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")
