@@ -130,8 +130,8 @@ def page(source: bytes | str | None = None, about: bytes | None = None, still: S
     """Returns the player as one HTML file.
 
     source: the bytes of a `.pd4` to embed, or its URL, whatever `?src=` says; None: `scene.pd4` beside the page, or the
-    page's `?src=address`. about: bytes of a `.pd4` whose metadata name the page; default: those that are embedded. still:
-    shown before any script has arrived.
+    page's `?src=address`. about: bytes of a `.pd4` whose metadata name the page; default: those that are embedded.
+    still: shown before any script has arrived.
     """
     root = player_folder()
     code = bundle(root, SCRIPT, *(f"render/{name}" for name in WORKERS), start=ENTRY)
