@@ -190,6 +190,7 @@ def serving(file: Path) -> Iterator[str]:
         exec(compile(text, "server.py", "exec"), module)
     with ThreadingHTTPServer(("127.0.0.1", 0), module["H"]) as served:
         served.daemon_threads = True
+        served.handle_error = lambda *_: None  # of clients that have left
         threading.Thread(target=served.serve_forever, daemon=True).start()
         yield f"http://127.0.0.1:{served.server_port}"
         served.shutdown()
