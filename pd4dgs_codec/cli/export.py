@@ -151,22 +151,27 @@ def _write_still(args: argparse.Namespace, player: Player, eyes: Eyes) -> dict[s
     import numpy as np
 
     from pd4dgs_codec.interchange.export import UNTURNED, bake, upright
-    from pd4dgs_codec.interchange.splats import SPZ_STEP, glb_bytes, ply_bytes, spz_bytes
+    from pd4dgs_codec.interchange.splats import SPZ_SCALE, SPZ_STEP, glb_bytes, ply_bytes, spz_bytes
 
     turn = upright(player.info.up) if args.to in ("glb", "spz") else UNTURNED
-    splats = _scaled(bake(player, args.time, eyes, args.sh, turn)[0], args)
-    if args.to == "spz" and (size := float(np.median(splats.scales.max(axis=1)))) < 4 * SPZ_STEP:
+    splats, _ = bake(player, args.time, eyes, args.sh, turn)
+    _check_some(len(splats.means), args)
+    splats, sizes = splats.scaled(args.scale), args.scale * splats.scales.max(axis=1)
+    if args.to == "spz" and (size := float(np.median(sizes))) < 4 * SPZ_STEP:
         what = f"half of the Gaussians are smaller than {size:.2g} units, and SPZ rounds positions to {SPZ_STEP:.2g}"
         say(f"pd4dgs-export: warning: {what}; --scale enlarges the scene")
+    if args.to == "spz" and (count := np.count_nonzero(sizes > SPZ_SCALE)):
+        what = f"{count:,} Gaussians are larger than {SPZ_SCALE:.0f} units, to which SPZ shrinks them"
+        say(f"pd4dgs-export: warning: {what}; --scale below 1 keeps their size")
     data = {"ply": ply_bytes, "spz": spz_bytes, "glb": glb_bytes}[args.to](splats)
     common.write_bytes(args.output, data, args.overwrite)
     return {"frames": 1, "gaussians": len(splats.means), "bytes": len(data), "time": args.time}
 
 
-def _scaled(splats: Splats, args: argparse.Namespace) -> Splats:
-    if not len(splats.means):
-        raise DataError(f"{args.input}: has no visible Gaussians at this level and time, expected some")
-    return splats.scaled(args.scale)
+def _check_some(count: int, args: argparse.Namespace) -> None:
+    if not count:
+        when = "any time" if args.to in SEQUENCES else "this time"
+        raise DataError(f"{args.input}: has no visible Gaussians at this level and {when}, expected some")
 
 
 def frame_times(info: SceneInfo, fps: float) -> list[float]:
@@ -192,16 +197,17 @@ def _write_sequence(args: argparse.Namespace, player: Player, eyes: Eyes) -> dic
         for seconds in starts:
             t = min(seconds / (stop - start), 1.0) if stop > start else 0.0
             splats, slots = bake(player, t, eyes, args.sh)
-            yield seconds, _scaled(splats, args), slots
+            yield seconds, splats.scaled(args.scale), slots
             step()
 
     with progress_bar(len(starts), "frames", "exporting") as step:
         if args.to == "ply-seq":
             return _write_folder(args, len(starts), (splats for _, splats, _ in frames(step)))
         kept = list(frames(step))
+        _check_some(most := max(len(slots) for _, _, slots in kept), args)
         data = fourdgs_bytes(kept, starts[-1] + 1 / args.fps)
         common.write_bytes(args.output, data, args.overwrite)
-        return {"frames": len(starts), "gaussians": max(len(g.means) for _, g, _ in kept), "bytes": len(data)}
+        return {"frames": len(starts), "gaussians": most, "bytes": len(data)}
 
 
 def _write_folder(args: argparse.Namespace, count: int, frames: Iterator[Splats]) -> dict[str, Any]:
@@ -214,6 +220,7 @@ def _write_folder(args: argparse.Namespace, count: int, frames: Iterator[Splats]
             data = ply_bytes(splats)
             temporary.write_bytes(data)
             most, total = max(most, len(splats.means)), total + len(data)
+        _check_some(most, args)
     for other in set(folder.glob("*.ply")) - {Path(name) for name in names}:
         other.unlink()
     return {"frames": count, "gaussians": most, "bytes": total}

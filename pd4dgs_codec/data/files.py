@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import functools
+import importlib
 import io
 import json
 import os
@@ -295,7 +298,16 @@ def _open(path: Path, *, header_only: bool = False) -> Picture:
         if jpeg and (scans := path.read_bytes().count(SCAN)) > MAX_SCANS:
             raise DataError(f"{path}: {scans:,} scans, expected {MAX_SCANS} at most in a JPEG")
         refused.pop_all()
+    if picture.format == "TIFF":
+        _silence_libtiff()
     return picture
+
+
+@functools.cache
+def _silence_libtiff() -> None:
+    """Stops libtiff from printing what is wrong with a picture, which Pillow also raises."""
+    with contextlib.suppress(AttributeError, OSError):  # some builds of Pillow do not show the libraries they contain
+        ctypes.CDLL(importlib.import_module("PIL._imaging").__file__).TIFFSetErrorHandler(None)
 
 
 def image_info(path: Path, *, upright: bool = False) -> tuple[int, int, bool]:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import pytest
+from tiny import sighted
 
 from pd4dgs_codec.cli.export import frame_times
 from pd4dgs_codec.errors import DataError
@@ -49,6 +50,32 @@ def test_the_whole_time_as_a_folder_of_plys(cli, scene_pd4, tmp_path):
     assert again.code == 1 and "contains PLY files already" in again.err
     assert cli(*command, "--fps", 1, "-f").code == 0
     assert sorted(path.name for path in out.iterdir()) == ["00000.ply", "00001.ply", "00002.ply"]
+
+
+def faint(scene, bias: float):
+    """The scene with lower opacities."""
+    *rest, (weight, offset) = scene.networks["opacity"]
+    return sighted(replace(scene, networks=scene.networks | {"opacity": (*rest, (weight, offset - bias))}))
+
+
+def test_a_frame_may_be_empty_but_not_all(cli, scene, tmp_path):
+    fourdgs = pytest.importorskip("fourdgs")
+    file, frames, moving = tmp_path / "scene.pd4", tmp_path / "frames", tmp_path / "scene.4dgs"
+    file.write_bytes(encode(faint(scene, 2.8), effort=1))
+    seen = [1, 0, 1, 1, 1]
+    for out, kind in ((frames, "ply-seq"), (moving, "4dgs")):
+        result = cli("export", file, "-o", out, "--to", kind, "--fps", 2, "--sh", 1, "--json")
+        assert result.code == 0 and result.json["frames"] == 5 and result.json["gaussians"] == 1, result.err
+    assert [_count(path) for path in sorted(frames.iterdir())] == seen
+    state_at = fourdgs.read(moving.read_bytes()).state_at
+    assert [len(state_at(i / 2)["indices"]) for i in range(5)] == seen
+
+    result = cli("export", file, "-o", tmp_path / "a.ply", "--time", 0.25)
+    assert result.code == 1 and "has no visible Gaussians at this level and this time, expected some" in result.err
+    file.write_bytes(encode(faint(scene, 9), effort=1))
+    for kind in ("ply-seq", "4dgs"):
+        result = cli("export", file, "-o", tmp_path / "none", "--to", kind, "--fps", 2)
+        assert result.code == 1 and "at this level and any time" in result.err and not (tmp_path / "none").exists()
 
 
 def test_the_number_of_frames_is_limited(scene):
