@@ -1,4 +1,4 @@
-"""Quantiser, masks and the table of rows; refusals and ends of ranges are rows of `pd4dgs-bench stability`."""
+"""Quantiser, masks and the table of rows; refusals and ends of ranges are rows of `tests/stability`."""
 
 import numpy as np
 import pytest

@@ -12,37 +12,37 @@ from typing import Any
 
 import numpy as np
 import torch
+from promises import Found, Promise, largest, refusal
+from tiny import TINY, camera_ahead, trained_like_scene
 from torch import Tensor
 
-from pd4dgs_codec.bench.stability import BOX, CAMERA, HEIGHT, WIDTH, Found, Promise, largest, refusal, small_scene
 from pd4dgs_codec.draw.gaussians import near_plane
 from pd4dgs_codec.draw.hexplane import Field
 from pd4dgs_codec.errors import EncodeError, NotFinite, RenderError
 from pd4dgs_codec.format import decoder, encoder
 from pd4dgs_codec.interchange.teacher import load_source
 from pd4dgs_codec.model import checkpoint, hexplane
-from pd4dgs_codec.model.config import DeformationConfig, ModelConfig
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model, from_scene, to_scene
 from pd4dgs_codec.model.picture import rasterization, render
-from pd4dgs_codec.scene import PLANES, Camera, Deformation, Network, deformation_unit, plane_shapes
+from pd4dgs_codec.scene import PLANES, Camera, Deformation, Network, Scene, deformation_unit, plane_shapes
 from pd4dgs_codec.train.config import LearningRates, TrainConfig
 from pd4dgs_codec.train.loop import Trainer
 
+BOX = np.array([[-1, -1, -1], [1, 1, 1]], np.float32)
 FLOAT32 = 1e-5  #: of the largest value: the float32 error of six lookups, their product and two layers
 NAN, INF = math.nan, math.inf
 
 
 @torch.no_grad()
-def picture_error(model: Model, level: int, t: float, camera: Camera = CAMERA) -> float:
+def picture_error(model: Model, level: int, t: float, camera: Camera) -> float:
     """Returns the largest difference of any channel between the float32 image and the float64 reference's image of the
     same Gaussians; NaN if the float32 image is not finite."""
     picture = render(model, level, t, camera)
     g, near = picture.gaussians, near_plane(model.info)
     drawn = g.colors.isfinite().all(1)
-    splats: Any = [a[drawn] for a in (g.means, g.quats, g.scales, g.opacities, g.colors)]
-    view: Any = (camera, model.info.background)
-    expected, _, _ = rasterization(*splats, *view, near_plane=near, backend="reference")
+    splats = [a[drawn] for a in (g.means, g.quats, g.scales, g.opacities, g.colors)]
+    expected, _, _ = rasterization(*splats, camera, model.info.background, near_plane=near, backend="reference")
     return float((picture.image.double() - expected).abs().max())
 
 
@@ -150,9 +150,14 @@ def _residual_error(field: Deformation, times: Sequence[float]) -> Found:
 
 
 def _file_pictures(field: Deformation, times: Sequence[float]) -> Found:
-    data = encoder.encode(small_scene(field), effort=1)
+    data = encoder.encode(_moved_by(field), effort=1)
     model = from_scene(decoder.decode(data))
-    return f"{len(data):,} bytes, {len(times)} images", largest(picture_error(model, 1, t) for t in times)
+    errors = [picture_error(model, 1, t, camera_ahead()) for t in times]
+    return f"{len(data):,} bytes, {len(times)} images", largest(errors)
+
+
+def _moved_by(field: Deformation) -> Scene:
+    return replace(trained_like_scene().prefix(1), global_deformation=field)
 
 
 _ROW = np.arange(12)[:, None] * np.ones(6)  #: of time
@@ -171,7 +176,7 @@ FIELDS: list[tuple[str, str, Deformation, Sequence[float]]] = [
 # -- rasteriser --------------------------------------------------------------------------------------------------------
 
 NAMES = ("means", "quats", "scales", "opacities", "colors")
-NEAR = 0.01
+WIDTH, HEIGHT, NEAR = 40, 30, 0.01
 #: Bound of the relative errors of the image and of each gradient, in the norm; the kernels compute in float32.
 BOUND = 1e-4
 
@@ -209,9 +214,8 @@ def _draw(
     tensors: list[Tensor], camera: Camera | None = None, background: Sequence[float] = (0.0,) * 3, backend: str = "cpu"
 ) -> dict[str, Tensor]:
     """Returns the image, its alphas, and the gradients of a fixed weighting of both, float64."""
-    leaves: Any = [t.detach().requires_grad_() for t in tensors]
-    view: Any = (camera or _camera(), background)
-    image, alphas, _ = rasterization(*leaves, *view, near_plane=NEAR, backend=backend)
+    leaves = [t.detach().requires_grad_() for t in tensors]
+    image, alphas, _ = rasterization(*leaves, camera or _camera(), background, near_plane=NEAR, backend=backend)
     both = torch.cat([image.double().flatten(), alphas.double().flatten()])
     loss = (both * torch.randn(both.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)).sum()
     found = {"picture": image.detach().double(), "alphas": alphas.detach().double()}
@@ -277,9 +281,6 @@ CROWDS: tuple[tuple[Any, ...], ...] = (
 # -- training: runs that could fail end in a whole checkpoint, a file that decodes and finite images -------------------
 
 SOURCE = "synthetic:local?size=32x24&frames=6"
-_FIELD = DeformationConfig(((4, 4),), 8, 8)
-#: Like the preset `tiny`, but a step takes milliseconds.
-SMALLEST = ModelConfig(_FIELD, _FIELD, hidden=8, initial_anchors=300, max_anchors=600)
 
 
 def _trainer(
@@ -294,7 +295,7 @@ def _trainer(
     data = load_source(SOURCE)
     views = tuple(replace(v, **view) for v in data.train)
     rates = LearningRates(**{k: (factor * a, factor * b) for k, (a, b) in asdict(LearningRates()).items()})
-    size = replace(SMALLEST, initial_anchors=anchors, max_anchors=anchors) if anchors else SMALLEST
+    size = replace(TINY, initial_anchors=anchors, max_anchors=anchors) if anchors else TINY
     run = TrainConfig(preset="tiny", iterations=60, rates=rates, cooldown=0.0)
     trainer = Trainer(run, replace(data, train=views, **fields), size=size)
     with torch.no_grad():
@@ -359,7 +360,7 @@ PROMISES = [
     Promise("deformation", "the residuals of float64, by model and player", _residual_error, FIELDS, FLOAT32),
     Promise("deformation", "finite images within 1/255 of those of the float64 reference", _file_pictures,
             [(f"{name}: pictures of its file", *rest) for name, *rest in FIELDS], 1 / 255),
-    refusal("deformation", EncodeError, lambda: encoder.encode(small_scene(_field("xy", np.full((6, 6), 1e20)))),
+    refusal("deformation", EncodeError, lambda: encoder.encode(_moved_by(_field("xy", np.full((6, 6), 1e20)))),
             ("overflows: as symbols", "planes of 1e20 at a step of 0.1: over 2^23 steps")),
     Promise("rasteriser", REFERENCE, _reference_error,
             [*((name, f"{tensor} {value} in 3 of 30", _scene(first=3, **{tensor: value}))

@@ -11,9 +11,10 @@ from functools import cache
 
 import numpy as np
 import torch
-from torch import Tensor
+from mpmath import mp
+from promises import Found, Promise, largest, refusal
+from tiny import trained_like_scene
 
-from pd4dgs_codec.bench.stability import Found, Promise, largest, mpmath, refusal, small_scene
 from pd4dgs_codec.entropy import channels
 from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.errors import EncodeError
@@ -29,98 +30,85 @@ IN_SIGMAS = (0.0, 1e-6, *(10 ** (i / 3) for i in range(-6, 19)))
 IN_STEPS = (0.49, 0.499999, 0.5, 0.500001, 0.51, 1.0, 40.0)
 FARTHEST = 1e6  #: sigmas
 PRIORS = ((0.0, 0.125), (-1.5, 0.7))  #: (mu, Q)
-LN_CLIP = math.log(rate.MIN_PROBABILITY)
-#: Least ln P for which values and gradients are promised.
-LEAST = {torch.float64: -math.inf, torch.float32: math.log(1e-30)}
+LN_2, LN_CLIP = math.log(2.0), math.log(rate.MIN_PROBABILITY)
 
 
 @cache
-def _inputs(dtype: torch.dtype) -> list[Tensor]:
-    """(a, mu, sigma, Q), each [n], leaves: sigma / Q of 1e-8..1e8."""
-    rows = []
-    for ratio, (mu, step), sign in itertools.product((10.0**e for e in range(-8, 9)), PRIORS, (1, -1)):
+def _channels(dtype: type) -> list[tuple[np.ndarray, float, float, float]]:
+    """Channels with sigma / Q of 1e-8..1e8: (a [n, 1] of the dtype, mu, sigma, Q)."""
+    found = []
+    for ratio, (mu, step) in itertools.product((10.0**e for e in range(-8, 9)), PRIORS):
         sigma = ratio * step
         distances = [z * sigma for z in IN_SIGMAS] + [d * step for d in IN_STEPS if d <= FARTHEST * ratio]
-        rows += [(mu + sign * d, mu, sigma, step) for d in distances]
-    columns = torch.tensor(rows, dtype=torch.float64).T.to(dtype)
-    return [column.clone().requires_grad_() for column in columns]
+        found.append((np.array([[mu + sign * d] for sign in (1, -1) for d in distances], dtype), mu, sigma, step))
+    return found
 
 
 @cache
-def _reference(dtype: torch.dtype, floored: bool) -> Tensor:
-    """float64 [n, 4] at the inputs exactly as stored: ln P, sigma dlnP/da, sigma dlnP/dsigma, Q dlnP/dQ.
-
-    floored: with the sigma of `rate_bits`, at least Q MIN_SIGMA_RATIO.
-    """
-    rows = torch.stack([x.detach().double() for x in _inputs(dtype)], 1).tolist()
+def _reference(dtype: type, floored: bool) -> np.ndarray:
+    """float64 [n, 5] of all channels, exactly as stored: sigma / Q, |a - mu| / sigma, ln P, sigma dlnP/da and
+    sigma dlnP/dsigma. floored: with a sigma of at least Q MIN_SIGMA_RATIO."""
     least = rate.MIN_SIGMA_RATIO if floored else 0.0
-    return torch.tensor(
-        [_exact(a, mu, max(sigma, step * least), step) for a, mu, sigma, step in rows], dtype=torch.float64
-    )
+    rows = ((a, mu, sigma, step) for values, mu, sigma, step in _channels(dtype) for a in values[:, 0].tolist())
+    return np.array([(s / q, abs(a - mu) / s, *_exact(a, mu, max(s, q * least), q)) for a, mu, s, q in rows])
 
 
-def _exact(*stored: float) -> tuple[float, float, float, float]:
-    mp = mpmath()
+def _exact(*stored: float) -> tuple[float, float, float]:
     with mp.workdps(60):
         a, mu, sigma, step = (mp.mpf(x) for x in stored)
         d = abs(a - mu)
         u, v = (d - step / 2) / sigma, (d + step / 2) / sigma
         p = (mp.erfc(u / mp.sqrt(2)) - mp.erfc(v / mp.sqrt(2))) / 2
         phi_u, phi_v = mp.npdf(u), mp.npdf(v)
-        of_a, of_sigma = mp.sign(a - mu) * (phi_v - phi_u) / p, (u * phi_u - v * phi_v) / p
-        return float(mp.log(p)), float(of_a), float(of_sigma), float((phi_u + phi_v) * step / (2 * sigma * p))
+        return float(mp.log(p)), float(mp.sign(a - mu) * (phi_v - phi_u) / p), float((u * phi_u - v * phi_v) / p)
 
 
-def _worst(inputs: list[Tensor], errors: Tensor, counts: Tensor) -> Found:
-    """Returns the position of the largest error among `counts`, and that error, NaN if there is one."""
-    found = torch.where(counts, errors, -1.0)
-    index = int(found.argmax())
-    a, mu, sigma, step = (float(x[index].detach()) for x in inputs)
-    position = f"sigma/Q {sigma / step:.0e}, |a - mu|/sigma {abs(a - mu) / sigma:.3g}"
-    return f"{int(counts.sum())} points, worst at {position}", float(found[index])
+def _measured(dtype: type, least_sigma: float, most_bits: float) -> np.ndarray:
+    """float64 [n, 3] of all channels: R in nats, and its derivatives by a and sigma times the sigma in use."""
+    found, narrow = [], rate.NARROW[torch.from_numpy(np.empty(0, dtype)).dtype]
+    for values, mu, sigma, step in _channels(dtype):
+        bits, slopes, used = np.empty(len(values)), np.empty((2, *values.shape)), max(sigma, step * least_sigma)
+        prior, limits = (np.full((1, 1), x) for x in (mu, used)), (least_sigma, most_bits, narrow)
+        rows, classes = np.arange(len(values)), np.zeros(len(values), np.int8)
+        rate.scalar_bits(bits, *slopes, values, rows, classes, *prior, step, *limits)
+        found.append(np.column_stack([bits, *(slope * used for slope in slopes)]) * LN_2)
+    return np.concatenate(found)
 
 
-def _relative(found: Tensor, expected: Tensor) -> Tensor:
-    return (found.detach().double() - expected).abs() / expected.abs().clamp(min=1.0)
+def _worst(reference: np.ndarray, errors: np.ndarray) -> Found:
+    """Returns the position of the largest error, and that error, NaN if there is one."""
+    index = int(errors.argmax())
+    ratio, distance = reference[index, :2]
+    position = f"sigma/Q {ratio:.0e}, |a - mu|/sigma {distance:.3g}"
+    return f"{len(errors)} points, worst at {position}", float(errors[index])
 
 
-def _value_and_gradients(dtype: torch.dtype) -> Found:
-    inputs, reference = _inputs(dtype), _reference(dtype, False)
-    value = rate.log_probability(*inputs)
-    da, dmu, dsigma, dq = (slope.double() for slope in torch.autograd.grad(value.sum(), inputs))
-    sigma, step = (x.detach().double() for x in inputs[2:])
-    found = torch.stack([value.double(), da * sigma, dsigma * sigma, dq * step, -dmu * sigma])
-    errors = _relative(found, reference[:, [0, 1, 2, 3, 1]].T).amax(0)
-    return _worst(inputs, errors, reference[:, 0] >= LEAST[dtype])
+def _relative(found: np.ndarray, expected: np.ndarray) -> np.ndarray:
+    return np.abs(found - expected) / np.maximum(np.abs(expected), 1.0)
 
 
-def _bits_and_slope(dtype: torch.dtype) -> Found:
-    inputs, reference = _inputs(dtype), _reference(dtype, True)
-    bits = rate.rate_bits(*inputs)
-    (slope,) = torch.autograd.grad(bits.sum(), inputs[0])
-    errors = _relative(bits * -math.log(2.0), reference[:, 0].clamp(min=LN_CLIP))
-    sigma, step = (x.detach() for x in inputs[2:])
-    unit = torch.maximum(sigma, step * rate.MIN_SIGMA_RATIO).double()
-    expected = -reference[:, 1] / math.log(2.0)  # of bits, per sigma; a wrong sign is an error of 2
-    off = (slope.double() * unit - expected).abs() / expected.abs().clamp(min=1e-300)  # at mu the slope is 0
-    errors = torch.where(reference[:, 0] < LN_CLIP, torch.maximum(errors, off), errors)
-    return _worst(inputs, errors, torch.ones_like(errors, dtype=torch.bool))
+def _value_and_gradients(dtype: type) -> Found:
+    reference = _reference(dtype, False)
+    return _worst(reference, _relative(-_measured(dtype, 0.0, math.inf), reference[:, 2:]).max(axis=1))
 
 
-def _not_finite(dtype: torch.dtype) -> Found:
-    tensors = []
-    for function in (rate.log_probability, rate.rate_bits):
-        inputs = _inputs(dtype)
-        value = function(*inputs)
-        tensors += [value, *torch.autograd.grad(value.sum(), inputs)]
-    numbers = torch.cat(tensors)
-    bad = int((~torch.isfinite(numbers)).sum())
-    return f"{bad} of {numbers.numel()} numbers not finite", float(bad)
+def _bits_and_slope(dtype: type) -> Found:
+    reference, (nats, slope, _) = _reference(dtype, True), _measured(dtype, rate.MIN_SIGMA_RATIO, rate.MAX_BITS).T
+    errors = _relative(-nats, np.maximum(reference[:, 2], LN_CLIP))
+    expected = -reference[:, 3]  # per sigma; a wrong sign is an error of 2
+    off = np.abs(slope - expected) / np.maximum(np.abs(expected), 1e-300)  # at mu the slope is 0
+    return _worst(reference, np.where(reference[:, 2] < LN_CLIP, np.maximum(errors, off), errors))
+
+
+def _not_finite(dtype: type) -> Found:
+    numbers = np.stack([_measured(dtype, 0.0, math.inf), _measured(dtype, rate.MIN_SIGMA_RATIO, rate.MAX_BITS)])
+    bad = np.count_nonzero(~np.isfinite(numbers))
+    return f"{bad} of {numbers.size} numbers not finite", float(bad)
 
 
 def _without_spread() -> Found:
     x = torch.full((1000, 1), 3.7, requires_grad=True)
-    total = rate.rate_bits(x, *rate.channel_moments(x), 0.125).sum()
+    total = rate.row_bits([(x, 0.125)], torch.zeros(1000, dtype=torch.int8), torch.arange(1000)).sum()
     (slope,) = torch.autograd.grad(total, x)
     finite = bool(torch.isfinite(slope).all())
     said = f"{float(total.detach()):.3g} bits, gradients {'finite' if finite else 'not finite'}"
@@ -214,7 +202,7 @@ def _changed(step: float) -> Found:
 
 
 def _file_error_in_bounds(scale: float) -> Found:
-    scene = small_scene()
+    scene = trained_like_scene()
     decoded = decoder.decode(encoder.encode(scene, step_scale=scale, effort=1, omit="nothing"))
     order, back = np.lexsort(scene.anchor_q.T), np.lexsort(decoded.anchor_q.T)
     errors = {
@@ -225,7 +213,7 @@ def _file_error_in_bounds(scale: float) -> Found:
 
 
 def _encode_with(value: float) -> bytes:
-    scene = small_scene()
+    scene = trained_like_scene()
     offset = scene.offset.copy()
     offset[3, 2, 1] = value
     return encoder.encode(replace(scene, offset=offset))
@@ -235,7 +223,6 @@ def _encode_with(value: float) -> bytes:
 
 
 def _level_mask_error(values: Sequence[float]) -> Found:
-    mp = mpmath()
     logits = torch.tensor(list(itertools.product(values, repeat=3))).requires_grad_()
     levels = [networks.level_mask(logits, level) for level in range(3)]
     slopes = [torch.autograd.grad(mask.sum(), logits)[0] for mask in levels]
@@ -265,18 +252,17 @@ def _code_errors() -> Found:
 
 STEPS = {name: float(np.float32(step)) for name, step in (("1e-38", TINY), ("1e-6", 1e-6), ("1", 1), ("2^104", 2**104))}
 RATES = "sigma/Q 1e-8..1e8, |a - mu|/sigma up to 1e6"
-#: (name, dtype, bound, where it holds)
-TYPES = (("float64", torch.float64, 1e-9, ""), ("float32", torch.float32, 1e-4, " where P >= 1e-30"))
+TYPES = (("float64", np.float64), ("float32", np.float32))  #: of the values; sums are float64
 LOSSLESS = "every symbol decoded, with any priors and effort"
 NO_STEP, IN_OFFSETS = "a step that is not a positive normal binary32", "among the offsets of a scene"
 
 PROMISES = [
-    *(Promise("rate", f"within {bound:g} of mpmath relative to max(1, |x|){where}", _value_and_gradients,
-              [(f"ln P and gradients, {name}", RATES, dtype)], bound) for name, dtype, bound, where in TYPES),
-    *(Promise("rate", f"bits min(R, 19.93), gradient of R beyond the clip, within {bound:g}", _bits_and_slope,
-              [(f"clipped bits, {name}", RATES, dtype)], bound) for name, dtype, bound, _ in TYPES),
+    Promise("rate", "within 1e-9 of mpmath relative to max(1, |x|)", _value_and_gradients,
+            [(f"ln P and gradients, {name}", RATES, dtype) for name, dtype in TYPES], 1e-9),
+    Promise("rate", "bits min(R, 19.93), gradient of R beyond the clip, within 1e-9", _bits_and_slope,
+            [(f"clipped bits, {name}", RATES, dtype) for name, dtype in TYPES], 1e-9),
     Promise("rate", "value and gradients finite", _not_finite,
-            [(f"finite, {name}", RATES, dtype) for name, dtype, _, _ in TYPES]),
+            [(f"finite, {name}", RATES, dtype) for name, dtype in TYPES]),
     Promise("rate", "0 bits within 1e-6, finite gradients", _without_spread,
             [("a channel without spread", "1,000 equal values, their own moments, float32")], 1e-6),
     Promise("fitting", LOSSLESS, _lost_symbols, [
@@ -311,7 +297,7 @@ PROMISES = [
     Promise("quantiser", "every attribute within Q/2 and half a float32 unit", _file_error_in_bounds,
             [(f"a whole file at steps times {scale:.0e}", "a scene of 40 anchors, encoded and decoded", scale)
              for scale in (1e-3, 1.0, 1e30)], 1.0),
-    refusal("quantiser", EncodeError, lambda scale: encoder.encode(small_scene(), step_scale=scale),
+    refusal("quantiser", EncodeError, lambda scale: encoder.encode(trained_like_scene(), step_scale=scale),
             ("a whole file at steps times 1e-06", "weights of more than 2^23 steps; the limit is 2^23", 1e-6),
             ("a whole file at steps times 1e-38", "steps below binary32's normal range", 1e-38),
             ("a whole file at steps times 1e+40", "steps above binary32's range", 1e40)),

@@ -1,24 +1,30 @@
-"""The stability table: its rows hold, they can fail, and the command around them."""
+"""The stability table: its rows hold, and they can fail. `pytest tests/stability --table` prints it."""
 
-import json
 import math
-import sys
 from unittest.mock import Mock
 
 import numpy as np
 import pytest
+import stable_scenes
+import stable_symbols
 import torch
+from promises import FAIL, Promise, run_case
 
-from pd4dgs_codec.bench import stability, stable_scenes
-from pd4dgs_codec.cli import bench
 from pd4dgs_codec.entropy import channels
 from pd4dgs_codec.errors import DataError, EncodeError
 from pd4dgs_codec.format import quantise
 from pd4dgs_codec.model import hexplane, networks, rate, reference
 from pd4dgs_codec.threads import one_torch_thread
 
-KEYS = {"case", "group", "fed", "promised", "got", "error", "bound", "status"}
-GROUPS = ("rate", "fitting", "quantiser", "masks", "hexplane", "deformation", "rasteriser", "training")
+CASES = [
+    (promise, given)
+    for module in (stable_symbols, stable_scenes)
+    for promise in module.PROMISES
+    for given in promise.inputs
+]
+NAMES = [f"{promise.group}: {case}" for promise, (case, *_) in CASES]
+#: Of the trainings, those that every run of the tests repeats.
+USUAL = ("learning rates times 1e4", "a single Gaussian", "a NaN weight")
 
 
 @pytest.fixture(autouse=True)
@@ -27,35 +33,38 @@ def _one_torch_thread():
         yield
 
 
-def failed(name):
-    """Names of the failed rows."""
-    rows = [stability.run_case(*case) for case in stability.chosen(name)]
-    return {row["case"] for row in rows if row["status"] == stability.FAIL}
+def slow(promise, case):
+    return [pytest.mark.slow] if promise.group == "training" and case not in USUAL else []
 
 
-def test_the_table_has_all_groups_and_no_two_rows_of_one_name():
-    names = [(promise.group, case) for promise, (case, *_) in stability.chosen(None)]
-    assert len(names) >= 120 and len(set(names)) == len(names)
-    assert tuple(dict.fromkeys(group for group, _ in names)) == GROUPS
+def test_no_two_rows_have_one_name():
+    assert len(set(NAMES)) == len(NAMES) >= 120
 
 
-@pytest.mark.parametrize("name", [*GROUPS[:-1], "learning rates", "a single Gaussian", "a NaN weight"])
-def test_every_row_holds(name):
-    assert failed(name) == set()
-
-
-@pytest.mark.slow
-def test_every_training_run_holds():
-    assert failed("training") == set()
+@pytest.mark.parametrize(
+    "promise, given",
+    [pytest.param(*case, id=name, marks=slow(case[0], case[1][0])) for case, name in zip(CASES, NAMES, strict=True)],
+)
+def test_every_row_holds(promise, given, record_property):
+    row = run_case(promise, given)
+    record_property("row", row)
+    assert row["status"] != FAIL, row
 
 
 # -- rows can fail -----------------------------------------------------------------------------------------------------
 
 
-def naive(a, mu, sigma, q):
-    """ln P by the plain difference of two distribution functions."""
-    normal = torch.distributions.Normal(torch.zeros((), dtype=a.dtype), 1)
-    return torch.log(normal.cdf((a - mu + q / 2) / sigma) - normal.cdf((a - mu - q / 2) / sigma))
+def naive(bits, by_value, by_sigma, values, rows, classes, mu, sigma, step, *limits):
+    """R by the plain difference of two distribution functions."""
+    low, high = (torch.from_numpy((values + side - mu) / sigma) for side in (-step / 2, step / 2))
+    bits[:] = -(torch.special.ndtr(high) - torch.special.ndtr(low)).log2()[:, 0]
+    by_value[:] = by_sigma[:] = 0
+
+
+def unreached(bits, by_value, *given):
+    """R without a gradient beyond the clip."""
+    scalar_bits(bits, by_value, *given)
+    by_value[bits >= given[-2]] = 0
 
 
 def floor(x, step, name=""):
@@ -64,17 +73,16 @@ def floor(x, step, name=""):
     return np.zeros(x.shape, np.int32)
 
 
-bits, sample, mask = rate.rate_bits, hexplane.sample_reference, networks.level_mask
-read = channels.ChannelReader.read
-draw = stable_scenes.rasterization
+scalar_bits, mask, sample = rate.scalar_bits, networks.level_mask, hexplane.sample_reference
+read, draw = channels.ChannelReader.read, stable_scenes.rasterization
 #: What is broken: (module, name, broken, rows to run, rows that must fail, a row that must not).
 FAULTS = {
     "the plain formula of the rate": (
-        rate, "log_probability", naive, "rate",
+        rate, "scalar_bits", naive, "rate:",
         {"finite, float32", "ln P and gradients, float64", "clipped bits, float64"}, "a channel without spread",
     ),
     "a clip without gradient": (
-        rate, "rate_bits", lambda *x: bits(*x).clamp(max=19.9), "float64",
+        rate, "scalar_bits", unreached, "float64",
         {"clipped bits, float64"}, "ln P and gradients, float64",
     ),
     "a coder that loses an outlier": (
@@ -114,7 +122,8 @@ FAULTS = {
 def test_a_fault_fails_its_rows(fault, monkeypatch):
     module, name, broken, rows, must_fail, must_not = FAULTS[fault]
     monkeypatch.setattr(module, name, broken)
-    found = failed(rows)
+    tested = [run_case(*case) for case, row in zip(CASES, NAMES, strict=True) if rows in row]
+    found = {row["case"] for row in tested if row["status"] == FAIL}
     assert must_fail <= found and must_not not in found
 
 
@@ -138,33 +147,5 @@ class TwoLines(EncodeError):
     ],
 )
 def test_the_status_of_a_row(measure, refuses, status):
-    promise = stability.Promise("group", "promised", measure, (), 1.0, refuses)
-    assert stability.run_case(promise, ("name", "fed"))["status"] == status
-
-
-# -- the command -------------------------------------------------------------------------------------------------------
-
-
-def test_the_command_prints_a_table_and_writes_json(capsys, tmp_path):
-    path = tmp_path / "rows.json"
-    assert bench.main(["stability", "--only", "MASK", "--json", str(path)]) == 0
-    out, err = capsys.readouterr()
-    result = json.loads(path.read_text())
-    assert out.startswith("## masks\n\n| case ") and f"\n{len(result['rows'])} rows: " in out
-    assert all(set(row) == KEYS for row in result["rows"]) and result["counts"]["fail"] == 0
-    assert bench.main(["stability", "--only", "mask nan", "--json"]) == 0
-    (row,) = json.loads(capsys.readouterr().out)["rows"]
-    assert row["status"] == "refused" and row["error"] is None and row["bound"] is None
-
-
-def test_a_failed_row_is_named_and_exits_1(capsys, monkeypatch):
-    monkeypatch.setattr(quantise, "MASK_THRESHOLD", 0.0118)
-    assert bench.main(["stability", "--only", "codes at 0"]) == 1
-    out, err = capsys.readouterr()
-    assert "1 fail" in out and "fail: masks: codes at 0, 1 and the threshold" in err
-
-
-def test_without_mpmath_it_says_what_to_install(monkeypatch, capsys):
-    monkeypatch.setitem(sys.modules, "mpmath", None)
-    assert bench.main(["stability"]) == 1
-    assert "pip install 'pd4dgs-codec[test]'" in capsys.readouterr().err
+    promise = Promise("group", "promised", measure, (), 1.0, refuses)
+    assert run_case(promise, ("name", "fed"))["status"] == status
