@@ -275,6 +275,7 @@ def read_scalars(header):
 
 
 # 5.4 Rows: "ids ascend"
+# 6.2 Layer parameters: "with the rules and limits of 5.4 but no centres"
 # 6.3 Grids and chains: "Ids of grids ascend, and so do those of chains."
 def read_id(tensor, last):
     need(limited(tensor[0], 255, "an id") > last, f"id {tensor[0]} after {last}, expected ascending ids")
