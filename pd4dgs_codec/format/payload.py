@@ -10,7 +10,7 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -171,57 +171,57 @@ def read_slice(
         earlier = NO_CLASSES
     codes, stream = payload[start : start + parameters.codes], bytes(payload[start + parameters.codes :])
     if mode == "lzma":
-        part = _read_lzma(codes, stream, layer, table, parameters, earlier)
+        coded = _read_lzma(codes, stream, table, parameters)
     else:
         reader = ChannelReader(codes, stream, parameters.symbols, of is not None)
-        part = _read_ans(reader, layer, table, parameters, earlier, past or Past())
-    where = f"layer {layer}"
-    for name, found, low in (("rise of a mask code", part.rises, 0), ("mask code", part.codes, MASK_MIN_CODE)):
+        coded = _read_ans(reader, table, parameters, earlier, past or Past())
+    voxels, rises, own, classes, k, layer_k, residuals, weights, bits = coded
+    where, tables = f"layer {layer}", parameters.tables
+    for name, found, low in (("rise of a mask code", rises, 0), ("mask code", own, MASK_MIN_CODE)):
         if found.size and not (low <= found.min() and found.max() <= 255):
             raise Malformed(f"{where}: {name} in {int(found.min())}..{int(found.max())}, expected {low}..255")
-    if any(magnitude(array) > MAX_SYMBOL for array in part.tensors.weights):
+    if any(magnitude(array) > MAX_SYMBOL for array in weights):
         raise Malformed(f"{where}: a symbol of a chain over {MAX_SYMBOL} in magnitude")
+    predictors = [predictor for grid in tables.grids for predictor in grid.predictors]
+    samples = restore(list(zip(predictors, residuals, strict=True)))
+    arrays = [array.reshape(shape) for array, shape in zip(weights, tables.weights, strict=True)]
+    tensors, fill = Tensors(tables, samples, arrays), parameters.fill
+    part = LayerSymbols(layer, table, voxels, rises, own, classes, k, tensors, fill, earlier, layer_k, bits)
     try:
-        rows = table.values(part.rows, part.classes)
-        layer_rows = part.layer_table.values(part.layer_rows, part.all_classes)
+        rows, layer_rows = table.values(k, classes), part.layer_table.values(layer_k, part.all_classes)
     except Malformed as error:
         raise Malformed(f"{where}: {error.message}") from None
     return replace(part, rows=rows, layer_rows=layer_rows), declared
 
 
+Array = np.ndarray
+#: Voxels, rises, own codes and step classes of a slice, the symbols of its rows and of its layer rows, the residuals of
+#: its planes, its weights and biases, and the bits of its groups.
+Coded = tuple[Array, Array, Array, Array, Array, Array, list[Array], list[Array], dict[str, int]]
+
+
 def _read_ans(
-    reader: ChannelReader,
-    layer: int,
-    table: RowTable,
-    parameters: Parameters,
-    earlier: np.ndarray,
-    past: Past[Prior],
-) -> LayerSymbols:
-    """Returns the slice, with symbols k in place of the values of rows."""
+    reader: ChannelReader, table: RowTable, parameters: Parameters, earlier: Array, past: Past[Prior]
+) -> Coded:
     n, tables, marks = parameters.rows, parameters.tables, [reader.bits]
-    anchor_q = decode_positions(reader, n, past.positions)
+    voxels = decode_positions(reader, n, past.positions)
     marks.append(reader.bits)
-    sizes = [parameters.rises, n]
-    rises, codes = split(reader.read(sizes, past.rows), sizes)
+    rises, own = split(reader.read([parameters.rises, n], past.rows), [parameters.rises, n])
     marks.append(reader.bits)
-    classes = reader.read([n] * table.graded, past.rows)
+    classes, width = reader.read([n] * table.graded, past.rows), RowTable(tables.rows).channels
     _check_classes(classes)
-    everyone = np.concatenate([earlier, classes])
     rows = _read_rows(reader, table.channels, n, classes, past.rows)
-    width = RowTable(tables.rows).channels
+    everyone = np.concatenate([earlier, classes])
     layer_rows = _read_rows(reader, width, parameters.rises + n, everyone, past.rows) if width else NO_LAYER_ROWS
     marks.append(reader.bits)
-    known = list[Prior]()
+    known, sizes = list[Prior](), [math.prod(shape) for shape in tables.weights]
     residuals = read_planes(reader, tables.planes, known)
     marks.append(reader.bits)
-    sizes = [math.prod(shape) for shape in tables.weights]
     weights = split(reader.read(sizes, known), sizes)
     marks.append(reader.bits)
     reader.finish()
-    tensors, bits = _tensors(tables, residuals, weights), np.diff(marks).tolist()
-    spent = dict(zip(GROUPS, bits, strict=True))
-    more: dict[str, Any] = {"earlier": earlier, "layer_rows": layer_rows, "bits": spent}
-    return LayerSymbols(layer, table, anchor_q, rises, codes, classes, rows, tensors, parameters.fill, **more)
+    bits = dict(zip(GROUPS, np.diff(marks).tolist(), strict=True))
+    return voxels, rises, own, classes, rows, layer_rows, residuals, weights, bits
 
 
 def _read_rows(reader: ChannelReader, channels: int, n: int, classes: np.ndarray, known: list[Prior]) -> np.ndarray:
@@ -233,10 +233,7 @@ def _read_rows(reader: ChannelReader, channels: int, n: int, classes: np.ndarray
     return rows
 
 
-def _read_lzma(
-    codes: bytes | memoryview, stream: bytes, layer: int, table: RowTable, parameters: Parameters, earlier: np.ndarray
-) -> LayerSymbols:
-    """As _read_ans."""
+def _read_lzma(codes: bytes | memoryview, stream: bytes, table: RowTable, parameters: Parameters) -> Coded:
     n, tables = parameters.rows, parameters.tables
     channels = [h * w for c, h, w in tables.planes for _ in range(c)]
     groups = [
@@ -251,16 +248,9 @@ def _read_lzma(
         np.concatenate(planes[first:end]).reshape(shape)
         for first, end, shape in zip(ends, ends[1:], tables.planes, strict=False)
     ]
-    tensors = _tensors(tables, residuals, weights)
-    graded, spent = classes[0] if classes else NO_CLASSES, {LZMA_GROUP: 8 * (len(codes) + len(stream))}
-    more: dict[str, Any] = {
-        "earlier": earlier,
-        "layer_rows": np.stack(moved) if moved else NO_LAYER_ROWS,
-        "bits": spent,
-    }
-    return LayerSymbols(
-        layer, table, _voxels(steps), rises, own, graded, np.stack(rows), tensors, parameters.fill, **more
-    )
+    graded, layer_rows = [*classes, NO_CLASSES][0], np.stack(moved) if moved else NO_LAYER_ROWS
+    bits = {LZMA_GROUP: 8 * (len(codes) + len(stream))}
+    return _voxels(steps), rises, own, graded, np.stack(rows), layer_rows, residuals, weights, bits
 
 
 def _voxels(steps: Sequence[np.ndarray]) -> np.ndarray:
@@ -272,12 +262,6 @@ def _voxels(steps: Sequence[np.ndarray]) -> np.ndarray:
     if np.any(np.diff(morton_codes(cells)) <= 0):
         raise Malformed("voxels out of Morton order")
     return cells.astype(np.int32)
-
-
-def _tensors(tables: Tables, residuals: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> Tensors:
-    predictors = [predictor for grid in tables.grids for predictor in grid.predictors]
-    samples, pairs = restore(list(zip(predictors, residuals, strict=True))), zip(weights, tables.weights, strict=True)
-    return Tensors(tables, samples, [array.reshape(shape) for array, shape in pairs])
 
 
 def _check_classes(classes: np.ndarray = NO_CLASSES) -> None:

@@ -167,12 +167,17 @@ class RowTable:
             yield tensor, channels[first:last]
             first = last
 
+    def _mapped(self, a: np.ndarray, b: np.ndarray) -> Iterator[tuple[Rows, np.ndarray, np.ndarray, np.ndarray]]:
+        """Yields (tensor, its part of a and of b, both [W, n], its centres [C, 1])."""
+        parts = zip(self.of_each(a), self.of_each(b), self.of_each(self._centres[:, None]), strict=True)
+        yield from ((tensor, own, other, m) for (tensor, own), (_, other), (_, m) in parts)
+
     def quantise(self, given: Sequence[np.ndarray], classes: np.ndarray, names: Sequence[str]) -> np.ndarray:
         """Returns v of float32 [n, any], one array per tensor, without predictors. names: for messages. Raises
         EncodeError for a value without a symbol."""
-        v, parts = np.empty((self.channels, len(given[0])), np.int32), self.of_each(self._centres[:, None])
+        v = np.empty((self.channels, len(given[0])), np.int32)
         spacing = np.int32(1) << classes if self.graded else np.ones(v.shape[1], np.int32)
-        for x, name, (tensor, own), (_, m) in zip(given, names, self.of_each(v), parts, strict=True):
+        for x, name, (tensor, own, _, m) in zip(given, names, self._mapped(v, v), strict=True):
             for rows in row_blocks(v.shape[1]):
                 channels = x[rows].reshape(-1, tensor.channels).T
                 own[:, rows] = quantise(channels, tensor.step, name, m, spacing[rows]) * spacing[rows] + m
@@ -182,15 +187,19 @@ class RowTable:
         """Returns the values float32 [n, C] of each tensor, C-contiguous."""
         return [np.ascontiguousarray(dequantise(own, tensor.step).T) for tensor, own in self.of_each(v)]
 
+    @property
+    def _plain(self) -> bool:
+        """Whether symbols are values."""
+        return not self.graded and not any(tensor.predictor for tensor in self.tensors)
+
     def values(self, symbols: np.ndarray, classes: np.ndarray) -> np.ndarray:
         """Returns v of symbols k int32 [W, n]. Raises Malformed if a magnitude exceeds MAX_SYMBOL."""
         if magnitude(symbols) > MAX_SYMBOL:
             raise Malformed(f"a symbol of a row over {MAX_SYMBOL} in magnitude")
-        if not self.graded and not any(tensor.predictor for tensor in self.tensors):
+        if self._plain:
             return symbols
         v, shifts = np.empty_like(symbols), classes if self.graded else 0
-        parts = zip(self.of_each(symbols), self.of_each(self._centres[:, None]), strict=True)
-        for ((tensor, k), (_, m)), (_, out) in zip(parts, self.of_each(v), strict=True):
+        for tensor, k, out, m in self._mapped(symbols, v):
             found = _accumulated(k, m, classes) if tensor.predictor else (k << shifts) + m
             if magnitude(found) > MAX_SYMBOL:
                 raise Malformed(f"a value of a row more than {MAX_SYMBOL} steps from 0")
@@ -199,11 +208,10 @@ class RowTable:
 
     def symbols(self, v: np.ndarray, classes: np.ndarray) -> np.ndarray:
         """The inverse of `values`. Raises EncodeError if no symbols give v."""
-        if not self.graded and not any(tensor.predictor for tensor in self.tensors):
+        if self._plain:
             return v
         symbols, shifts = np.empty_like(v), classes if self.graded else 0
-        parts = zip(self.of_each(v), self.of_each(self._centres[:, None]), strict=True)
-        for ((tensor, own), (_, m)), (_, out) in zip(parts, self.of_each(symbols), strict=True):
+        for tensor, own, out, m in self._mapped(v, symbols):
             steps = _differences(own, m, classes) if tensor.predictor else own - m
             out[:] = steps >> shifts
             expect(np.array_equal(out << shifts, steps), f"rows {tensor.id}: values between the steps of their class")
