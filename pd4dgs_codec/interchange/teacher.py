@@ -109,9 +109,9 @@ def load_source(
 
 
 def _around(source: str, place: Path, teacher: Teacher, options: Options, downscale: int, holdout: int) -> Dataset:
-    """Returns the teacher's pictures by `_cameras` as a dataset, every holdout-th picture held out."""
+    """Returns the teacher's pictures by `cameras_of` as a dataset, every holdout-th picture held out."""
     solid = _solid(source, teacher, MIDDLE)
-    cameras, up = _cameras(place, teacher.splats(teacher.nearest(MIDDLE)).means[solid], options, downscale)
+    cameras, up = cameras_of(place, teacher.splats(teacher.nearest(MIDDLE)).means[solid], options, downscale)
     still = teacher.times is not None and len(teacher.times) == 1
     poses = [(camera, 0.0 if still else i * GOLDEN % 1.0) for i, camera in enumerate(cameras)]
     times = teacher.times or tuple(np.linspace(0, 1, BOX_TIMES))
@@ -172,7 +172,9 @@ def _value(key: str, text: str) -> Any:
     raise ValueError(text)
 
 
-def _cameras(place: Path, points: np.ndarray, options: Options, downscale: int) -> tuple[list[Camera], Triple]:
+def cameras_of(
+    place: Path, points: np.ndarray, options: Options, downscale: int = 1
+) -> tuple[list[Camera], Triple]:
     """Returns (cameras of a cameras.json beside the Gaussians, else cameras around `points` [n, 3]; up direction)."""
     beside = next((p / "cameras.json" for p in (place, *place.parents[:2]) if (p / "cameras.json").is_file()), None)
     if beside is not None:
@@ -199,13 +201,18 @@ class Teacher:
     """A model that gives Gaussians at a time.
 
     splats: normalised time -> Gaussians. times: the known times, None if it knows all. seconds: from the first time to
-    the last. background: of its training.
+    the last. background: of its training. windows: float32 [n, 3], the centre, half width and softness in normalised
+    time of the window that each Gaussian's opacity has (clause 13.7); bare: `splats` without them. None: no windows.
+    varies: whether other Gaussians are given at other times.
     """
 
     splats: Callable[[float], Splats]
     times: tuple[float, ...] | None
     seconds: float
     background: Triple = (0.0, 0.0, 0.0)
+    windows: np.ndarray | None = None
+    bare: Callable[[float], Splats] | None = None
+    varies: bool = False
 
     def nearest(self, t: float) -> float:
         """Returns the known time nearest to t."""
@@ -236,7 +243,13 @@ def _folder(folder: Path, fps: float) -> Teacher:
     paths = max((files_of(folder, [suffix]) for suffix in FRAME_SUFFIXES), key=len)
     if not paths:
         raise DataError(f"{folder}: holds no file that ends in {', '.join(FRAME_SUFFIXES)}, expected one per frame")
-    paths = [path for _, path in sorted(zip(last_numbers(paths) or range(len(paths)), paths, strict=True))]
+    numbers = last_numbers(paths) or range(len(paths))
+    found, paths = zip(*sorted(zip(numbers, paths, strict=True)), strict=True)
+    gaps = np.diff(found)
+    if len(gaps) and (lost := np.flatnonzero(gaps != gaps.min())).size:
+        missing = found[lost[0]] + gaps.min() if gaps.min() else found[gaps.argmin()]
+        what = f"has no frame {missing}" if gaps.min() else f"has several frames {missing}"
+        raise DataError(f"{folder}: {what}, expected one for each number from {found[0]} to {found[-1]}")
     times = tuple(i / max(len(paths) - 1, 1) for i in range(len(paths)))
 
     frame = lru_cache(maxsize=2)(read_splats)
@@ -273,7 +286,7 @@ def _fourdgs(path: Path, data: bytes) -> Teacher:
             sh=np.concatenate(sh, axis=1),
         )
 
-    return Teacher(splats, None, seconds)
+    return Teacher(splats, None, seconds, varies=True)
 
 
 def _numbers(data: bytes, most: int) -> int:
