@@ -81,7 +81,6 @@ def parser() -> options.Parser:
 def _direction(text: str) -> tuple[float, ...]:
     """Reads three numbers that are not all 0."""
 
-
     def numbers(text: str) -> tuple[float, ...]:
         return tuple(map(float, text.split(",")))
 

@@ -48,17 +48,13 @@ class Views(Sequence[Any]):
     """Views of samples at cameras, spread over time, whose Gaussians are made when they are asked for."""
 
     def __init__(self, source: Sampled, cameras: Sequence[Camera], chosen: Sequence[int]):
-        self.source, self.cameras, self.chosen = source, cameras, chosen
+        self.source, self.cameras, self.chosen = source, cameras, list(chosen)
 
     @classmethod
     def over_time(cls, source: Sampled, cameras: Sequence[Camera]) -> Views:
         """Spreads the cameras over the instants."""
         last = len(source.times) - 1
         return cls(source, cameras, [round(i * GOLDEN % 1.0 * last) for i in range(len(cameras))])
-
-    def time(self, i: int) -> float:
-        """The normalised time of view i."""
-        return float(self.source.times[self.chosen[i]])
 
     def __len__(self) -> int:
         return len(self.cameras)
@@ -94,7 +90,7 @@ class Packer:
         weights = sensitivity(pictures)
         step()
         some = Views(source, *zip(*[(views.cameras[i], views.chosen[i]) for i in _spread(len(views), 8)], strict=True))
-        self.pictures = Pictures(some, info.background, info.near)
+        self.pictures, self.times = Pictures(some, info.background, info.near), source.times[some.chosen]
         self.ordered = Ordered.of(source.frame(self.key), weights)
         self.changes = self._changes() if len(source.times) > 1 else {}
         step()
@@ -110,8 +106,7 @@ class Packer:
 
         def build(theta: float) -> tuple[splats.SplatScene, float]:
             scene = self._scene(theta, 10 ** (-psnr / 10))
-            times = [self.pictures.views.time(i) for i in range(len(self.pictures.views))]
-            return scene, self.pictures.error(lambda i: scene.splats(times[i])[0])
+            return scene, self.pictures.error(lambda i: scene.splats(self.times[i])[0])
 
         return matched(build, psnr, 10 ** (-psnr / 10) / scalars)
 
@@ -165,7 +160,7 @@ class Packer:
             root = np.sqrt(weights / instants)[:, None].astype(np.float32)
             gram = (values * root).T.astype(np.float64) @ (values * root)
             energies, vectors = np.linalg.eigh(gram)
-            order = np.argsort(-energies)[: MOST_BASES]
+            order = np.argsort(-energies)[:MOST_BASES]
             order = order[energies[order] > max(STATIC, 1e-9 * energies.max())]
             if len(order):
                 vectors = vectors[:, order] * np.sqrt(instants)

@@ -54,9 +54,12 @@ class Imported:
     def json(self) -> dict[str, Any]:
         """The report, with what was read and measured."""
         names = ("psnr", "views", "gaussians", "left_out", "instants", "static", "order", "matched")
-        return self.report.json() | {"gaussians_left_out": self.left_out} | {n: getattr(self, n) for n in names[:3]} | {
-            name: getattr(self, name) for name in names[4:]
-        }
+        return (
+            self.report.json()
+            | {"gaussians_left_out": self.left_out}
+            | {n: getattr(self, n) for n in names[:3]}
+            | {name: getattr(self, name) for name in names[4:]}
+        )
 
 
 def import_model(

@@ -72,7 +72,8 @@ class Sampled:
         for values in (np.log(np.maximum(self.scales, 1e-12)), self.opacities, self.colors):
             still &= np.ptp(values, axis=0).reshape(len(size), -1).max(axis=1) < MOVES
         still &= np.abs(np.einsum("tnd,nd->tn", self.quats, self.quats[0])).min(axis=0) > 1 - MOVES**2
-        return still if self.windows is None else still & (self.windows[:, 1] >= 0.5)
+        found: np.ndarray = still if self.windows is None else still & (self.windows[:, 1] >= 0.5)
+        return found
 
 
 def visible(windows: np.ndarray, t: float) -> np.ndarray:
@@ -117,20 +118,19 @@ def _check_size(where: str, frames: int, count: int) -> None:
 
 def _stacked(times: np.ndarray, frames: Sequence[Splats], windows: np.ndarray | None, order: str) -> Sampled:
     """Stacks frames with the same rows. Harmonics but the constants are means over the frames."""
-    parts = {name: np.stack([getattr(f, name) for f in frames]) for name in ("means", "quats", "scales", "opacities")}
-    flips = np.sign(np.einsum("tnd,tnd->tn", parts["quats"][1:], parts["quats"][:-1]))
-    parts["quats"][1:] *= np.cumprod(np.where(flips < 0, np.float32(-1), np.float32(1)), axis=0)[..., None]
+    names = ("means", "quats", "scales", "opacities")
+    means, quats, scales, opacities = (np.stack([getattr(frame, name) for frame in frames]) for name in names)
+    flips = np.einsum("tnd,tnd->tn", quats[1:], quats[:-1])
+    quats[1:] *= np.cumprod(np.where(flips < 0, np.float32(-1), np.float32(1)), axis=0)[..., None]
     colors = np.stack([frame.sh[:, 0] for frame in frames])
-    rest = np.mean([frame.sh[:, 1:] for frame in frames], axis=0, dtype=np.float32)
-    return Sampled(times, **parts, colors=colors, rest=rest, windows=windows, order=order)
+    rest = np.asarray(sum(frame.sh[:, 1:] for frame in frames) / len(frames), np.float32)
+    return Sampled(times, means, quats, scales, opacities, colors, rest, windows, order)
 
 
 # -- models that know all times ----------------------------------------------------------------------------------------
 
 
-def _by_error(
-    read: Callable[[float], Splats], where: str, step: Step
-) -> tuple[np.ndarray, list[Splats]]:
+def _by_error(read: Callable[[float], Splats], where: str, step: Step) -> tuple[np.ndarray, list[Splats]]:
     """Returns (times, frames with the same rows): more where a straight line between samples is wrong."""
     found = dict[float, Splats]()
 
@@ -163,13 +163,15 @@ def _bend(a: Splats, middle: Splats, b: Splats) -> float:
     seen = middle.opacities > SEEN
     if not seen.any():
         return 0.0
-    size = middle.scales.max(axis=1)[seen, None]
-    aside = np.abs((a.means + b.means)[seen] / 2 - middle.means[seen]).max(axis=1, keepdims=True) / np.maximum(size, 1e-9)
+    size = middle.scales.max(axis=1)[seen]
+    aside = np.abs((a.means + b.means)[seen] / 2 - middle.means[seen]).max(axis=1, keepdims=True) / np.maximum(
+        size, 1e-9
+    )
     turned = 1 - np.abs(np.einsum("nd,nd->n", _halfway(a.quats, b.quats), middle.quats))[seen]
     grown = np.abs((a.scales + b.scales)[seen] / 2 / np.maximum(middle.scales[seen], 1e-9) - 1).max(axis=1)
     faded = np.abs((a.opacities + b.opacities) / 2 - middle.opacities)[seen]
     tinted = np.abs((a.sh[:, 0] + b.sh[:, 0]) / 2 - middle.sh[:, 0])[seen].max(axis=1)
-    parts = (aside[:, 0], np.sqrt(turned.clip(0)), grown, faded, tinted)
+    parts = (aside, np.sqrt(turned.clip(0)), grown, faded, tinted)
     return max(float(np.minimum(part, 1).mean()) for part in parts)
 
 
@@ -186,7 +188,9 @@ def _halfway(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 def _features(splats: Splats, means: np.ndarray, reach: float) -> np.ndarray:
     """Returns float32 [n, 7] whose distances say how little Gaussians, moved to `means`, resemble each other."""
     size = np.log(np.maximum(splats.scales, 1e-12)).mean(axis=1, keepdims=True)
-    return np.concatenate([means / np.float32(reach), splats.base_colors / np.float32(HUE), size / np.float32(GROWTH)], 1)
+    return np.concatenate(
+        [means / np.float32(reach), splats.base_colors / np.float32(HUE), size / np.float32(GROWTH)], 1
+    )
 
 
 def _reach(splats: Splats) -> float:
@@ -217,7 +221,7 @@ def _in_order(frames: Sequence[Splats]) -> bool:
 
 
 @kernel()
-def _nearest(here: np.ndarray, there: np.ndarray) -> np.ndarray:  # type: ignore[type-arg]
+def _nearest(here: np.ndarray, there: np.ndarray) -> np.ndarray:
     """Returns int64 [n]: for each row of `here` [n, d] the row of `there` [m, d], sorted by its first column, nearest
     to it within a distance of 1, else -1."""
     found = np.full(len(here), -1, np.int64)

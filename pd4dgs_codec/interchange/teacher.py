@@ -172,9 +172,7 @@ def _value(key: str, text: str) -> Any:
     raise ValueError(text)
 
 
-def cameras_of(
-    place: Path, points: np.ndarray, options: Options, downscale: int = 1
-) -> tuple[list[Camera], Triple]:
+def cameras_of(place: Path, points: np.ndarray, options: Options, downscale: int = 1) -> tuple[list[Camera], Triple]:
     """Returns (cameras of a cameras.json beside the Gaussians, else cameras around `points` [n, 3]; up direction)."""
     beside = next((p / "cameras.json" for p in (place, *place.parents[:2]) if (p / "cameras.json").is_file()), None)
     if beside is not None:
