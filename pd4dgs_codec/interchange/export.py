@@ -17,16 +17,14 @@ from pd4dgs_codec.data.view import View, rotation_matrix
 from pd4dgs_codec.draw.gaussians import LEAST_NEAR, near_plane
 from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.interchange.splats import (
-    Splats,
     evenly,
-    harmonics,
     looking,
     picture,
     principal_axes,
     quaternions,
     sphere,
-    unit,
 )
+from pd4dgs_codec.kinds.splats import Splats, harmonics, unit
 from pd4dgs_codec.quality.image import mpsnr
 from pd4dgs_codec.scene import MIN_OPACITY, Camera
 
