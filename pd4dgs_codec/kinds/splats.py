@@ -56,6 +56,10 @@ class Splats:
         basis = harmonics(unit(self.means - eye.astype(np.float32)), self.degree)
         return np.asarray(np.maximum(np.einsum("nj,njc->nc", basis, self.sh) + np.float32(0.5), 0))
 
+    def seen_from(self, eye: np.ndarray, slots: np.ndarray) -> Gaussians:
+        """Returns the Gaussians with their colours seen from `eye` [3], world."""
+        return Gaussians(self.means, self.quats, self.scales, self.opacities, self.colors(eye), slots)
+
     @property
     def base_colors(self) -> np.ndarray:
         """float32 [N, 3] 0..1: the mean colours over all directions."""
@@ -195,7 +199,8 @@ class SplatScene(LayeredScene):
             return Moving(self.at(t, level)).at(t)
 
     def _evaluated(self, t: float, eye: np.ndarray) -> Gaussians:
-        return Moving(self).gaussians(t, eye)
+        splats, rows = Moving(self).at(t)
+        return splats.seen_from(eye, rows)
 
 
 class Moving:
@@ -241,11 +246,6 @@ class Moving:
             return splats, self._rows
         seen = np.flatnonzero(splats.opacities >= np.float32(MIN_OPACITY))
         return splats.taken(seen), self._rows[seen]
-
-    def gaussians(self, t: float, eye: np.ndarray) -> Gaussians:
-        """Returns the visible Gaussians at normalised time t in 0..1 seen from `eye` float32 [3]."""
-        splats, rows = self.at(t)
-        return Gaussians(splats.means, splats.quats, splats.scales, splats.opacities, splats.colors(eye), rows)
 
 
 def scene(
