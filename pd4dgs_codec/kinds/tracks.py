@@ -139,7 +139,10 @@ def tracks_of(tensors: Tensors, rows: list[np.ndarray]) -> Tracks:
 
 
 def json_of_layer(tables: Tables) -> dict[str, Any]:
-    """instants: their number T. heads: number K of bases by name. steps: of each head's coefficients, and of bases."""
+    """instants: their number T. heads: number K of bases by name. steps: of each head's coefficients, and of bases. All
+    are empty without tracks."""
+    if not tables.grids:
+        return {"steps": {}, "instants": 0, "heads": {}}
     names = list(HEADS)
     steps = {names[rows.id]: rows.step for rows in tables.rows} | {"bases": tables.grid_step}
     heads = {names[rows.id]: rows.channels for rows in tables.rows}
