@@ -11,7 +11,7 @@ import numpy as np
 
 from pd4dgs_codec.entropy.fitting import Fitted
 from pd4dgs_codec.errors import DecodeError, EncodeError, LimitExceeded
-from pd4dgs_codec.format.check import check_scene
+from pd4dgs_codec.format.check import Errors, check_scene, verify_errors
 from pd4dgs_codec.format.container import (
     CHUNK_OVERHEAD,
     FLAG_ANCILLARY,
@@ -30,7 +30,7 @@ from pd4dgs_codec.format.plan import LeftOut, SceneSymbols, plan
 from pd4dgs_codec.format.reader import read_layers
 from pd4dgs_codec.format.registry import MAX_CHUNKS
 from pd4dgs_codec.format.symbols import LayerSymbols, sliced
-from pd4dgs_codec.scene import Scene
+from pd4dgs_codec.kinds import AnyScene, utility_of
 from pd4dgs_codec.threads import one_blas_thread
 
 LATER = 2 / 3  #: size of the slices behind the first one of layer 0, of that one's
@@ -75,7 +75,7 @@ class LayerReport:
 @dataclass(frozen=True)
 class Report:
     """The report of an encode. left_out: rows {what, why, lossless, bytes} with the estimated bytes of each part left
-    out. metadata_bytes: of the metadata chunk, 0 without one."""
+    out. errors: by field of Steps, empty if not verified. metadata_bytes: of the metadata chunk, 0 without one."""
 
     mode: str
     bytes: int
@@ -83,6 +83,7 @@ class Report:
     seconds: float
     layers: list[LayerReport]
     left_out: list[dict[str, Any]]
+    errors: list[Errors]
     metadata_bytes: int
 
     def added_bytes(self) -> dict[int, int]:
@@ -100,26 +101,26 @@ class Report:
         return asdict(self)
 
 
-def encode(scene: Scene, options: EncodeOptions = DEFAULTS, **changes: Any) -> bytes:
+def encode(scene: AnyScene, options: EncodeOptions = DEFAULTS, **changes: Any) -> bytes:
     """Returns the bytes of a `.pd4` file. Options, changes and errors as in encode_with_report."""
     return encode_with_report(scene, options, **changes)[0]
 
 
 @one_blas_thread()
 def encode_with_report(
-    scene: Scene,
+    scene: AnyScene,
     options: EncodeOptions = DEFAULTS,
     *,
     left_out: Sequence[LeftOut] = (),
     metadata: Metadata | None = None,
-    utility: Callable[[Scene], np.ndarray] | None = None,
+    utility: Callable[[AnyScene], np.ndarray] | None = None,
     **changes: Any,
 ) -> tuple[bytes, Report]:
     """Encodes a scene; returns (bytes of the file, report).
 
     left_out: parts that the caller has removed from the scene, added to the report. metadata: stored in the file.
     utility: function of the decoded scene, float [N], the gain in image quality by each anchor. It orders the anchors
-    of sliced layers; by_size if None. changes: fields of EncodeOptions that replace those of `options`.
+    of sliced layers; `kinds.utility_of` if None. changes: fields of EncodeOptions that replace those of `options`.
     Raises EncodeError.
     """
     started = time.perf_counter()
@@ -127,8 +128,9 @@ def encode_with_report(
     check_scene(scene)
     planned = plan(scene, options)
     symbols, omitted = planned.symbols, planned.left_out
+    errors = verify_errors(planned.scene, symbols) if options.verify else []
     del planned  # as large as the scene
-    written = _write_layers(symbols, options, utility or by_size)
+    written = _write_layers(symbols, options, utility or utility_of)
     data, about_bytes = _container(symbols, options.mode, written), 0
     if metadata is not None:
         data, about_bytes = with_metadata(data, metadata)
@@ -140,15 +142,7 @@ def encode_with_report(
     kept_bits = sum(r.position_bits + s.payload_bits for r in reports for s in r.streams if s.name == "attributes")
     rows = [item.row(options, kept, kept_bits) for item in (*left_out, *omitted)]
     seconds = round(time.perf_counter() - started, 4)
-    return data, Report(options.mode, len(data), options.verify, seconds, reports, rows, about_bytes)
-
-
-def by_size(scene: Scene) -> np.ndarray:
-    """Estimates each anchor's utility without views, float32 [N]: its mask code in the highest layer times the largest
-    area, relative to other anchors, that its Gaussians may cover."""
-    scales = np.sort(scene.scaling_log[:, 3:], axis=1)[:, 1:].sum(axis=1)
-    utility: np.ndarray = scene.mask[-1] * np.exp(scales - scales.max(initial=0))
-    return utility
+    return data, Report(options.mode, len(data), options.verify, seconds, reports, rows, errors, about_bytes)
 
 
 def with_metadata(data: bytes, metadata: Metadata) -> tuple[bytes, int]:
@@ -170,7 +164,7 @@ def header_size(symbols: SceneSymbols, mode: str, chunks: int, most: int) -> int
 
 
 def _write_layers(
-    symbols: SceneSymbols, options: EncodeOptions, utility: Callable[[Scene], np.ndarray]
+    symbols: SceneSymbols, options: EncodeOptions, utility: Callable[[AnyScene], np.ndarray]
 ) -> list[list[_Slice]]:
     """Writes the slices of each layer. The preamble and the header count with the first slice."""
     if not options.slices:

@@ -9,8 +9,10 @@ import numpy as np
 import torch
 
 from pd4dgs_codec.data.view import View
+from pd4dgs_codec.draw.player import drawer
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import in_file_order, layer_symbols, passed, symbols_of, tensor_bytes
+from pd4dgs_codec.kinds import AnyScene
 from pd4dgs_codec.model.model import Model, from_scene
 from pd4dgs_codec.model.networks import EXACT, Rounding
 from pd4dgs_codec.model.picture import render_image
@@ -50,19 +52,26 @@ def level_psnr(
 ) -> float:
     """Returns the mean mPSNR of a level over `views`, dB, of each at most MOST_DB. step is called after each."""
 
-    def draw(view: View) -> np.ndarray:
-        return render_image(model, level, view.time, view.camera, rounding)
+    return _mean_psnr(lambda view: render_image(model, level, view.time, view.camera, rounding), views, step)
 
+
+def _mean_psnr(draw: Callable[[View], np.ndarray], views: Sequence[View], step: Callable[[], None]) -> float:
     capped = {"mpsnr": lambda *pictures: min(mpsnr(*pictures), MOST_DB)}
     return mean_scores(draw, views, capped, step)["mpsnr"]
 
 
 def true_psnr(
-    scene: Scene, levels: Iterable[int], views: Sequence[View], step: Callable[[], None] = lambda: None
+    scene: AnyScene, levels: Iterable[int], views: Sequence[View], step: Callable[[], None] = lambda: None
 ) -> dict[int, float]:
     """Returns `level_psnr` of a decoded scene at each of `levels`, which may lie above its highest layer."""
-    model = from_scene(scene)
-    return {level: level_psnr(model, level, views, step) for level in levels}
+    if isinstance(scene, Scene):
+        model = from_scene(scene)
+        return {level: level_psnr(model, level, views, step) for level in levels}
+    players = {level: drawer(scene.prefix(level)) for level in levels}
+    return {
+        level: _mean_psnr(lambda view: player.picture(view.camera, view.time), views, step)  # noqa: B023
+        for level, player in players.items()
+    }
 
 
 # -- errors of a quantised scene ---------------------------------------------------------------------------------------
@@ -83,7 +92,7 @@ class RenderedLoss:
         model = from_scene(self.scene)
         return {level: pictures(model, level, self.viewpoints, self.step) for level in self.scene.layers}
 
-    def mse(self, scene: Scene) -> dict[int, float]:
+    def mse(self, scene: AnyScene) -> dict[int, float]:
         """Returns per level the mean squared error over all pictures, colours in 0..1."""
         model, found = from_scene(scene), {}
         for level, references in self.references.items():
@@ -91,7 +100,7 @@ class RenderedLoss:
             found[level] = float(np.mean([np.square(a - b).mean() for a, b in pairs]))
         return found
 
-    def mean_mse(self, scene: Scene) -> float:
+    def mean_mse(self, scene: AnyScene) -> float:
         """Returns the mean of `mse` over the levels."""
         return float(np.mean(list(self.mse(scene).values())))
 

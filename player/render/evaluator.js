@@ -11,7 +11,7 @@ import { eachAttribute, GAUSSIAN_COLUMNS, levelOf } from "./level.js";
 import { anchorColumns } from "./record.js";
 import { ANCHOR_BITS, NO_ENTRY } from "./sort.js";
 /** @import { Network } from "../decode/tensors.js" */
-/** @import { Deformation, Scene } from "../kinds/index.js" */
+/** @import { Deformation, AnchorScene } from "../kinds/index.js" */
 /** @import { Field, Gpu } from "./gl.js" */
 /** @import { List, Lister } from "./sort.js" */
 
@@ -103,7 +103,7 @@ export class GpuEvaluator {
   /**
    * Throws TooLarge where the scene's networks or planes are larger than shaders take.
    *
-   * @param {Gpu} gpu @param {Scene} scene
+   * @param {Gpu} gpu @param {AnchorScene} scene
    */
   constructor(gpu, scene) {
     this._gpu = gpu;

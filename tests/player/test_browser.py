@@ -48,7 +48,8 @@ from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.format.encoder import with_metadata
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.format.metadata import Metadata
-from pd4dgs_codec.interchange.splats import Splats, ply_bytes
+from pd4dgs_codec.interchange.splats import ply_bytes
+from pd4dgs_codec.kinds.splats import Splats
 from pd4dgs_codec.scene import Camera, Deformation, Scene, SceneInfo, Steps, Widths
 from pd4dgs_codec.web.page import Still
 from pd4dgs_codec.web.page import page as packed_page
