@@ -29,8 +29,8 @@ from pd4dgs_codec.interchange.pack import (
     turned,
 )
 from pd4dgs_codec.interchange.sampled import Sampled
-from pd4dgs_codec.interchange.splats import Splats
 from pd4dgs_codec.kinds import splats
+from pd4dgs_codec.kinds.splats import Splats
 from pd4dgs_codec.kinds.tracks import Head, Tracks
 from pd4dgs_codec.scene import Camera, SceneInfo
 

@@ -15,8 +15,10 @@ import numpy as np
 
 from pd4dgs_codec.draw.simd import kernel
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.interchange.splats import Splats, evenly
+from pd4dgs_codec.interchange.runs import visible
+from pd4dgs_codec.interchange.splats import evenly
 from pd4dgs_codec.interchange.teacher import Teacher
+from pd4dgs_codec.kinds.splats import Splats
 
 MOST_FRAMES = 4096  #: instants of tracks, a limit of the format
 MOST_NUMBERS = 1 << 29  #: numbers of all samples, which take 2 GiB
@@ -74,13 +76,6 @@ class Sampled:
         still &= np.abs(np.einsum("tnd,nd->tn", self.quats, self.quats[0])).min(axis=0) > 1 - MOVES**2
         found: np.ndarray = still if self.windows is None else still & (self.windows[:, 1] >= 0.5)
         return found
-
-
-def visible(windows: np.ndarray, t: float) -> np.ndarray:
-    """Returns float32 [n]: the factors on opacities at time t of windows [n, 3] (centre, half width, softness)."""
-    outside = np.maximum(np.abs(t - windows[:, 0]) - windows[:, 1], 0)
-    shown: np.ndarray = np.exp(-0.5 * np.square(outside / windows[:, 2])).astype(np.float32)
-    return shown
 
 
 def sampled(model: Teacher, where: str, fps: float = 30.0, step: Step = lambda: None) -> Sampled:

@@ -92,7 +92,7 @@ def _iteration(folder: Path) -> Path:
         what = f"{PLY}, here or in point_cloud/iteration_N"
         raise DataError(f"{folder}: has no {what}; expected a checkpoint of Scaffold-GS")
     if network := network_of(place):
-        how = f"train with pd4dgs-train teacher:{folder}"
+        how = f"-o FILE.pd4 packs it, pd4dgs-train teacher:{folder} learns from it"
         raise DataError(f"{folder}: {network.name} moves its Gaussians, expected a checkpoint of Scaffold-GS; {how}")
     return place
 

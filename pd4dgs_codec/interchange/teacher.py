@@ -1,9 +1,10 @@
 """Renders other programs' Gaussians over time into a dataset: the source `teacher:PATH[?key=value&...]`.
 
 PATH is a folder of PLY, SPZ or .splat files, one per frame, in the order of the last number in their names, or one such
-file; a `.4dgs` file; a static gsplat checkpoint; a run of 4DGaussians or Deformable-3DGS or one of its
-`point_cloud/iteration_N`; or `module:function`, called with t in 0..1. The function returns means, quats (wxyz),
-scales, opacities and either colors or sh, as a mapping or as attributes, numpy arrays or tensors.
+file; a `.4dgs` file; a PLY file of SpacetimeGaussians (lite); a static gsplat checkpoint; a run of 3D Gaussian
+splatting, 4DGaussians or Deformable-3DGS or one of its `point_cloud/iteration_N`; or `module:function`, called with t
+in 0..1. The function returns means, quats (wxyz), scales, opacities and either colors or sh, as a mapping or as
+attributes, numpy arrays or tensors.
 
 Keys: cameras=SOURCE uses the training cameras of a dataset and their times. Otherwise views=N cameras (200) of
 size=WxH pixels (400x400) surround the Gaussians; a `cameras.json` beside them gives at most N cameras instead. fps=F
@@ -28,10 +29,20 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.data.dataset import color, load
-from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, files_of, last_numbers, read_file, split_options
+from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, MAX_HEADER, files_of, last_numbers, read_file, split_options
 from pd4dgs_codec.data.view import Dataset, View, depth_range, held_out, normalised_times, points_box, seconds_range
 from pd4dgs_codec.errors import DataError, one_line, required
-from pd4dgs_codec.interchange.runs import read_cameras, read_deformed
+from pd4dgs_codec.interchange.runs import (
+    PLY,
+    SPACETIME,
+    Config,
+    iteration,
+    read_cameras,
+    read_deformed,
+    read_spacetime,
+    run_of,
+    visible,
+)
 from pd4dgs_codec.interchange.splats import (
     EXTRA,
     SH_SPAN,
@@ -221,11 +232,13 @@ def read_model(place: str, fps: float) -> Teacher:
     path = Path(place)
     if path.is_dir():
         run = read_deformed(path)
-        return Teacher(run[0], None, 1.0, run[1]) if run else _folder(path, fps)
+        return Teacher(run[0], None, 1.0, run[1]) if run else _still_run(path) or _folder(path, fps)
     if path.is_file():
         raw = read_file(path)
         if raw.startswith(FOURDGS):
             return _fourdgs(path, raw)
+        if SPACETIME in raw[:MAX_HEADER]:
+            return _spacetime(path, raw)
         splats = read_splats(path, raw)
         return Teacher(lambda t: splats, (0.0,), 1.0)
     if match := re.fullmatch(r"([A-Za-z_][\w.]*):([A-Za-z_]\w*)", place):
@@ -235,18 +248,39 @@ def read_model(place: str, fps: float) -> Teacher:
     )
 
 
+def _still_run(folder: Path) -> Teacher | None:
+    """Reads the last iteration of a run of 3D Gaussian splatting, or of SpacetimeGaussians; None for other folders."""
+    place = iteration(folder)
+    if place is None or place == folder and len(files_of(folder, FRAME_SUFFIXES)) > 1:
+        return None
+    if (place / "opacity_mlp.pt").is_file() or (place / "checkpoints.pth").is_file():
+        raise DataError(f"{folder}: is a run of Scaffold-GS, which becomes a checkpoint: pd4dgs-import -o model.pt")
+    return replace(read_model(str(place / PLY), 1.0), background=Config.of(run_of(place)).background)
+
+
+def _spacetime(path: Path, raw: bytes) -> Teacher:
+    """Reads a PLY file of SpacetimeGaussians."""
+    bare, windows = read_spacetime(path, raw)
+
+    def splats(t: float) -> Splats:
+        found = bare(t)
+        return replace(found, opacities=found.opacities * visible(windows, t))
+
+    return Teacher(splats, None, 1.0, windows=windows, bare=bare)
+
+
 def _folder(folder: Path, fps: float) -> Teacher:
     """Reads a folder of one file per frame, in the order of the last number in the names."""
     paths = max((files_of(folder, [suffix]) for suffix in FRAME_SUFFIXES), key=len)
     if not paths:
         raise DataError(f"{folder}: holds no file that ends in {', '.join(FRAME_SUFFIXES)}, expected one per frame")
-    numbers = last_numbers(paths) or range(len(paths))
-    found, paths = zip(*sorted(zip(numbers, paths, strict=True)), strict=True)
-    gaps = np.diff(found)
-    if len(gaps) and (lost := np.flatnonzero(gaps != gaps.min())).size:
-        missing = found[lost[0]] + gaps.min() if gaps.min() else found[gaps.argmin()]
-        what = f"has no frame {missing}" if gaps.min() else f"has several frames {missing}"
-        raise DataError(f"{folder}: {what}, expected one for each number from {found[0]} to {found[-1]}")
+    numbers = last_numbers(paths) or list(range(len(paths)))
+    paths, numbers = [path for _, path in sorted(zip(numbers, paths, strict=True))], sorted(numbers)
+    gaps = np.diff(numbers)
+    if len(gaps) and (odd := np.flatnonzero(gaps != max(gaps.min(), 1))).size:
+        least, before = int(gaps.min()), numbers[int(odd[0])]
+        what = f"has no frame {before + least}" if least else f"has several frames {numbers[int(gaps.argmin())]}"
+        raise DataError(f"{folder}: {what}, expected one for each number from {numbers[0]} to {numbers[-1]}")
     times = tuple(i / max(len(paths) - 1, 1) for i in range(len(paths)))
 
     frame = lru_cache(maxsize=2)(read_splats)
