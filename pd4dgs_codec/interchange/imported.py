@@ -23,6 +23,7 @@ from pd4dgs_codec.interchange.teacher import SOLID, Options, Teacher, cameras_of
 from pd4dgs_codec.kinds.splats import SplatScene
 from pd4dgs_codec.quality.image import mpsnr
 from pd4dgs_codec.scene import Camera, SceneInfo
+from pd4dgs_codec.threads import one_blas_thread
 
 #: Cameras; of so many of them one measures the result and decides nothing. Width and height of a dome's pictures.
 CAMERAS, HOLDOUT, SIZE = 72, 6, 400
@@ -62,6 +63,7 @@ class Imported:
         )
 
 
+@one_blas_thread()
 def import_model(
     place: str,
     *,
