@@ -25,8 +25,9 @@ from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.interchange.export import bake, eyes_of_scene
 from pd4dgs_codec.interchange.splats import evenly, fourdgs_bytes, picture, ply_bytes, read_splats, sphere, spz_bytes
 from pd4dgs_codec.interchange.teacher import Options, Teacher, cameras_of, read_model
-from pd4dgs_codec.kinds.splats import SH_C0, Splats, unit
+from pd4dgs_codec.kinds.splats import SH_C0, Splats, SplatScene, unit
 from pd4dgs_codec.quality.image import mpsnr, to_uint8
+from pd4dgs_codec.scene import Scene
 
 GOALS = (34, 38, 42, 46)  #: dB of the curve
 GOAL, STILL_GOAL = 43, 50  #: dB of the table
@@ -35,6 +36,8 @@ FAINT = 1e-4  #: opacity of the sample's Gaussians in frames that do not show th
 SEEDS, FPS = 3, 30.0
 JUDGES = 12  #: pictures that measure other formats and held-out instants
 BODIES, EACH = 10, 1500
+Triple = tuple[float, float, float]
+BLACK = (0.0, 0.0, 0.0)
 
 # -- sources -----------------------------------------------------------------------------------------------------------
 
@@ -115,7 +118,9 @@ MOTIONS = {"flying": _flying, "bouncing": _bouncing, "bending": _bending, "appea
 
 def write_sample(folder: Path) -> None:
     """The sample as FRAMES PLY files with harmonics of degree 1. Every file has every Gaussian that any frame shows."""
-    player = Player(decode(sample().read_bytes()))
+    scene = decode(sample().read_bytes())
+    assert isinstance(scene, Scene)
+    player = Player(scene)
     eyes = eyes_of_scene(player, EYES)
     baked = [bake(player, i / (FRAMES - 1), eyes, 1) for i in range(FRAMES)]
     slots = np.unique(np.concatenate([own for _, own in baked]))
@@ -134,6 +139,13 @@ def write_sample(folder: Path) -> None:
 # -- measures ----------------------------------------------------------------------------------------------------------
 
 
+def scene_of(data: bytes) -> SplatScene:
+    """Decodes a file of explicit Gaussians."""
+    scene = decode(data)
+    assert isinstance(scene, SplatScene)
+    return scene
+
+
 def packed(source: str | Path, *options: object) -> tuple[bytes, Row]:
     """The file that pd4dgs-import makes, and its report with `encode` and `decode` seconds."""
     with tempfile.TemporaryDirectory() as folder:
@@ -146,7 +158,7 @@ def packed(source: str | Path, *options: object) -> tuple[bytes, Row]:
 
 
 def differences(
-    model: Teacher, shown: Callable[[float], Splats], place: Path, times: Sequence[float], background: tuple[float, ...]
+    model: Teacher, shown: Callable[[float], Splats], place: Path, times: Sequence[float], background: Triple = BLACK
 ) -> float:
     """Mean PSNR in dB of the pictures of `shown` against the model's, from JUDGES cameras of a dome at these times."""
     middle = model.splats(model.nearest(0.5))
@@ -168,7 +180,7 @@ def others(model: Teacher, place: Path, times: Sequence[float], seconds: float) 
             path.write_bytes(spz_bytes(frame))
         row["spz"] = sum(path.stat().st_size for path in files)
         at = {t: path for t, path in zip(times, files, strict=True)}
-        row["spz_db"] = differences(model, lambda t: read_splats(at[t]), place, times, (0.0, 0.0, 0.0))
+        row["spz_db"] = differences(model, lambda t: read_splats(at[t]), place, times)
         if len(frames) == 1:
             return row
         path = Path(folder) / "scene.4dgs"
@@ -177,7 +189,7 @@ def others(model: Teacher, place: Path, times: Sequence[float], seconds: float) 
         path.write_bytes(fourdgs_bytes(spans, seconds))
         row["4dgs"] = path.stat().st_size
         read = read_model(str(path), FPS)
-        row["4dgs_db"] = differences(model, read.splats, place, times[1:-1], (0.0, 0.0, 0.0))
+        row["4dgs_db"] = differences(model, read.splats, place, times[1:-1])
     return row
 
 
@@ -185,7 +197,7 @@ def measured(name: str, source: str, goal: float, *, held_out: Path | None = Non
     """One source: its file, and those of other formats. held_out: a folder with the frames between the source's."""
     options = ("--fps", FPS / 2) if held_out else ()
     data, report = packed(source, "--psnr", goal, *options)
-    scene, model = decode(data), read_model(source, FPS)
+    scene, model = scene_of(data), read_model(source, FPS)
     top = str(max(map(int, report["psnr"])))
     row = {"name": name, "gaussians": report["gaussians"], "bytes": len(data), "psnr": report["psnr"][top]}
     row |= {key: report[key] for key in ("encode", "decode", "static", "instants")} | {"levels": report["psnr"]}
@@ -194,7 +206,7 @@ def measured(name: str, source: str, goal: float, *, held_out: Path | None = Non
         whole = read_model(str(held_out), FPS)
         assert whole.times
         between = whole.times[1::2]
-        row["between"] = differences(whole, lambda t: scene.splats(t)[0], held_out, between, (0.0, 0.0, 0.0))
+        row["between"] = differences(whole, lambda t: scene.splats(t)[0], held_out, between)
     elif model.times is None:
         row["between"] = row["psnr"]  # the cameras of a function measure at any time
     if peers:
@@ -239,7 +251,7 @@ def draw_curve(curves: dict[str, list[tuple[float, float]]], path: Path) -> None
 
 def draw_beside(frames: Path, data: bytes, path: Path) -> None:
     """Source and file at three instants, side by side."""
-    model, scene, rows = read_model(str(frames), FPS), decode(data), []
+    model, scene, rows = read_model(str(frames), FPS), scene_of(data), []
     middle = model.splats(model.nearest(0.5))
     cameras, _ = cameras_of(frames, middle.means[middle.opacities > 0.1], Options(views=20, size=(240, 240)))
     for t in (0.1, 0.5, 0.9):

@@ -42,6 +42,8 @@ BIT = 2 * np.log(2)  #: what a bit is worth, in units of the error that a scalar
 MOST_BASES = 80  #: of a head, components and a limit of the format on channels
 STRAIGHT = 0.05  #: the share of the allowed error that left-out instants may add
 CHECKED = 12  #: pictures that measure the error
+#: Windows are precise to PRECISE of the width that all but the share SHORT of them have.
+PRECISE, SHORT = 0.1, 0.01
 STATIC = 1e-12  #: the least share of a picture's squared error for which anything changes
 
 
@@ -140,10 +142,10 @@ class Packer:
             centres["color"], centres["harmonics"], steps["harmonics"] = middle[:3], middle[3:], steps["color"]
         if self.source.windows is not None:
             windows = self.source.windows[packed.rows].astype(np.float64)
+            shortest = np.quantile(windows[:, 1] + windows[:, 2], SHORT)
             windows[:, 2] = np.log(windows[:, 2])
-            finest = min(0.25 / max(len(self.source.times) - 1, 1), float(np.exp(windows[:, 2].min()) / 4))
             spacing = np.ldexp(1.0, packed.classes.astype(int))[:, None]
-            step = float(np.float32(finest / spacing[-1].max() if len(spacing) else finest))
+            step = float(np.float32(PRECISE * shortest / spacing.max()))
             middle = np.rint(np.median(windows, axis=0) / step)
             k = np.rint((windows / step - middle) / spacing)
             tensors["window"] = ((middle + k * spacing) * step).astype(np.float32)
