@@ -231,7 +231,8 @@ def _slice_lines(result: dict[str, Any]) -> list[str]:
         for layer, own in zip(result["layers"], sizes, strict=True)
     ]
     if over := [row["layer"] for row, own in zip(result["layers"], sizes, strict=True) if own[0] > about["size"]]:
-        lines.append(f"first slices of layers {over} exceed {about['size']:,} bytes: networks, planes and tracks stay whole")
+        what = "networks, planes and tracks stay whole"
+        lines.append(f"first slices of layers {over} exceed {about['size']:,} bytes: {what}")
     seen = f" on {about['pictures']} views: {about['cameras']}" if about["pictures"] else ""
     seen = ": the file has no camera" if about["order"].startswith("gate") else seen
     lines.append(f"anchors ordered by {about['order']}{seen}")

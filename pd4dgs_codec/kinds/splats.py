@@ -133,7 +133,7 @@ def splats_of(tensors: Mapping[str, np.ndarray]) -> Splats:
         means=np.ascontiguousarray(tensors["position"], np.float32),
         quats=_rotations(np.concatenate([w, xyz], axis=1)).astype(np.float32),
         scales=np.exp(tensors["scale"]).astype(np.float32),
-        opacities=_sigmoid(tensors["opacity"][:, 0]).astype(np.float32),
+        opacities=sigmoid(tensors["opacity"][:, 0]).astype(np.float32),
         sh=np.moveaxis(sh.astype(np.float32), -1, 0),
     )
 
@@ -146,8 +146,10 @@ def _rotations(p: np.ndarray) -> np.ndarray:
     return np.asarray(found)
 
 
-def _sigmoid(x: np.ndarray) -> np.ndarray:
-    return np.asarray(1 / (1 + np.exp(-x)))
+def sigmoid(x: np.ndarray) -> np.ndarray:
+    """Returns 1 / (1 + exp(-x)) of logits of any shape."""
+    with np.errstate(over="ignore"):
+        return np.asarray(1 / (1 + np.exp(-x)))
 
 
 # -- the scene ---------------------------------------------------------------------------------------------------------
@@ -233,7 +235,7 @@ class Moving:
     def at(self, t: float) -> tuple[Splats, np.ndarray]:
         """Returns (the visible Gaussians at normalised time t in 0..1, their rows int64 [K])."""
         rest, mask, added = self._rest, self._mask, total(self._tracks, t, len(self._rows))
-        opacities = rest.opacities if "opacity" not in added else _sigmoid(self._logits + added["opacity"][:, 0])
+        opacities = rest.opacities if "opacity" not in added else sigmoid(self._logits + added["opacity"][:, 0])
         if self._window is not None:
             centre, half, softness = self._window
             excess = np.maximum(np.abs(np.float32(t) - centre) - half, 0)
