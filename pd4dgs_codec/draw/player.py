@@ -50,6 +50,7 @@ class Player:
 
     def __init__(self, scene: Scene):
         self.info, self.level = scene.info, scene.level
+        self.background = scene.background  #: RGB 0..1 behind the Gaussians
         codes = scene.mask[-1]
         self._mask = codes.astype(np.float32) * MASK_STEP
         self._anchor = np.ascontiguousarray(scene.anchor[: len(codes)], np.float32)
@@ -86,14 +87,17 @@ class Player:
 
     def picture(self, camera: Camera, t: float) -> np.ndarray:
         """Draws float32 [H, W, 3] in 0..1 at normalised time t in 0..1. Raises RenderError unless t is finite."""
+        picture: np.ndarray = np.clip(self.drawn(camera, t)[0], 0, 1)
+        return picture
+
+    def drawn(self, camera: Camera, t: float) -> tuple[np.ndarray, np.ndarray]:
+        """Returns (`picture` before it is clipped, alpha float32 [H, W])."""
         check_time(t)
         g = self.gaussians(camera, t)
         finite = np.isfinite(g.colors).all(axis=1)  # a colour that overflowed hides its Gaussian
         opacities, colors = np.where(finite, g.opacities, np.float32(0)), np.nan_to_num(g.colors)
         near = near_plane(self.info)
-        image, _ = draw(g.means, g.quats, g.scales, opacities, colors, camera, self.info.background, near_plane=near)
-        picture: np.ndarray = np.clip(image, 0, 1)
-        return picture
+        return draw(g.means, g.quats, g.scales, opacities, colors, camera, self.background, near_plane=near)
 
     def gaussians(self, camera: Camera, t: float) -> Gaussians:
         """Returns the Gaussians that the camera may see at normalised time t in 0..1."""

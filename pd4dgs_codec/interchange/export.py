@@ -289,7 +289,7 @@ class Export:
             camera = self.eyes.cameras[i]
             camera = shrunk(camera, int(np.ceil(np.sqrt(camera.width * camera.height / TARGET_PIXELS))))
             targets[i] = turned_camera(camera, turn), self.player.picture(camera, t)
-        refined = refine(started, targets, order, info.background, near_plane(info), step)
+        refined = refine(started, targets, order, self.player.background, near_plane(info), step)
         return refined, Learnt(slots, baked, refined)
 
 
@@ -340,7 +340,7 @@ def cost(export: Export, views: Sequence[View], step: Step = lambda: None) -> di
     for view in views:
         direct = export.player.picture(view.camera, view.time)
         splats, _ = export.splats(view.time)
-        image = picture(splats, view.camera, info.background, near_plane(info))
+        image = picture(splats, view.camera, export.player.background, near_plane(info))
         error = float(np.square(image.astype(np.float64) - direct).mean())
         to_direct = -10 * np.log10(max(error, np.finfo(float).tiny))
         rows.append((mpsnr(direct, view.image, view.mask), mpsnr(image, view.image, view.mask), to_direct))

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -272,7 +272,8 @@ def to_scene(model: Model) -> Scene:
 def from_scene(scene: Scene) -> Model:
     """Returns the model that renders `scene`, with anchors in the scene's order.
 
-    A level whose layer is absent equals the level below it; masks are reproduced to within 1e-6.
+    A level whose layer is absent equals the level below it; masks are reproduced to within 1e-6. All levels have the
+    background of the highest one.
     """
     n = len(scene.anchor_q)
     masks = np.zeros((n, 3), np.float64)
@@ -284,7 +285,7 @@ def from_scene(scene: Scene) -> Model:
     fields = (scene.global_deformation, scene.local_deformation)
     global_field, local_field = (None if f is None else DeformationField.from_arrays(f, box) for f in fields)
     return Model(
-        scene.info,
+        replace(scene.info, background=scene.background),
         scene.steps,
         torch.from_numpy(scene.anchor_q.astype(np.int32)),
         torch.from_numpy(np.array(scene.feature, np.float32)),

@@ -79,6 +79,8 @@ def load_levels(
     if background is not None:
         for level in levels:
             level.model.info = replace(level.model.info, background=background)
+            if isinstance(level.model, Player):
+                level.model.background = background
     return levels
 
 

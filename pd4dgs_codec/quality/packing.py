@@ -15,6 +15,7 @@ from pd4dgs_codec.format.encoder import Report, encode_with_report, with_metadat
 from pd4dgs_codec.format.metadata import Metadata
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.plan import LeftOut, plan
+from pd4dgs_codec.format.tables import Fill
 from pd4dgs_codec.quality.frames import own_frames
 from pd4dgs_codec.scene import Scene, SceneInfo, Viewpoint
 
@@ -175,21 +176,28 @@ class _Pictures:
         if not options.slices:
             return *encode_with_report(scene, options, left_out=left_out, metadata=metadata), None
         from pd4dgs_codec.model.model import from_scene
-        from pd4dgs_codec.quality.measure import in_order, level_psnr, own_views, true_psnr
+        from pd4dgs_codec.model.sensitivity import smaller
+        from pd4dgs_codec.quality.measure import best_fill, in_order, level_psnr, own_views, pictures, true_psnr
 
         about: dict[str, Any] = {"order": "gate times area", "cameras": None, "pictures": 0, "size": options.slices}
         order: Callable[[Scene], np.ndarray] | None = None
+        fill: Callable[[Scene], Fill | None] | None = None
         if views := self.views:
             planned = plan(scene, options)
             about |= {"order": "rendered gain per byte", "cameras": views.source, "pictures": len(views.fitting)}
             left_out = [*left_out, *planned.left_out]
+            small = [(smaller(camera), time) for camera, time in views.fitting]
             with self.progress("ordering anchors") as step:
-                scene, values = in_order(planned.scene, views.fitting, options, step, passing=passing)
+                shown = pictures(from_scene(planned.scene), planned.scene.level, small)
+                scene, values = in_order(planned.scene, small, shown, options, step, passing=passing)
 
             def order(_: Scene) -> np.ndarray:
                 return values
 
-        data, report = encode_with_report(scene, options, left_out=left_out, utility=order)
+            def fill(prefix: Scene) -> Fill | None:
+                return best_fill(prefix, small, shown)
+
+        data, report = encode_with_report(scene, options, left_out=left_out, utility=order, fill=fill)
         if self.held_out:
             with self.progress("measuring slices") as step:
                 about["psnr"] = [
