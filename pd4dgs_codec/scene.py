@@ -202,7 +202,7 @@ class SceneInfo:
     voxel_size: float  #: scene units; anchors are integer multiples of it
     box: np.ndarray  #: float32 [2, 3], lower and upper corner; the HexPlanes' normalisation box, scene units
     time_range: tuple[float, float]  #: seconds; normalised time 0 and 1
-    background: tuple[float, float, float]  #: RGB as displayed, 0..1, behind every Gaussian
+    background: tuple[float, float, float]  #: RGB as displayed, 0..1, behind every Gaussian of a complete file
     near: float
     far: float
     up: tuple[float, float, float]  #: world direction
@@ -351,8 +351,8 @@ class Scene:
     mask: per present layer i, uint8 [rows[i]] codes (see MASK_STEP), non-decreasing from layer to layer.
     networks: "opacity", "covariance", "color". global_deformation belongs to layer 1, local_deformation to layer 2;
     each may be None (left out). The trunk of layer 2 reads the planes of layer 1 as well, see `motion`.
-    grading: None if all anchors have the same steps. fills: per present layer, what `background` is while this layer is
-    the highest one, RGB 0..255; None for that of `info`. Without entries all are None.
+    grading: None if all anchors have the same steps. fills: per present layer, the background while this layer is the
+    highest one, RGB 0..255; None for that of `info`. Without entries all are None.
     """
 
     info: SceneInfo
@@ -370,12 +370,12 @@ class Scene:
     grading: Grading | None = None
     fills: tuple[tuple[int, int, int] | None, ...] = ()
 
-    @property
-    def background(self) -> tuple[float, float, float]:
-        """RGB as displayed, 0..1, behind every Gaussian at the highest level: the fill of an incomplete file, or that
-        of `info`. Of a lower level it is `prefix(level).background`."""
-        fill = self.fills[-1] if self.fills else None
-        return self.info.background if fill is None else (fill[0] / 255, fill[1] / 255, fill[2] / 255)
+    def background(self, level: int = 2) -> tuple[float, float, float]:
+        """Returns what is behind every Gaussian at a level, RGB as displayed, 0..1: the fill of an incomplete file, or
+        the background of `info`."""
+        fill = [fill for layer, fill in zip(self.layers, self.fills, strict=False) if layer <= level][-1:]
+        red, green, blue = [code / 255 for code in fill[0]] if fill and fill[0] else self.info.background
+        return red, green, blue
 
     @property
     def widths(self) -> Widths:

@@ -396,6 +396,7 @@ class Layer:
         return cells, channels
 
     # 9.1 Channels and codes: "the symbol is base + v, which MUST lie in −K..K (8.2), else Malformed"
+    # 11.2 Rows: "A step class MUST lie in 0..6, else Malformed."
     def decode_lzma(self, codes, stream):
         """As decode_ans."""
         n, graded = self.rows, self.header["graded"]
@@ -404,7 +405,8 @@ class Layer:
         heads = [(codes.varint(8 * K + 3) if count else 0, count) for count in counts]
         need(all(code & 3 < 3 for code, _ in heads), "a channel of 8-byte symbols")
         size = sum(count << (code & 3) for code, count in heads)
-        reader = Reader(unpack_lzma(stream, size) if size or stream else b"")
+        need(size or not stream, "an LZMA stream of no channel")
+        reader = Reader(unpack_lzma(stream, size) if size else b"")
         channels = [
             ranged(take_numbers(reader, count, code & 3, unzigzag(code >> 2)), -K, K, "a symbol")
             for code, count in heads
@@ -521,6 +523,7 @@ class Ans:
 
 
 # 8.2 Priors: "kmin + n − 1 MUST NOT exceed K, else Malformed." "mu8 = g + 128·(n − 1) and si = v − 640"
+# 8.1 Tokens: "a new prior of this family"
 # 7.4 Mixture tables: "C(k) = ((256 − w)·C1(k) + w·C2(k)) >> 8"
 def read_prior(codes, family):
     """(kmin, n, cum) of clause 8.2."""

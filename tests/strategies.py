@@ -266,7 +266,7 @@ def coded(channels: Sequence[np.ndarray], known: list[Fitted] | None = None, **o
     """(codes, stream) of channels in one batch. known: the prior list. options: of ChannelWriter."""
     writer = ChannelWriter(**options)
     writer.write(channels, [] if known is None else known)
-    return bytes(writer.codes), writer.stream()
+    return writer.finish()[:2]
 
 
 def decoded(codes: bytes, stream: bytes, counts: Sequence[int]) -> list[np.ndarray]:

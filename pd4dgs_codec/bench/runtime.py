@@ -126,7 +126,7 @@ def view(level: Level, frame: Frame) -> View:
             gaussians = model.gaussians(level.level, frame.time, camera)
     names = ("means", "quats", "scales", "opacities", "colors")
     splats = {name: torch.as_tensor(np.ascontiguousarray(getattr(gaussians, name))) for name in names}
-    return {**splats, "camera": camera, "background": model.info.background, "near_plane": near_plane(model.info)}
+    return {**splats, "camera": camera, "background": level.background, "near_plane": near_plane(model.info)}
 
 
 def render_points(views: Sequence[View], names: Sequence[str], repeats: int, step: Step = lambda: None) -> list[Point]:

@@ -155,7 +155,7 @@ CHANNELS = [
 def _coded(*arrays: np.ndarray, priors: str = "best", effort: int = 5) -> tuple[bytes, bytes]:
     writer = channels.ChannelWriter(priors, effort)
     writer.write(arrays, [])
-    return bytes(writer.codes), writer.stream()
+    return writer.finish()[:2]
 
 
 def _lost_symbols(*arrays: np.ndarray) -> Found:

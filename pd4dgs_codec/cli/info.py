@@ -1,11 +1,11 @@
 """`pd4dgs-info`: what a `.pd4` file holds."""
 
 import argparse
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pd4dgs_codec.cli import options
 from pd4dgs_codec.cli.common import OK, Console, command, number, read_prefix, shown_name, table
-from pd4dgs_codec.errors import DataError
 
 DETAILS = """\
 The time to the first frame is 8 * (bytes to the end of the first slice) / rate, without latency.
@@ -26,7 +26,7 @@ def parser() -> options.Parser:
     p = options.Parser("info", "FILE", "Show the header and layers of a .pd4 file.", DETAILS)
     options.add_file(p, "FILE", ".pd4 file or URL; - reads stdin")
     p.add_argument("--check", action="store_true", help="decode the whole file and check every checksum and rule")
-    p.add_argument("--bytes", action="store_true", help="show the bytes of each layer by part")
+    p.add_argument("--bytes", action="store_true", help="show the bytes of each part of each layer")
     what = "show SHA-256 of the integers and float32 tensors of each layer"
     p.add_argument("--hashes", action="store_true", help=what)
     what = "link rates in bits per second for the time to the first frame (default: 2M,10M,50M)"
@@ -46,10 +46,11 @@ def _info(args: argparse.Namespace, console: Console) -> int:
     end = result["layers"][0]["slices"][0]["end"]
     result["first_frame_seconds"] = {name: 8 * end / rate for name, rate in args.at.items()}
     result["left_out"] = _left_out(result["layers"])
+    if args.bytes or args.check:
+        _, layers = read_layers(data)
     if args.bytes:
-        result["parts"] = _parts(result)
+        result["parts"] = _parts(result, [layer.bits for layer in layers])
     if args.check:
-        read_layers(data)
         result["checked"] = True
     if args.hashes:
         result["hashes"] = hashes(data)
@@ -63,16 +64,13 @@ def _info(args: argparse.Namespace, console: Console) -> int:
 main = command(parser, _info)
 
 
-def _parts(result: dict[str, Any]) -> list[dict[str, Any]]:
-    """Returns the bytes of each part of a payload by layer, and of all other parts. The header counts as part of layer
-    0; other chunks belong to no layer."""
+def _parts(result: dict[str, Any], bits: Sequence[Mapping[str, int]]) -> list[dict[str, Any]]:
+    """Returns the bytes of each group of channels by layer, and of all other parts. The header counts as part of layer
+    0; other chunks belong to no layer. bits: by group, of each layer."""
     layers = result["layers"]
-    missing = [row["layer"] for row in layers if "codes" not in row]
-    if missing:
-        raise DataError(f"{result['input']}: layer {missing[0]} is truncated, expected a complete file for --bytes")
     parts: list[dict[str, Any]]
-    parts = [{"part": name, "layers": [row[name] for row in layers]} for name in ("codes", "stream")]
-    frames = [row["bytes"] - row["codes"] - row["stream"] for row in layers]
+    parts = [{"part": name, "layers": [round(own[name] / 8) for own in bits]} for name in bits[0]]
+    frames = [row["bytes"] - sum(part["layers"][i] for part in parts) for i, row in enumerate(layers)]
     frames[0] += result["header_bytes"]
     parts.append({"part": "header, frames, parameters", "layers": frames})
     for row in parts:

@@ -184,7 +184,7 @@ def _still(scene: Scene) -> Still:
         Image.fromarray(to_uint8(picture)).save(file, "webp", quality=quality, method=6)
         if file.tell() <= STILL_BYTES:
             break
-    red, green, blue = to_uint8(np.array(scene.background))
+    red, green, blue = to_uint8(np.array(scene.background()))
     return Still(file.getvalue(), STILL_REACH, camera.width / camera.height, f"rgb({red},{green},{blue})")
 
 

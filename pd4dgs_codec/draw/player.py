@@ -49,8 +49,7 @@ class Player:
     """
 
     def __init__(self, scene: Scene):
-        self.info, self.level = scene.info, scene.level
-        self.background = scene.background  #: RGB 0..1 behind the Gaussians
+        self.info, self.level, self.background = scene.info, scene.level, scene.background()
         codes = scene.mask[-1]
         self._mask = codes.astype(np.float32) * MASK_STEP
         self._anchor = np.ascontiguousarray(scene.anchor[: len(codes)], np.float32)
@@ -91,7 +90,7 @@ class Player:
         return picture
 
     def drawn(self, camera: Camera, t: float) -> tuple[np.ndarray, np.ndarray]:
-        """Returns (`picture` before it is clipped, alpha float32 [H, W])."""
+        """Returns (`picture` before it is clipped, its alpha float32 [H, W])."""
         check_time(t)
         g = self.gaussians(camera, t)
         finite = np.isfinite(g.colors).all(axis=1)  # a colour that overflowed hides its Gaussian

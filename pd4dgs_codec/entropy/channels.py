@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
 from pd4dgs_codec.entropy import EFFORTS, PRIORS
 from pd4dgs_codec.entropy.ans import MAX_COUNT, AnsDecoder, ans_encode
-from pd4dgs_codec.entropy.fitting import Fit, Fitted, bits_under, fit_best, fit_gauss, histogram, plan_priors
+from pd4dgs_codec.entropy.fitting import Fit, Fitted, fit_best, fit_gauss, histogram, plan_priors
 from pd4dgs_codec.entropy.priors import (
     FIRST_REUSE,
     FREE_ENTRIES,
@@ -62,37 +63,39 @@ class ChannelWriter:
         if priors not in PRIORS or effort not in EFFORTS:
             raise EncodeError(f"expected priors best or gauss and effort 1..9, found {priors!r} and {effort}")
         self.codes = bytearray()
+        self._ends = [(0, 0)]  # of the batches so far: channels and bytes of codes
         self._fit: Fit = (lambda h: fit_best(h, effort)) if priors == "best" and effort > 1 else fit_gauss
         self._share = effort > 2
         self._spare = MORE_ENTRIES if later else FREE_ENTRIES  # window entries beyond the symbols of the batches
         self._symbols, self._cums = list[np.ndarray](), list[np.ndarray]()
 
-    def write(
-        self, channels: Sequence[np.ndarray], known: list[Fitted], counted: int | None = None
-    ) -> tuple[float, float]:
-        """Codes channels int [any], |k| <= 2**24. Returns (their bits by the tables, the sum of R(a)).
+    def write(self, channels: Sequence[np.ndarray], known: list[Fitted], counted: int | None = None) -> float:
+        """Codes channels int [any], |k| <= 2**24, as the next batch. Returns the sum of R(a).
 
         known: the prior list, to which new priors are appended. counted: symbols for which the windows may have an
         entry each, by default all; of further entries a batch uses at most half of what is left.
         """
         arrays = [array for array in check_channels(channels) if len(array)]
-        histograms, before, first = [histogram(a) for a in arrays], len(self.codes), len(known)
+        histograms, first = [histogram(a) for a in arrays], len(known)
         counted = sum(map(len, arrays)) if counted is None else counted
         plan = plan_priors(histograms, self._fit, self._share, known, counted + self._spare // 2)
-        bits = 0.0
-        for array, counts, fitted in zip(arrays, histograms, plan, strict=True):
+        for array, fitted in zip(arrays, plan, strict=True):
             window = fitted.prior.window
             inside, exceptions = _split(array, window)
             _write_channel(self.codes, fitted, exceptions, known)
             self._symbols.append(inside - window.kmin)
             self._cums.append(fitted.prior.cum)
-            bits += bits_under(counts, fitted)
         self._spare -= max(sum(fitted.prior.window.n for fitted in known[first:]) - counted, 0)
-        return bits + 8 * (len(self.codes) - before), sum(h.rate_bits for h in histograms)
+        self._ends.append((len(self._symbols), len(self.codes)))
+        return sum(h.rate_bits for h in histograms)
 
-    def stream(self) -> bytes:
-        """Returns the ANS stream of all batches."""
-        return ans_encode(self._symbols, self._cums)
+    def finish(self) -> tuple[bytes, bytes, list[int]]:
+        """Returns (codes, ANS stream, bits of each batch in both, but for the stream's rounding to words)."""
+        sizes = list[int]()
+        stream = ans_encode(self._symbols, self._cums, sizes)
+        left = [*sizes[::-1], 0]  # of each channel and those behind it
+        bits = [left[a] - left[b] + 8 * (end - start) for (a, start), (b, end) in pairwise(self._ends)]
+        return bytes(self.codes), stream, bits
 
 
 def _split(array: np.ndarray, window: Window) -> tuple[np.ndarray, _Exceptions]:
@@ -175,6 +178,11 @@ class ChannelReader:
             end += count
             _take_channel(self._stream, known[index], exceptions, symbols[end - count : end])
         return symbols
+
+    @property
+    def bits(self) -> int:
+        """Bits read from codes and stream, up to a constant; the difference of two values is what lies between."""
+        return 8 * self.codes.offset - self._stream.left
 
     def finish(self) -> None:
         """Raises Malformed unless all codes and exactly the stream's symbols have been read."""

@@ -191,13 +191,6 @@ def _fullest_window(h: Histogram) -> Window:
     return Window(low, high - low + 1)
 
 
-def bits_under(h: Histogram, fitted: Fitted) -> float:
-    """Bits of a channel's symbols within the window of a prior."""
-    window = fitted.prior.window
-    inside = (h.values >= window.kmin) & (h.values < window.end)
-    return float(h.counts[inside] @ fitted.costs[h.values[inside] - window.kmin]) / BIT
-
-
 # -- sharing -----------------------------------------------------------------------------------------------------------
 
 Fit = Callable[[Histogram], Fitted]

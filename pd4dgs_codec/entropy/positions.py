@@ -35,12 +35,12 @@ _CHILD = np.argsort((np.arange(256)[:, None] >> np.arange(8) & 1) == 0, axis=1, 
 _CODED = range(2, 8)  # numbers of children with more than one pattern; nodes with one child have channels of their own
 
 
-def encode_positions(cells: np.ndarray, writer: ChannelWriter, known: list[Fitted]) -> float:
-    """Codes cells int32 [N, 3] (voxels), which must be distinct and in Morton order (`morton_order`); returns their
-    bits. known: the prior list. Raises EncodeError as position_channels does."""
+def encode_positions(cells: np.ndarray, writer: ChannelWriter, known: list[Fitted]) -> None:
+    """Codes cells int32 [N, 3] (voxels), which must be distinct and in Morton order (`morton_order`), as a batch.
+    known: the prior list. Raises EncodeError as position_channels does."""
     head, channels = position_channels(cells)
     writer.codes += head
-    return 8 * len(head) + writer.write(channels, known, cells.size)[0]
+    writer.write(channels, known, cells.size)
 
 
 def position_channels(cells: np.ndarray) -> tuple[bytes, list[np.ndarray]]:

@@ -23,10 +23,10 @@ def info(data: bytes) -> dict[str, Any]:
     """Returns the header and layers of a file, or of a prefix of it that holds at least the preamble and header.
 
     layers: {layer, offset, bytes, end, slices}; bytes counts whole chunks, and end is the length of the prefix with
-    layers 0 .. this one. Layers that `data` holds whole also have anchors, codes and stream (bytes), and of a known
-    kind steps, planes ([C, x, y, z, t] per scale), networks (output widths) and key_instant if any, else grids, chains,
-    their steps and kind, see `Tables.json`. slices: {offset, bytes, end}, and anchors and fill if `data` holds the
-    slice whole. kind, rows: of the header; of a known kind also feature_width, slots, view_dependent and steps.
+    layers 0 .. this one. Layers that `data` holds whole also have anchors, and of a known kind steps, planes ([C, x, y,
+    z, t] per scale), networks (output widths) and key_instant if any, else grids, chains, their steps and kind, see
+    `Tables.json`. slices: {offset, bytes, end}, and anchors and fill if `data` holds the slice whole. kind, rows: of
+    the header; of a known kind also feature_width, slots, view_dependent and steps.
     metadata: {title, source, licence, command, quality, slices, still_bytes} as far as given, {"fault"} if it cannot be
     read, None if `data` holds no metadata chunk. Raises DecodeError.
     """
@@ -52,14 +52,12 @@ def info(data: bytes) -> dict[str, Any]:
             if offset + size <= len(data):
                 payload = read_chunk(data, offset, type=chunk_type, length=length, index=index).payload
                 scalars = header.table.channels + header.table.graded
-                found, start, declared = read_parameters(payload, chunk_type, scalars, declared, later)
+                found, _, declared = read_parameters(payload, chunk_type, scalars, declared, later)
                 place |= {"anchors": found.rows, "fill": found.fill and list(found.fill)}
                 if not later:
                     tables[chunk_type] = found.tables
                     row |= kinds.json_of_layer(header.kind, header.table, tables)
-                stream = len(payload) - start - found.codes
-                for name, count in (("anchors", found.rows), ("codes", found.codes), ("stream", stream)):
-                    row[name] = row.get(name, 0) + count
+                row["anchors"] = row.get("anchors", 0) + found.rows
             else:
                 layers[-1] = {name: row[name] for name in ("layer", "offset", "bytes", "end", "slices")}
         offset += size
@@ -184,7 +182,7 @@ def _meta(scene: Scene) -> dict[str, np.ndarray]:
         "voxel_size": np.float32(info.voxel_size),
         "box": info.box,
         "time_range": np.array(info.time_range, np.float32),
-        "background": np.array(scene.background, np.float32),
+        "background": np.array(scene.background(), np.float32),
         "near_far": np.array([info.near, info.far], np.float32),
         "up": np.array(info.up, np.float32),
         "unit": np.float32(info.unit),

@@ -27,6 +27,10 @@ from pd4dgs_codec.format.tables import Declared, Parameters, Tables, Tensors, pa
 from pd4dgs_codec.morton import AXIS_BITS, MAX_VOXEL, morton_codes
 from pd4dgs_codec.scene import MASK_MIN_CODE, MAX_CLASS
 
+#: Groups of channels in reports, in coding order, and the one of mode lzma.
+GROUPS = ("positions", "masks", "attributes", "planes", "weights")
+LZMA_GROUP = "symbols"
+
 Known = TypeVar("Known", Prior, Fitted)
 
 
@@ -64,8 +68,8 @@ class Residuals:
 
 @dataclass(frozen=True)
 class StreamReport:
-    """A group of channels. payload_bits: by the tables, exact but for the rounding of the stream. rate_bits: sum of
-    R(a), the cost in the trainer's rate model; 0 for positions."""
+    """A group of channels. payload_bits: in codes and stream, but for its rounding to words. rate_bits: sum of R(a),
+    the cost in the trainer's rate model; 0 for positions."""
 
     name: str
     payload_bits: int
@@ -91,24 +95,26 @@ def _write_ans(
     symbols: LayerSymbols, coded: Residuals, options: EncodeOptions, later: bool, past: Past[Fitted]
 ) -> tuple[bytes, bytes, list[StreamReport]]:
     writer = ChannelWriter(options.priors, options.effort, later)
-    positions = encode_positions(symbols.anchor_q, writer, past.positions), 0.0
+    encode_positions(symbols.anchor_q, writer, past.positions)
     masks = writer.write([symbols.rises, symbols.codes], past.rows)
-    classes, _ = writer.write([symbols.classes], past.rows)
-    bits, rate = writer.write(list(by_class(symbols.rows, symbols.classes)), past.rows)
-    known, reports = list[Fitted](), list[StreamReport]()
+    writer.write([symbols.classes], past.rows)
+    rows = writer.write(list(by_class(symbols.rows, symbols.classes)), past.rows) + entropy_bits(symbols.classes)
+    known = list[Fitted]()
     planes = write_planes(coded.planes, writer, known)
     weights = writer.write([array.ravel() for array in symbols.tensors.weights], known)
-    for name, cost, arrays in (
-        ("positions", positions, [symbols.anchor_q]),
-        ("masks", masks, [symbols.rises, symbols.codes]),
-        ("attributes", (bits + classes, rate + entropy_bits(symbols.classes)), [symbols.classes, symbols.rows]),
-        ("planes", planes, coded.planes),
-        ("weights", weights, symbols.tensors.weights),
-    ):
-        count = sum(array.size for array in arrays)
-        if count or name == "positions":
-            reports.append(StreamReport(name, round(cost[0]), cost[1], count))
-    return bytes(writer.codes), writer.stream(), reports
+    codes, stream, bits = writer.finish()
+    groups = (
+        (bits[:1], 0.0, [symbols.anchor_q]),
+        (bits[1:2], masks, [symbols.rises, symbols.codes]),
+        (bits[2:4], rows, [symbols.classes, symbols.rows]),
+        (bits[4:-1], planes, coded.planes),
+        (bits[-1:], weights, symbols.tensors.weights),
+    )
+    reports = [
+        StreamReport(name, sum(own), rate, sum(array.size for array in arrays))
+        for name, (own, rate, arrays) in zip(GROUPS, groups, strict=True)
+    ]
+    return codes, stream, [report for report in reports if report.symbols]
 
 
 def by_class(rows: np.ndarray, classes: np.ndarray) -> Iterator[np.ndarray]:
@@ -129,7 +135,7 @@ def _write_lzma(
     counted = [channel for channel in (*by_class(symbols.rows, symbols.classes), *rest) if channel.size]
     rate = sum(histogram(channel).rate_bits for channel in counted) + entropy_bits(symbols.classes)
     count = sum(channel.size for channel in channels)
-    return codes, stream, [StreamReport("symbols", 8 * (len(codes) + len(stream)), rate, count)]
+    return codes, stream, [StreamReport(LZMA_GROUP, 8 * (len(codes) + len(stream)), rate, count)]
 
 
 # -- reading -----------------------------------------------------------------------------------------------------------
@@ -169,23 +175,30 @@ def read_slice(
 def _read_ans(
     reader: ChannelReader, layer: int, table: RowTable, parameters: Parameters, past: Past[Prior]
 ) -> LayerSymbols:
-    n, tables = parameters.rows, parameters.tables
+    n, tables, marks = parameters.rows, parameters.tables, [reader.bits]
     anchor_q = decode_positions(reader, n, past.positions)
-    sizes = [parameters.rises, n, n if table.graded else 0]
-    rises, codes, classes = split(reader.read(sizes, past.rows), sizes)
-    if table.graded and n:
+    marks.append(reader.bits)
+    sizes = [parameters.rises, n]
+    rises, codes = split(reader.read(sizes, past.rows), sizes)
+    marks.append(reader.bits)
+    classes = reader.read([n] * table.graded, past.rows)
+    if classes.size:
         _check_classes(classes)
         places, rows = Places.by(classes, MAX_CLASS + 1), np.empty((table.channels, n), np.int32)
         places.put(reader.read(places.sizes * table.channels, past.rows), rows)
     else:
         rows = reader.read([n] * table.channels, past.rows).reshape(table.channels, n)
+    marks.append(reader.bits)
     known = list[Prior]()
     residuals = read_planes(reader, tables.planes, known)
+    marks.append(reader.bits)
     sizes = [math.prod(shape) for shape in tables.weights]
     weights = split(reader.read(sizes, known), sizes)
+    marks.append(reader.bits)
     reader.finish()
-    tensors = _tensors(tables, residuals, weights)
-    return LayerSymbols(layer, anchor_q, rises, codes, classes, rows, tensors, parameters.fill)
+    tensors, bits = _tensors(tables, residuals, weights), np.diff(marks).tolist()
+    spent = dict(zip(GROUPS, bits, strict=True))
+    return LayerSymbols(layer, anchor_q, rises, codes, classes, rows, tensors, parameters.fill, spent)
 
 
 def _read_lzma(
@@ -206,8 +219,8 @@ def _read_lzma(
         for first, end, shape in zip(ends, ends[1:], tables.planes, strict=False)
     ]
     tensors = _tensors(tables, residuals, weights)
-    graded = classes[0] if classes else NO_CLASSES
-    return LayerSymbols(layer, _voxels(steps), rises, own, graded, np.stack(rows), tensors, parameters.fill)
+    graded, spent = classes[0] if classes else NO_CLASSES, {LZMA_GROUP: 8 * (len(codes) + len(stream))}
+    return LayerSymbols(layer, _voxels(steps), rises, own, graded, np.stack(rows), tensors, parameters.fill, spent)
 
 
 def _voxels(steps: Sequence[np.ndarray]) -> np.ndarray:

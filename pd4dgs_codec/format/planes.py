@@ -210,12 +210,13 @@ def _filled(k: Array, given: Array, predictor: int) -> Array:
 # channels before. All arithmetic is on integers.
 
 
-def write_planes(residuals: Sequence[Array], writer: ChannelWriter, known: list[Fitted]) -> tuple[float, float]:
-    """Codes residuals int32 [C, H, W] per plane. Returns (bits, sum of R(a) of all channels). known: the prior list."""
-    planes, bits = [plane.reshape(len(plane), -1) for plane in residuals], 0.0
+def write_planes(residuals: Sequence[Array], writer: ChannelWriter, known: list[Fitted]) -> float:
+    """Codes residuals int32 [C, H, W] per plane, a batch per stage. Returns the sum of R(a) of all channels. known: the
+    prior list."""
+    planes = [plane.reshape(len(plane), -1) for plane in residuals]
     for stage in _stages(planes, [plane.shape for plane in residuals]):
-        bits += writer.write([part for channels, places in stage for part in places.parts(channels)], known)[0]
-    return bits, sum(histogram(c).rate_bits for plane in planes for c in plane)
+        writer.write([part for channels, places in stage for part in places.parts(channels)], known)
+    return sum(histogram(c).rate_bits for plane in planes for c in plane)
 
 
 def read_planes(reader: ChannelReader, shapes: Sequence[PlaneShape], known: list[Prior]) -> list[Array]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -21,6 +21,7 @@ class LayerSymbols:
     anchor_q: int32 [n, 3] voxel indices of its own anchors, in Morton order. rises: int32 [rows before], of the earlier
     anchors' mask codes. codes: int32 [n], of its own anchors. classes: int32 [n] step classes, or NO_CLASSES. rows:
     int32 [W, n]. tensors: int32. fill: what a prefix that ends here has behind its Gaussians; None: the background.
+    bits: that each group of channels took in the file, by its name, if it was read from one.
     """
 
     layer: int
@@ -31,6 +32,7 @@ class LayerSymbols:
     rows: np.ndarray
     tensors: Tensors
     fill: Fill | None = None
+    bits: Mapping[str, int] = field(default_factory=dict)
 
     def arrays(self) -> list[np.ndarray]:
         """All arrays, in the order in which info --hashes digests them."""
@@ -60,6 +62,7 @@ def merged(slices: Sequence[LayerSymbols]) -> LayerSymbols:
         classes=classes[order] if len(classes) else classes,
         rows=np.concatenate([part.rows for part in slices], axis=1)[:, order],
         fill=slices[-1].fill,
+        bits={name: sum(part.bits.get(name, 0) for part in slices) for name in slices[0].bits},
     )
 
 

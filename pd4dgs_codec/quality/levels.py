@@ -35,6 +35,11 @@ class Level:
     cumulative_bytes: int | None = None
     decode_seconds: float | None = None
 
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """RGB in 0..1 behind every Gaussian."""
+        return self.model.background if isinstance(self.model, Player) else self.model.shown(self.level).background
+
     def picture(self, camera: Camera, time: float) -> np.ndarray:
         """Renders float32 [H, W, 3] in 0..1 at normalised time 0..1."""
         if isinstance(self.model, Player):

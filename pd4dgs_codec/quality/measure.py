@@ -66,7 +66,8 @@ def true_psnr(
     scene: Scene, levels: Iterable[int], views: Sequence[View], step: Callable[[], None] = lambda: None
 ) -> dict[int, float]:
     """Returns `level_psnr` of a decoded scene at each of `levels`, which may lie above its highest layer."""
-    return {level: level_psnr(from_scene(scene.prefix(level)), level, views, step) for level in levels}
+    model = from_scene(scene)
+    return {level: level_psnr(model, level, views, step) for level in levels}
 
 
 # -- errors of a quantised scene ---------------------------------------------------------------------------------------

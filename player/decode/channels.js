@@ -29,14 +29,16 @@ export class ChannelReader {
   }
 
   /**
-   * The symbols of the next channels of these lengths, one behind the other.
+   * The symbols of the next channels of these lengths, one behind the other, each in its range.
    *
    * @param {number[]} lengths @param {Prior[]} priors defined so far, in order; new ones are added
+   * @param {number} least @param {number} most @param {string} what names a symbol in messages
    */
-  read(lengths, priors) {
+  read(lengths, priors, least, most, what) {
     const out = new Int32Array(lengths.reduce((sum, length) => sum + length, 0));
     let at = 0;
     for (const length of lengths) this._take(out, at, (at += length), priors);
+    checkRange(out, least, most, what);
     return out;
   }
 

@@ -1,6 +1,5 @@
 // Clause 10: positions, an octree, level by level.
 
-import { checkRange } from "./channels.js";
 import { limitExceeded, malformed } from "./errors.js";
 import { MAX_COUNT, MAX_VOXEL } from "./limits.js";
 /** @import { ByteReader } from "./bytes.js" */
@@ -39,14 +38,10 @@ export function decodePositions(channels, rows, priors) {
     else lengths.push(single);
     only = single;
   }
-  /** @param {number[]} of @param {number} size */
-  const read = (of, size) => {
-    const symbols = channels.read(of, priors);
-    checkRange(symbols, 0, size - 1, "a symbol of the octree");
-    return symbols;
-  };
-  const symbols = read(lengths, ALL);
-  const patterns = PATTERNS.map(({ length }, k) => read([counts[k - 2] ?? 0], length));
+  const symbols = channels.read(lengths, priors, 0, ALL - 1, "a symbol of the octree");
+  const patterns = PATTERNS.map(({ length }, k) => {
+    return channels.read([counts[k - 2] ?? 0], priors, 0, length - 1, "a pattern of children");
+  });
   return placed(grow(levels, symbols, patterns, rows), minimum, depth);
 }
 

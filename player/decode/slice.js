@@ -50,12 +50,10 @@ export function decodeSlice(payload, layer, header, before, known) {
   const reader = new ChannelReader(bytes, stream, symbols + (known ? MORE_ENTRIES : FREE_ENTRIES));
   const priors = known ?? { positions: [], rows: [] };
   const voxels = n ? decodePositions(reader, n, priors.positions) : new Int32Array(0);
-  const rises = reader.read([earlier], priors.rows);
-  checkRange(rises, 0, MOST_CODE, "a rise of a mask code");
-  const codes = reader.read([n], priors.rows);
-  checkRange(codes, LEAST_OWN_CODE, MOST_CODE, "a mask code");
-  const stepClasses = reader.read(header.centres ? [n] : [], priors.rows);
-  checkRange(stepClasses, 0, STEP_CLASSES - 1, "a step class");
+  const rises = reader.read([earlier], priors.rows, 0, MOST_CODE, "a rise of a mask code");
+  const codes = reader.read([n], priors.rows, LEAST_OWN_CODE, MOST_CODE, "a mask code");
+  const graded = header.centres ? [n] : [];
+  const stepClasses = reader.read(graded, priors.rows, 0, STEP_CLASSES - 1, "a step class");
   const rows = new Int32Array(header.width * n);
   const groups = header.centres && groupByClass(stepClasses, STEP_CLASSES);
   for (const channel of channelsOf(rows, header.width)) reader.fill(channel, priors.rows, groups);
@@ -64,10 +62,8 @@ export function decodeSlice(payload, layer, header, before, known) {
   const others = []; // of grids and chains
   const planes = decodePlanes(reader, grids.list.flatMap((grid) => grid.planes), others);
   const linears = chains.list.flatMap((chain) => chain.linears);
-  const weights = linears
-    .flatMap(({ inputs, outputs }) => [inputs * outputs, outputs])
-    .map((length) => reader.read([length], others));
-  for (const weight of weights) checkRange(weight, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of a chain");
+  const lengths = linears.flatMap(({ inputs, outputs }) => [inputs * outputs, outputs]);
+  const weights = lengths.map((length) => reader.read([length], others, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of a chain"));
   reader.finish();
   return { layer, parameters, voxels, rises, codes, stepClasses, rows, planes, weights, priors };
 }

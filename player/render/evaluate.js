@@ -1,4 +1,4 @@
-// Clauses 13.2 to 13.4 without a GPU: the Gaussians of a level at a time, for a camera's centre. For Spark, for
+// Clauses 13.3 and 13.4 without a GPU: the Gaussians of a level at a time, for a camera's centre. For Spark, for
 // machines whose GPU is missing or slow, and the reference of the evaluator on the GPU.
 
 import { Column } from "../decode/columns.js";

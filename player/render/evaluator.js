@@ -1,4 +1,4 @@
-// Clauses 13.2 to 13.4 on the GPU, as fragment passes into float textures.
+// Clauses 13.3 and 13.4 on the GPU, as fragment passes into float textures.
 //
 // Per anchor, when time changes: the deformation; the features' share of the scaffold's first layers. Per anchor, when
 // the camera's centre changes: opacities. They tell which Gaussians are visible, about a fifth of all, and only these

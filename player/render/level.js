@@ -1,4 +1,4 @@
-// The parts of a scene that a level shows (clause 13.4), in the forms that both evaluators take.
+// The parts of a scene that a level shows (clauses 13.4 and 13.6), in the forms that both evaluators take.
 
 import { columnsOf, quantitiesOf } from "./record.js";
 /** @import { Deformation, Scale, Scene } from "../kinds/index.js" */
@@ -97,7 +97,7 @@ const EYE_TOLERANCE = 1e-5;
 export function stateOf(scene, level, seconds, eye) {
   const { number, motion } = levelOf(scene, level);
   const [start, end] = scene.info.timeRange;
-  const t = (seconds - start) / (end - start); // clause 13.1; no number where the range is empty
+  const t = (seconds - start) / (end - start); // clause 13.4; no number where the range is empty
   return { scene, level: number, t: motion && t > 0 ? Math.min(t, 1) : 0, eye };
 }
 

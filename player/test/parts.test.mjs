@@ -37,7 +37,7 @@ test("T and M are those of appendix B, far from where rounding could turn", () =
 
 test("NormTable gives the table of 7.3", () => {
   const [, numbers] = /** @type {RegExpExecArray} */ (
-    /Check: n = 7, mu8 = 832, si = 0 gives ([\d, ]+), 2\^24\./.exec(TEXT)
+    /Check:\s+n = 7, mu8 = 832, si = 0 gives ([\d, ]+), 2\^24\./.exec(TEXT)
   );
   assert.deepEqual([...normTable(7, { mu8: 832, si: 0 })], [...numbers.split(", ").map(Number), 2 ** 24]);
 });

@@ -186,8 +186,10 @@ def test_the_fill_of_the_highest_layer_is_its_background():
     data = file_of([replace(layers[0], fill=(51, 0, 255)), layers[1], replace(layers[2], fill=(0, 0, 0))])
     scene = decode(data)
     assert scene.fills == ((51, 0, 255), None, (0, 0, 0))
-    assert scene.background == (0.0, 0.0, 0.0) and scene.prefix(1).background == scene.info.background
-    assert scene.prefix(0).background == decode(data, max_layer=0).background == (0.2, 0.0, 1.0)
+    backgrounds = [(0.2, 0.0, 1.0), scene.info.background, (0.0, 0.0, 0.0)]
+    assert [scene.background(level) for level in range(3)] == backgrounds
+    assert [decode(data, max_layer=level).background() for level in range(3)] == backgrounds
+    assert replace(scene, fills=()).background(0) == scene.info.background
     assert [layer.fill for layer in decode_tensors(data)] == [(51, 0, 255), None, (0, 0, 0)]
     assert [row["slices"][0]["fill"] for row in info(data)["layers"]] == [[51, 0, 255], None, [0, 0, 0]]
     assert hashes(data) == hashes(small_file())
