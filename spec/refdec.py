@@ -221,7 +221,7 @@ def read_header(data):
     header = fields(unpack(data), range(1, 15), (1, 2, 3, 4, *range(6, 13), 14), "header")
     read_chunk_list(header[1], registered(header[2], "the coding mode"))
     read_kind(header[3])
-    read_rows(header)
+    read_scalars(header)
     a_step(header[6])
     box, (start, end) = reals(header[7], 6, "the box"), reals(header[8], 2, "the times")
     need(all(a <= b for a, b in zip(box[:3], box[3:])), "a lower corner of the box above the upper one")
@@ -254,14 +254,21 @@ def read_kind(value):
     integers(a_list(value, "a kind", 1, 16), 65535, "a number of a kind")
 
 
-# 5.4 Rows: "Each tensor is [id, C, Q] with an id 0..255, C = 1..256 channels and a step Q; ids ascend."
-def read_rows(header):
-    last = -1
-    for tensor in a_list(header[4], "the rows", 1, 32):
-        last = read_id(a_list(tensor, "a tensor of rows", 3), last)
-        limited(tensor[1], 256, "the number of channels", 1)
-        a_step(tensor[2])
-    width = limited(sum(channels for _, channels, _ in header[4]), 512, "the number of channels of all rows")
+# 5.4 Rows: "Each tensor is [id, C, Q, p] with an id 0..255, C = 1..256 channels, a step Q and a predictor p"
+# 6.2 Layer parameters: "layer rows, as header key 4"
+def read_rows(value, form):
+    """[(name, channels, step, predictor)] and the number of all channels."""
+    result, last = [], -1
+    for tensor in a_list(value, "the rows", 1, 32):
+        last = read_id(a_list(tensor, "a tensor of rows", 4), last)
+        channels = limited(tensor[1], 256, "the number of channels", 1)
+        result.append((f"{form}.{last}", channels, a_step(tensor[2]), registered(tensor[3], "a predictor")))
+    return result, limited(sum(row[1] for row in result), 512, "the number of channels of all rows")
+
+
+# 5.4 Rows: "If key 5 is there, the anchors have step classes (11.2), and the key gives each channel a centre"
+def read_scalars(header):
+    header["rows"], width = read_rows(header[4], "row")
     header["graded"] = 5 in header
     header["centres"] = a_list(header.get(5, [0] * width), "the centres", width)
     integers(header["centres"], MAX_SYMBOL, "a centre", -MAX_SYMBOL)
@@ -308,36 +315,44 @@ class Layer:
     """One slice; the first becomes the whole layer (add_slice). cells: [(x, y, z)] of its rows; symbols: {name:
     [channel]} in the order of clause 12.4; tensors: {name: [float]}, every one a binary32 value."""
 
-    def __init__(self, number, payload, header, before, first):
-        """before: N, S and B (6.5) of the slices before; first: the first slice of its layer, if it is a later one."""
+    def __init__(self, number, payload, header, before, first, earlier):
+        """before: N, S and B (6.5) of the slices before; first: the first slice of its layer, if it is a later one;
+        earlier: else the step classes of the earlier rows."""
         self.number, self.header, self.later, self.slices = number, header, first is not None, 1
+        self.earlier, self.layer_rows = earlier, first.layer_rows if first else ([], 0)
         self.planes, self.weights, self.steps = [], [], {}
         self.priors = first.priors if first else ([], [])
         reader = Reader(payload)
         parameters = reader.take(limited(reader.number("<I"), 4096, "the parameters' length"))
         codes = self.read_parameters(parameters, before[0])
-        self.rises = 0 if first else before[0]
         self.check_sizes(len(payload), before)
         codes, stream = Reader(reader.take(codes)), reader.take(reader.left)
         self.cells, channels = (self.decode_lzma if header[2] else self.decode_ans)(codes, stream)
         need(not codes.left, f"{codes.left} bytes after the last code")
-        self.symbols = self.name_channels(iter(channels))
+        self.name_channels(iter(channels))
 
-    # 6.2 Layer parameters: "Later slices have none of keys 4 to 6, else Malformed."
+    @property
+    def classes(self):
+        """The step class of each own row."""
+        return self.symbols["class"][0] if self.header["graded"] else [0] * self.rows
+
+    # 6.2 Layer parameters: "Later slices have none of keys 4 to 7, else Malformed."
     def read_parameters(self, data, rows_before):
         """The length of the codes."""
-        parameters = fields(unpack(data), range(1, 7), (1, 2), "layer parameters")
+        parameters = fields(unpack(data), range(1, 8), (1, 2), "layer parameters")
         self.rows = limited(parameters[1], (1 << 24) - rows_before, "own rows")
         length = limited(parameters[2], MAX_LENGTH, "the length of the codes")
         if 3 in parameters:
             integers(a_list(parameters[3], "the fill", 3), 255, "a colour of the fill")
-        need(not (self.later and {4, 5, 6} & set(parameters)), "grids, chains or a kind in a later slice")
+        need(not (self.later and {4, 5, 6, 7} & set(parameters)), "tables or a kind in a later slice")
         if 4 in parameters:
             self.read_grids(parameters[4])
         if 5 in parameters:
             self.read_chains(parameters[5])
         if 6 in parameters:
             read_kind(parameters[6])
+        if 7 in parameters:
+            self.layer_rows = read_rows(parameters[7], "layerrow")
         return length
 
     # 6.3 Grids and chains: "one plane for each pair (i, j), i < j, in lexicographic order" "its columns follow side i"
@@ -367,28 +382,28 @@ class Layer:
     def check_sizes(self, payload_bytes, before):
         samples = sum(c * h * w for _, _, (c, h, w) in self.planes)
         need(samples <= 1 << 28, f"{samples} plane samples, limit 2^28", "LimitExceeded")
-        row = len(self.header["centres"]) + 4 + self.header["graded"]
-        self.count = self.rises + row * self.rows + samples + sum(size for _, size in self.weights)
+        samples_and_weights = samples + sum(size for _, size in self.weights)
+        row, e = len(self.header["centres"]) + 4 + self.header["graded"], len(self.earlier)
+        self.count = e + row * self.rows + self.layer_rows[1] * (e + self.rows) + samples_and_weights
         self.declared = [a + b for a, b in zip(before, (self.rows, self.count, payload_bytes))]
         rows, symbols, size = self.declared
         need(rows <= (1 << 13) + 2 * size, f"{rows} rows", "LimitExceeded")
         need(symbols <= (1 << 22) + 256 * size, f"{symbols} symbols", "LimitExceeded")
 
     # 6.4 Channels: "In mode ans a slice codes the channels in this order:"
-    # 8 Coded channels: "one for item 1 of 6.4, one for items 2 to 5, one for items 6 and 7"
+    # 8 Coded channels: "one for item 1 of 6.4, one for items 2 to 6, one for items 7 and 8"
     # 11.2 Rows: "A step class MUST lie in 0..6, else Malformed."
     def decode_ans(self, codes, stream):
-        """The voxels and the channels of items 2 to 7, none split."""
+        """The voxels and the channels of items 2 to 8, none split."""
         n, graded = self.rows, self.header["graded"]
         coder = Coder(codes, stream, self.count + (1 << (10 if self.later else 18)))
         coder.priors = self.priors[0]
         cells = coder.decode_positions(n) if n else []
         coder.priors = self.priors[1]
-        channels = [coder.channel(size) for size in (self.rises, n, *[n] * graded)]
-        classes = ranged(channels[2], 0, 6, "a step class") if graded else []
-        channels += [
-            coder.split(classes, 7) if graded else coder.channel(n) for _ in range(len(self.header["centres"]))
-        ]
+        channels = [coder.channel(size) for size in (len(self.earlier), n, *[n] * graded)]
+        classes = ranged(channels[2], 0, 6, "a step class") if graded else [0] * n
+        for rows, width in ((classes, len(self.header["centres"])), (self.earlier + classes, self.layer_rows[1])):
+            channels += [coder.split(rows, 7) if graded else coder.channel(len(rows)) for _ in range(width)]
         coder.priors = []
         channels += coder.decode_grids([shape for _, _, shape in self.planes])
         channels += [coder.channel(size) for _, size in self.weights]
@@ -399,8 +414,8 @@ class Layer:
     # 11.2 Rows: "A step class MUST lie in 0..6, else Malformed."
     def decode_lzma(self, codes, stream):
         """As decode_ans."""
-        n, graded = self.rows, self.header["graded"]
-        counts = [n, n, n, self.rises] + [n] * (1 + graded + len(self.header["centres"]))
+        n, e, graded = self.rows, len(self.earlier), self.header["graded"]
+        counts = [n, n, n, e] + [n] * (1 + graded + len(self.header["centres"])) + [e + n] * self.layer_rows[1]
         counts += [h * w for _, _, (c, h, w) in self.planes for _ in range(c)] + [size for _, size in self.weights]
         heads = [(codes.varint(8 * K + 3) if count else 0, count) for count in counts]
         need(all(code & 3 < 3 for code, _ in heads), "a channel of 8-byte symbols")
@@ -417,29 +432,30 @@ class Layer:
     # 11.1 Masks: "Layer ℓ codes a rise 0..255 for each earlier row and a code 3..255 for each own row."
     # 11.2 Rows: "Symbols of rows, plane samples (11.3), weights and biases MUST lie in −2^23..2^23, else Malformed."
     def name_channels(self, channels):
-        symbols = {name: [ranged(next(channels), low, 255, name)] for name, low in (("rise", 0), ("own", 3))}
+        """The symbols: of rows their v (11.2), of planes their samples (11.3)."""
+        self.symbols = {name: [ranged(next(channels), low, 255, name)] for name, low in (("rise", 0), ("own", 3))}
         if self.header["graded"]:
-            symbols["class"] = [next(channels)]
-        symbols |= {f"row.{tensor}": [next(channels) for _ in range(width)] for tensor, width, _ in self.header[4]}
+            self.symbols["class"] = [next(channels)]
+        centres = iter(self.header["centres"])
+        for tables, classes in ((self.header["rows"], self.classes), (self.layer_rows[0], self.earlier + self.classes)):
+            for name, width, self.steps[name], predictor in tables:
+                self.symbols[name] = [
+                    row_values(next(channels), classes, next(centres, 0), predictor) for _ in range(width)
+                ]
         for name, predictor, (c, _, w) in self.planes:
-            symbols[name] = [restore(next(channels), predictor, w) for _ in range(c)]
-        symbols |= {name: [next(channels)] for name, _ in self.weights}
-        ranged((k for own in symbols.values() for channel in own for k in channel), -MAX_SYMBOL, MAX_SYMBOL, "a symbol")
-        return symbols
+            self.symbols[name] = [restore(next(channels), predictor, w) for _ in range(c)]
+        self.symbols |= {name: [next(channels)] for name, _ in self.weights}
+        for name, *_ in self.planes + self.weights:
+            ranged((k for channel in self.symbols[name] for k in channel), -MAX_SYMBOL, MAX_SYMBOL, "a symbol")
 
-    # 11.5 Dequantisation: "m + k·2^c MUST lie in −2^23..2^23, else Malformed."
+    # 11.5 Dequantisation: "An anchor's position is dequantised from its voxel index with the voxel size as Q."
     def dequantise(self):
-        header, symbols = self.header, self.symbols
-        self.tensors = {"position": dequantise([v for cell in self.cells for v in cell], header[6])}
-        classes, centres = symbols.get("class", [[0] * self.rows])[0], iter(header["centres"])
-        for tensor, width, step in header[4]:  # [C, n] -> [n, C]
-            own = [next(centres) for _ in range(width)]
-            values = [m + (k << c) for row, c in zip(zip(*symbols[f"row.{tensor}"]), classes) for m, k in zip(own, row)]
-            need(all(abs(k) <= MAX_SYMBOL for k in values), "a value of a row over 2^23 steps")
-            self.tensors[f"row.{tensor}"] = dequantise(values, step)
+        self.tensors = {"position": dequantise([v for cell in self.cells for v in cell], self.header[6])}
+        for name, *_ in self.header["rows"] + self.layer_rows[0]:  # [C, n] -> [n, C]
+            self.tensors[name] = dequantise([v for row in zip(*self.symbols[name]) for v in row], self.steps[name])
         for name, *_ in self.planes + self.weights:
             step = self.steps["plane" if name.startswith("plane") else "weight"]
-            self.tensors[name] = dequantise([k for channel in symbols[name] for k in channel], step)
+            self.tensors[name] = dequantise([k for channel in self.symbols[name] for k in channel], step)
 
     # 12.2 Prefixes: "sorted by the Morton code (10.1) of the voxel index less the minimum over these rows"
     def add_slice(self, part):
@@ -448,9 +464,20 @@ class Layer:
         codes = [morton_code(cell) for cell in less_minimum(cells)]
         order = sorted(range(len(cells)), key=codes.__getitem__)
         for name in part.symbols.keys() - {"rise"}:
-            both = [a + b for a, b in zip(self.symbols[name], part.symbols[name])]
-            self.symbols[name] = [[channel[row] for row in order] for channel in both]
+            e = len(self.earlier) if name.startswith("layerrow") else 0
+            both = [(a[:e], a[e:] + b) for a, b in zip(self.symbols[name], part.symbols[name])]
+            self.symbols[name] = [of_earlier + [own[row] for row in order] for of_earlier, own in both]
         self.cells, self.rows, self.slices = [cells[row] for row in order], len(cells), self.slices + 1
+
+
+# 11.2 Rows: "v = s[c] + k·2^c, then every s[j] with j ≥ c becomes v" "v MUST lie in −2^23..2^23, else Malformed."
+def row_values(symbols, classes, centre, predictor):
+    last, result = [centre] * 7, []
+    for k, c in zip(ranged(symbols, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of a row"), classes):
+        result.append(last[c] + (k << c))
+        if predictor:
+            last[c:] = result[-1:] * (7 - c)
+    return ranged(result, -MAX_SYMBOL, MAX_SYMBOL, "a value of a row")
 
 
 # 11.3 Planes: "in row 0 N and NW are taken equal to W, in column 0 W and NW are taken equal to N"
@@ -884,7 +911,8 @@ def decode(data, max_layer=2):
             number, after = first.slices if first else 0, [k for k, _ in chunks[i + 1 :] if k < 3]
             need(flags >> 6 == number, f"slice {flags >> 6} of layer {kind}, expected {number}")
             need(not after or (flags >> 1 & 1) == (after[0] == kind), f"flags {flags:#x} before layers {after}")
-            read = Layer(kind, payload, header, declared, first)
+            earlier = [] if first else [c for layer in layers for c in layer.classes]
+            read = Layer(kind, payload, header, declared, first, earlier)
             if first:
                 first.add_slice(read)
             else:

@@ -29,6 +29,7 @@ from pd4dgs_codec.entropy.priors import (
 )
 
 BLOCK = 256  #: channels planned together; keeps the cost matrix small
+NEAR = 48  #: latest priors whose tokens take one byte, even behind a few new ones
 WIDE = 1024  #: most distinct symbols of a channel that takes part in sharing; beyond, a prior's few bytes do not matter
 
 
@@ -76,12 +77,13 @@ class Histogram:
 @dataclass(frozen=True, eq=False)
 class Fitted:
     """A prior and its costs in 2^-20 bits. costs: int64 [n], of its table's entries. price: of its description.
-    own: of the symbols that it was fitted to."""
+    own: of the symbols that it was fitted to. token: of each use, beyond one byte."""
 
     prior: Prior
     costs: np.ndarray
     price: int
     own: int
+    token: int = 0
 
 
 def histogram(symbols: np.ndarray, times: np.ndarray | None = None) -> Histogram:
@@ -102,7 +104,8 @@ def pool(histograms: Sequence[Histogram]) -> Histogram:
 
 
 def costs_of(histograms: Sequence[Histogram], priors: Sequence[Fitted]) -> np.ndarray:
-    """Cost of coding each histogram's symbols under each prior, int64 [histograms, priors]; see `cost_matrix`."""
+    """Cost of coding each histogram's symbols under each prior, int64 [histograms, priors]; see `cost_matrix`. Tokens
+    count as far as they take more than a byte."""
     windows = [p.prior.window for p in priors]
     first = np.cumsum([0, *(len(p.costs) for p in priors[:-1])])
     shapes = np.array([(w.kmin, w.n, at) for w, at in zip(windows, first.tolist(), strict=True)], np.int64)
@@ -113,6 +116,7 @@ def costs_of(histograms: Sequence[Histogram], priors: Sequence[Fitted]) -> np.nd
         shapes,
         np.concatenate([p.costs for p in priors]),
     )
+    matrix += np.array([p.token for p in priors])
     return matrix
 
 
@@ -203,7 +207,8 @@ def plan_priors(
     new priors. known: priors that were described earlier, at no cost now. room: most entries of all new tables, at
     least one per channel."""
     plan = [fit(h) for h in histograms]
-    free = [replace(fitted, price=0) for fitted in known]
+    far = len(known) - NEAR
+    free = [replace(fitted, price=0, token=8 * BIT * (i < far)) for i, fitted in enumerate(known)]
     if free and plan:
         plan = [
             own if own.own + own.price < costs[best] else free[best]

@@ -276,11 +276,13 @@ def _unpack_tables(fields: Fields, where: str) -> Tables:
     if GRIDS in fields:
         grids = as_long(fields.get(GRIDS), f"{where} grids", MAX_GRIDS + 1, 2)
         tables = replace(tables, grid_step=as_step(grids[0], f"{where} grids"))
-        tables = replace(tables, grids=_ascending([_unpack_grid(row, where) for row in grids[1:]], where))
+        tables = replace(tables, grids=_ascending([_unpack_grid(row, where) for row in grids[1:]], f"{where} grids"))
     if CHAINS in fields:
         chains = as_long(fields.get(CHAINS), f"{where} chains", MAX_CHAINS + 1, 2)
         tables = replace(tables, chain_step=as_step(chains[0], f"{where} chains"))
-        tables = replace(tables, chains=_ascending([_unpack_chain(row, where) for row in chains[1:]], where))
+        tables = replace(
+            tables, chains=_ascending([_unpack_chain(row, where) for row in chains[1:]], f"{where} chains")
+        )
     return tables
 
 
