@@ -245,7 +245,9 @@ def _filled(
     symbols: SceneSymbols, options: EncodeOptions, written: list[list[_Slice]], fill: Callable[[Scene], Fill | None]
 ) -> list[list[_Slice]]:
     """Gives the last slice of the file the fill of its layer, every other one that of the prefix that ends with it."""
-    prefixes, last = every_prefix(_container(symbols, options.mode, written)), written[-1][-1]
+    data, last = _container(symbols, options.mode, written), written[-1][-1]
+    _check_file(data, [])  # limits of the format
+    prefixes = every_prefix(data)
 
     def filled(part: _Slice) -> _Slice:
         own = symbols.layers[-1].fill if part is last else fill(next(prefixes))

@@ -103,8 +103,8 @@ def pack(
     target_sizes: the most bytes that each layer may add to the file, by layer, or {None: the most bytes of the file}.
     views: for target sizes and the order of slices; without views the pictures are of the file's own camera. metadata:
     stored in the file. With options.slices anchors are ordered by the pictures' gain per byte, and without target
-    sizes or keep_levels some pass to later layers, see `measure.in_order`. Without views or a camera the largest
-    anchors come first.
+    sizes or keep_levels some pass to later layers, see `measure.in_order`. Every slice but the last gets its fill from
+    half of these pictures, see `measure.best_fill`. Without views or a camera the largest anchors come first.
 
     Only target sizes and slices need torch. Raises EncodeError, RenderError for target sizes without a camera.
     """
@@ -194,8 +194,15 @@ class _Pictures:
             def order(_: Scene) -> np.ndarray:
                 return values
 
+            closed = set[int]()  # levels of which later slices would gain nothing either
+
             def fill(prefix: Scene) -> Fill | None:
-                return best_fill(prefix, small, shown)
+                if prefix.level in closed:
+                    return None
+                found = best_fill(prefix, small[::2], shown[::2])  # half of the pictures is enough for a colour
+                if found is None:
+                    closed.add(prefix.level)
+                return found
 
         data, report = encode_with_report(scene, options, left_out=left_out, utility=order, fill=fill)
         if self.held_out:

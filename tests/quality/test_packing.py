@@ -171,7 +171,7 @@ def test_the_fill_is_the_colour_behind_the_pictures(scene, level):
 
 
 def test_a_fill_brings_every_prefix_nearer_to_the_pictures_that_order_anchors(scene):
-    packed = pack(scene, SLICED, views=Views("made up", VIEWPOINTS))
+    packed = pack(scene, SLICED, views=Views("made up", [both for both in VIEWPOINTS for _ in range(2)]))
     whole, left = over(plan(scene).scene, scene.info.background), list[float]()
     *prefixes, last = every_prefix(packed.data)
     for prefix in (prefix for prefix in prefixes if prefix.fills[-1]):
