@@ -255,7 +255,7 @@ def read_kind(value):
 
 
 # 5.4 Rows: "Each tensor is [id, C, Q, p] with an id 0..255, C = 1..256 channels, a step Q and a predictor p"
-# 6.2 Layer parameters: "layer rows, as header key 4"
+# 6.2 Layer parameters: "tensors that only this layer has, with the rules and limits of 5.4 but no centres"
 def read_rows(value, form):
     """[(name, channels, step, predictor)] and the number of all channels."""
     result, last = [], -1
@@ -275,6 +275,7 @@ def read_scalars(header):
 
 
 # 5.4 Rows: "ids ascend"
+# 6.2 Layer parameters: "with the rules and limits of 5.4 but no centres"
 # 6.3 Grids and chains: "Ids of grids ascend, and so do those of chains."
 def read_id(tensor, last):
     need(limited(tensor[0], 255, "an id") > last, f"id {tensor[0]} after {last}, expected ascending ids")
@@ -430,7 +431,7 @@ class Layer:
         return voxels_in_order(zip(*channels[:3])), channels[3:]
 
     # 11.1 Masks: "Layer ℓ codes a rise 0..255 for each earlier row and a code 3..255 for each own row."
-    # 11.2 Rows: "Symbols of rows, plane samples (11.3), weights and biases MUST lie in −2^23..2^23, else Malformed."
+    # 11.2 Rows: "Symbols of rows and layer rows, plane samples (11.3), weights and biases MUST lie in −2^23..2^23"
     def name_channels(self, channels):
         """The symbols: of rows their v (11.2), of planes their samples (11.3)."""
         self.symbols = {name: [ranged(next(channels), low, 255, name)] for name, low in (("rise", 0), ("own", 3))}
@@ -470,7 +471,7 @@ class Layer:
         self.cells, self.rows, self.slices = [cells[row] for row in order], len(cells), self.slices + 1
 
 
-# 11.2 Rows: "v = s[c] + k·2^c, then every s[j] with j ≥ c becomes v" "v MUST lie in −2^23..2^23, else Malformed."
+# 11.2 Rows: "v = s[c] + k·2^c, then s changes" "v MUST lie in −2^23..2^23, else Malformed." "s[j] = v for every j ≥ c"
 def row_values(symbols, classes, centre, predictor):
     last, result = [centre] * 7, []
     for k, c in zip(ranged(symbols, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of a row"), classes):

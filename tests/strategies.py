@@ -143,7 +143,7 @@ def make_scene(
     table = RowTable(tuple(Rows(i, math.prod(shape), step) for i, (shape, step) in enumerate(pairs)), centre)
     if widths.graded:
         grading = Grading(classes.astype(np.uint8), table.centre_values)
-    rows = zip(widths.attributes.items(), table.dequantise(k, classes), strict=True)
+    rows = zip(widths.attributes.items(), table.dequantise(table.values(k, classes)), strict=True)
     networks = {
         name: network(rng, (widths.inputs[name], *hidden, outputs), steps.weights_scaffold, kind)
         for name, outputs in widths.networks.items()

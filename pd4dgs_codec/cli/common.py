@@ -34,7 +34,6 @@ atexit.register(gc.freeze)
 OK, FAILED, USAGE, PARTIAL = 0, 1, 2, 3
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  #: errors of a full disk
 STDIO = "-"
-NONE_HELD_OUT = "no held-out views: measuring on the training views"
 #: Least time between two lines if stderr is not a terminal.
 LINE_SECONDS = 10.0
 EXTRAS = {"ray": "cluster", "submitit": "cluster"}  #: extra of each module that the extra `train` does not install

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -166,10 +167,13 @@ def _load(args: argparse.Namespace) -> tuple[Scene, list[Viewpoint], Metadata | 
 
 def _metadata(args: argparse.Namespace, had: Metadata | None, place: str = "") -> Metadata | None:
     """Returns the metadata `had` of the file without what was measured on it, and with the fields replaced that were
-    given as options. The source also says where the scene's 0 lies in the coordinates of its data, if not at theirs."""
-    if had:
-        had = replace(had, quality={}, slices=())
+    given as options. The source also says where the scene's 0 lies in the coordinates of its data, if not at theirs;
+    it still does once replaced."""
     given = options.given(args, "title", "source", "licence")
+    if had:
+        found = re.search(r"0 is \S+, \S+, \S+ of the data", had.source)  # as Dataset.place
+        place = found[0] if found and "source" in given else ""
+        had = replace(had, quality={}, slices=())
     if place:
         given["source"] = "; ".join(filter(None, [given.get("source"), place]))
     if not given:

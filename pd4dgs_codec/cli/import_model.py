@@ -7,8 +7,8 @@ from pd4dgs_codec.cli import options
 from pd4dgs_codec.cli.common import OK, Console, check_output, command, write_checkpoint
 
 DETAILS = """\
-FOLDER is a Scaffold-GS checkpoint: a run or its point_cloud/iteration_N, with point_cloud.ply and either
-opacity_mlp.pt, cov_mlp.pt and color_mlp.pt or checkpoints.pth.
+FOLDER is a Scaffold-GS checkpoint: its point_cloud/iteration_N, with point_cloud.ply and either opacity_mlp.pt,
+cov_mlp.pt and color_mlp.pt or checkpoints.pth, or a run, of which the last iteration is read.
 The model becomes layer 0, a static scene, without loss; encoding quantises it as usual.
 Models with features that layer 0 does not support (distance inputs, a feature bank) are refused.
 Runs of 4DGaussians and Deformable-3DGS cannot be imported; pd4dgs-train teacher:FOLDER trains on their renderings.
@@ -28,7 +28,6 @@ def parser() -> options.Parser:
     p.add_argument("--appearance", type=options.count, metavar="I", help=what)
     what = "voxel size of the anchor grid in scene units (default: from cfg_args or the anchors)"
     p.add_argument("--voxel-size", type=options.positive_float, metavar="V", help=what)
-    p.add_argument("--iteration", type=options.count, metavar="N", help="iteration to read (default: the last)")
     p.add_common()
     return p
 
@@ -37,7 +36,7 @@ def _import(args: argparse.Namespace, console: Console) -> int:
     check_output(args.output, args.overwrite)
     from pd4dgs_codec.interchange.scaffold_gs import read_scaffold_gs
 
-    scene = read_scaffold_gs(Path(args.input), args.appearance, args.voxel_size, args.iteration)
+    scene = read_scaffold_gs(Path(args.input), args.appearance, args.voxel_size)
     write_checkpoint(args.output, scene, args.overwrite)
     result = {
         "input": args.input,

@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pd4dgs_codec.errors import LimitExceeded, Malformed
+from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.format import canonical
 from pd4dgs_codec.format.canonical import Fields, as_integer, as_list, as_long
 from pd4dgs_codec.format.container import PREAMBLE_SIZE, SCENE_ID_SIZE
 from pd4dgs_codec.format.options import MODES
-from pd4dgs_codec.format.quantise import MAX_SYMBOL, Rows, RowTable
-from pd4dgs_codec.format.registry import LAYERS, MAX_CHANNELS, MAX_CHUNKS, MAX_ID, MAX_PAYLOAD, MAX_ROWS, MAX_ROWS_WIDTH
-from pd4dgs_codec.format.tables import Kind, as_step, check_ascending, unpack_kind
+from pd4dgs_codec.format.quantise import MAX_SYMBOL, RowTable
+from pd4dgs_codec.format.registry import LAYERS, MAX_CHUNKS, MAX_PAYLOAD
+from pd4dgs_codec.format.tables import Kind, as_step, pack_rows, unpack_kind, unpack_rows
 from pd4dgs_codec.scene import Camera, SceneInfo
 
 # Keys of the header map.
@@ -53,7 +53,7 @@ def pack_header(header: Header) -> bytes:
         CHUNKS: [list(chunk) for chunk in header.chunks],
         MODE: MODES[header.mode],
         KIND: list(header.kind),
-        ROWS: [[tensor.id, tensor.channels, *_f32(tensor.step)] for tensor in table.tensors],
+        ROWS: pack_rows(table.tensors),
         VOXEL_SIZE: _f32(info.voxel_size)[0],
         BOX: _f32(info.box),
         TIME_RANGE: _f32(info.time_range),
@@ -167,16 +167,7 @@ def layers_of(chunks: Iterable[tuple[int, int]]) -> list[int]:
 
 
 def _unpack_table(header: Fields) -> RowTable:
-    tensors = []
-    for row in as_long(header.get(ROWS), "header: rows", MAX_ROWS):
-        number, channels, step = as_list(row, "header: rows", 3)
-        as_integer(number, MAX_ID, "header: id of rows")
-        as_integer(channels, MAX_CHANNELS, f"header: channels of rows {number}", 1)
-        tensors.append(Rows(number, channels, as_step(step, f"header: rows {number}")))
-    check_ascending([tensor.id for tensor in tensors], "header: rows")
-    table = RowTable(tuple(tensors))
-    if table.channels > MAX_ROWS_WIDTH:
-        raise LimitExceeded(f"header: rows of {table.channels} channels, limit {MAX_ROWS_WIDTH}")
+    table = RowTable(unpack_rows(header.get(ROWS), "header: rows"))
     if CENTRE not in header:
         return table
     values: list[Any] = header.sequence(CENTRE, table.channels)

@@ -51,8 +51,8 @@ def info(data: bytes) -> dict[str, Any]:
             row |= {"bytes": row["bytes"] + size, "end": place["end"]}
             if offset + size <= len(data):
                 payload = read_chunk(data, offset, type=chunk_type, length=length, index=index).payload
-                scalars = header.table.channels + header.table.graded
-                found, _, declared = read_parameters(payload, chunk_type, scalars, declared, later)
+                of = tables[chunk_type] if later else None
+                found, _, declared = read_parameters(payload, chunk_type, header.table, declared, of)
                 place |= {"anchors": found.rows, "fill": found.fill and list(found.fill)}
                 if not later:
                     tables[chunk_type] = found.tables
@@ -107,15 +107,15 @@ def hashes(data: bytes, max_layer: int | None = None) -> list[dict[str, Any]]:
     complete file, or in its layers <= max_layer (later bytes are ignored). Clause 12.4.
 
     symbols: int32 little-endian, C order, of the own voxels [n, 3], the rises of earlier mask codes, the own codes, the
-    step classes if there are any, the rows [W, n], then the planes [C, H, W] grid by grid, then weight and bias per
-    linear layer, chain by chain. tensors: float32 little-endian of the own positions [n, 3], the rows (per tensor [n,
-    C]), then planes, weights and biases as above.
+    step classes if there are any, the rows [W, n] in steps, the layer rows likewise, then the planes [C, H, W] grid by
+    grid, then weight and bias per linear layer, chain by chain. tensors: float32 little-endian of the own positions [n,
+    3], the rows and layer rows (per tensor [n, C]), then planes, weights and biases as above.
     """
     header, layers = read_layers(data, max_layer=max_layer)
     found = []
     for part in layers:
-        values = [dequantise(part.anchor_q, header.info.voxel_size), *header.table.dequantise(part.rows, part.classes)]
-        values += part.tensors.dequantised().arrays
+        values = [dequantise(part.anchor_q, header.info.voxel_size), *header.table.dequantise(part.rows)]
+        values += [*part.layer_table.dequantise(part.layer_rows), *part.tensors.dequantised().arrays]
         found.append({"layer": part.layer, "symbols": _digest(part.arrays(), "<i4"), "tensors": _digest(values, "<f4")})
     return found
 
@@ -159,8 +159,9 @@ def to_npz_dict(scene: Scene, symbols: bool = False) -> dict[str, np.ndarray]:
             arrays[name], steps[name] = array, step
     if symbols:
         quantised = {name: quantise(arrays[name], step, name) for name, step in steps.items()}
-        classes = NO_CLASSES if scene.grading is None else scene.grading.classes
-        channels = table.quantise(list(scene.attributes.values()), classes, list(shapes))
+        classes = NO_CLASSES if scene.grading is None else scene.grading.classes.astype(np.int32)
+        v = table.quantise(list(scene.attributes.values()), classes, list(shapes))
+        channels = table.symbols(v, classes)
         for name, (_, rows) in zip(shapes, table.of_each(channels), strict=True):
             quantised[name] = rows.T.reshape(arrays[name].shape)
         steps |= scene.steps.attributes

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -22,7 +23,7 @@ from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.planes import choose_predictor, read_planes, restore, write_planes
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, NO_CLASSES, RowTable, magnitude
-from pd4dgs_codec.format.symbols import LayerSymbols
+from pd4dgs_codec.format.symbols import NO_LAYER_ROWS, LayerSymbols
 from pd4dgs_codec.format.tables import Declared, Parameters, Tables, Tensors, pack_parameters, read_parameters
 from pd4dgs_codec.morton import AXIS_BITS, MAX_VOXEL, morton_codes
 from pd4dgs_codec.scene import MASK_MIN_CODE, MAX_CLASS
@@ -85,9 +86,10 @@ def write_slice(
     later: whether it is not the first slice of its layer. past: of the layer's earlier slices; it grows.
     """
     coded = Residuals.of(symbols.tensors)
+    tables = Tables() if later else coded.tables
     write = _write_lzma if options.mode == "lzma" else _write_ans
     codes, stream, reports = write(symbols, coded, options, later, past or Past())
-    head = pack_parameters(len(symbols.anchor_q), len(codes), symbols.fill, coded.tables)
+    head = pack_parameters(len(symbols.anchor_q), len(codes), symbols.fill, tables)
     return b"".join([head, codes, stream]), reports
 
 
@@ -98,7 +100,7 @@ def _write_ans(
     encode_positions(symbols.anchor_q, writer, past.positions)
     masks = writer.write([symbols.rises, symbols.codes], past.rows)
     writer.write([symbols.classes], past.rows)
-    rows = writer.write(list(by_class(symbols.rows, symbols.classes)), past.rows) + entropy_bits(symbols.classes)
+    rows = writer.write(list(_row_channels(symbols)), past.rows) + entropy_bits(symbols.classes)
     known = list[Fitted]()
     planes = write_planes(coded.planes, writer, known)
     weights = writer.write([array.ravel() for array in symbols.tensors.weights], known)
@@ -106,7 +108,7 @@ def _write_ans(
     groups = (
         (bits[:1], 0.0, [symbols.anchor_q]),
         (bits[1:2], masks, [symbols.rises, symbols.codes]),
-        (bits[2:4], rows, [symbols.classes, symbols.rows]),
+        (bits[2:4], rows, [symbols.classes, symbols.rows, symbols.layer_rows]),
         (bits[4:-1], planes, coded.planes),
         (bits[-1:], weights, symbols.tensors.weights),
     )
@@ -117,9 +119,16 @@ def _write_ans(
     return codes, stream, [report for report in reports if report.symbols]
 
 
-def by_class(rows: np.ndarray, classes: np.ndarray) -> Iterator[np.ndarray]:
-    """Yields the coded channels, int [n], of rows int32 [W, n]: of each class 0 .. MAX_CLASS, if there are classes."""
-    yield from Places.by(classes, MAX_CLASS + 1).parts(rows) if classes.size else rows
+def _row_symbols(symbols: LayerSymbols) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the symbols of the rows and of the layer rows, int32 [channels, rows]."""
+    own = symbols.table.symbols(symbols.rows, symbols.classes)
+    return own, symbols.layer_table.symbols(symbols.layer_rows, symbols.all_classes)
+
+
+def _row_channels(symbols: LayerSymbols) -> Iterator[np.ndarray]:
+    """Yields the coded channels of rows and layer rows, int [any]: of each class 0 .. MAX_CLASS, if there are any."""
+    for k, classes in zip(_row_symbols(symbols), (symbols.classes, symbols.all_classes), strict=True):
+        yield from Places.by(classes, MAX_CLASS + 1).parts(k) if classes.size else k
 
 
 def _write_lzma(
@@ -130,9 +139,9 @@ def _write_lzma(
     steps = np.diff(symbols.anchor_q, axis=0, prepend=0).T if len(symbols.anchor_q) else []
     rest = [*(channel.ravel() for plane in coded.planes for channel in plane), *map(np.ravel, symbols.tensors.weights)]
     classes = [symbols.classes] if len(symbols.classes) else []
-    channels = [*steps, symbols.rises, symbols.codes, *classes, *symbols.rows, *rest]
+    channels = [*steps, symbols.rises, symbols.codes, *classes, *chain(*_row_symbols(symbols)), *rest]
     codes, stream = encode_channels_lzma(channels, options.effort)
-    counted = [channel for channel in (*by_class(symbols.rows, symbols.classes), *rest) if channel.size]
+    counted = [channel for channel in (*_row_channels(symbols), *rest) if channel.size]
     rate = sum(histogram(channel).rate_bits for channel in counted) + entropy_bits(symbols.classes)
     count = sum(channel.size for channel in channels)
     return codes, stream, [StreamReport(LZMA_GROUP, 8 * (len(codes) + len(stream)), rate, count)]
@@ -147,80 +156,101 @@ def read_slice(
     table: RowTable,
     mode: str,
     before: Declared,
-    later: bool = False,
+    of: Tables | None = None,
+    earlier: np.ndarray = NO_CLASSES,
     past: Past[Prior] | None = None,
 ) -> tuple[LayerSymbols, Declared]:
-    """Returns (symbols, sums with this slice) of a payload. table: of the rows. Other arguments as in read_parameters.
+    """Returns (symbols, sums with this slice) of a payload. Arguments as in read_parameters.
 
-    past: of the layer's earlier slices; it grows. Raises subclasses of DecodeError; nothing is allocated for a count
-    beyond the limits or the payload.
+    earlier: int32 [rows before], the step classes of the rows of all layers before; NO_CLASSES without any. past: of
+    the layer's earlier slices; it grows. Raises subclasses of DecodeError; nothing is allocated for a count beyond the
+    limits or the payload.
     """
-    parameters, start, declared = read_parameters(payload, layer, table.channels + table.graded, before, later)
+    parameters, start, declared = read_parameters(payload, layer, table, before, of)
+    if of:
+        earlier = NO_CLASSES
     codes, stream = payload[start : start + parameters.codes], bytes(payload[start + parameters.codes :])
     if mode == "lzma":
-        part = _read_lzma(codes, stream, layer, table, parameters)
+        coded = _read_lzma(codes, stream, table, parameters)
     else:
-        reader = ChannelReader(codes, stream, parameters.symbols, later)
-        part = _read_ans(reader, layer, table, parameters, past or Past())
-    where = f"layer {layer}"
-    for name, found, low in (("rise of a mask code", part.rises, 0), ("mask code", part.codes, MASK_MIN_CODE)):
+        reader = ChannelReader(codes, stream, parameters.symbols, of is not None)
+        coded = _read_ans(reader, table, parameters, earlier, past or Past())
+    voxels, rises, own, classes, k, layer_k, residuals, weights, bits = coded
+    where, tables = f"layer {layer}", parameters.tables
+    for name, found, low in (("rise of a mask code", rises, 0), ("mask code", own, MASK_MIN_CODE)):
         if found.size and not (low <= found.min() and found.max() <= 255):
             raise Malformed(f"{where}: {name} in {int(found.min())}..{int(found.max())}, expected {low}..255")
-    for name, arrays in (("row", [part.rows]), ("chain", part.tensors.weights)):
-        if any(magnitude(array) > MAX_SYMBOL for array in arrays):
-            raise Malformed(f"{where}: a symbol of a {name} over {MAX_SYMBOL} in magnitude")
-    return part, declared
+    if any(magnitude(array) > MAX_SYMBOL for array in weights):
+        raise Malformed(f"{where}: a symbol of a chain over {MAX_SYMBOL} in magnitude")
+    predictors = [predictor for grid in tables.grids for predictor in grid.predictors]
+    samples = restore(list(zip(predictors, residuals, strict=True)))
+    arrays = [array.reshape(shape) for array, shape in zip(weights, tables.weights, strict=True)]
+    tensors, fill = Tensors(tables, samples, arrays), parameters.fill
+    part = LayerSymbols(layer, table, voxels, rises, own, classes, k, tensors, fill, earlier, layer_k, bits)
+    try:
+        rows, layer_rows = table.values(k, classes), part.layer_table.values(layer_k, part.all_classes)
+    except Malformed as error:
+        raise Malformed(f"{where}: {error.message}") from None
+    return replace(part, rows=rows, layer_rows=layer_rows), declared
+
+
+Array = np.ndarray
+#: Voxels, rises, own codes and step classes of a slice, the symbols of its rows and of its layer rows, the residuals of
+#: its planes, its weights and biases, and the bits of its groups.
+Coded = tuple[Array, Array, Array, Array, Array, Array, list[Array], list[Array], dict[str, int]]
 
 
 def _read_ans(
-    reader: ChannelReader, layer: int, table: RowTable, parameters: Parameters, past: Past[Prior]
-) -> LayerSymbols:
+    reader: ChannelReader, table: RowTable, parameters: Parameters, earlier: Array, past: Past[Prior]
+) -> Coded:
     n, tables, marks = parameters.rows, parameters.tables, [reader.bits]
-    anchor_q = decode_positions(reader, n, past.positions)
+    voxels = decode_positions(reader, n, past.positions)
     marks.append(reader.bits)
-    sizes = [parameters.rises, n]
-    rises, codes = split(reader.read(sizes, past.rows), sizes)
+    rises, own = split(reader.read([parameters.rises, n], past.rows), [parameters.rises, n])
     marks.append(reader.bits)
-    classes = reader.read([n] * table.graded, past.rows)
-    if classes.size:
-        _check_classes(classes)
-        places, rows = Places.by(classes, MAX_CLASS + 1), np.empty((table.channels, n), np.int32)
-        places.put(reader.read(places.sizes * table.channels, past.rows), rows)
-    else:
-        rows = reader.read([n] * table.channels, past.rows).reshape(table.channels, n)
+    classes, width = reader.read([n] * table.graded, past.rows), RowTable(tables.rows).channels
+    _check_classes(classes)
+    rows = _read_rows(reader, table.channels, n, classes, past.rows)
+    everyone = np.concatenate([earlier, classes])
+    layer_rows = _read_rows(reader, width, parameters.rises + n, everyone, past.rows) if width else NO_LAYER_ROWS
     marks.append(reader.bits)
-    known = list[Prior]()
+    known, sizes = list[Prior](), [math.prod(shape) for shape in tables.weights]
     residuals = read_planes(reader, tables.planes, known)
     marks.append(reader.bits)
-    sizes = [math.prod(shape) for shape in tables.weights]
     weights = split(reader.read(sizes, known), sizes)
     marks.append(reader.bits)
     reader.finish()
-    tensors, bits = _tensors(tables, residuals, weights), np.diff(marks).tolist()
-    spent = dict(zip(GROUPS, bits, strict=True))
-    return LayerSymbols(layer, anchor_q, rises, codes, classes, rows, tensors, parameters.fill, spent)
+    bits = dict(zip(GROUPS, np.diff(marks).tolist(), strict=True))
+    return voxels, rises, own, classes, rows, layer_rows, residuals, weights, bits
 
 
-def _read_lzma(
-    codes: bytes | memoryview, stream: bytes, layer: int, table: RowTable, parameters: Parameters
-) -> LayerSymbols:
+def _read_rows(reader: ChannelReader, channels: int, n: int, classes: np.ndarray, known: list[Prior]) -> np.ndarray:
+    """Decodes the symbols int32 [channels, n] of rows of these step classes, int32 [n] or NO_CLASSES."""
+    if not classes.size:
+        return reader.read([n] * channels, known).reshape(channels, n)
+    places, rows = Places.by(classes, MAX_CLASS + 1), np.empty((channels, n), np.int32)
+    places.put(reader.read(places.sizes * channels, known), rows)
+    return rows
+
+
+def _read_lzma(codes: bytes | memoryview, stream: bytes, table: RowTable, parameters: Parameters) -> Coded:
     n, tables = parameters.rows, parameters.tables
     channels = [h * w for c, h, w in tables.planes for _ in range(c)]
     groups = [
         *([n] * 3, [parameters.rises, n], [n] * table.graded, [n] * table.channels),
-        *(channels, [math.prod(shape) for shape in tables.weights]),
+        *([parameters.rises + n] * RowTable(tables.rows).channels, channels, list(map(math.prod, tables.weights))),
     ]
     left = iter(decode_channels_lzma(codes, stream, [size for sizes in groups for size in sizes]))
-    steps, (rises, own), classes, rows, planes, weights = ([next(left) for _ in sizes] for sizes in groups)
+    steps, (rises, own), classes, rows, moved, planes, weights = ([next(left) for _ in sizes] for sizes in groups)
     _check_classes(*classes)
     ends = np.cumsum([0, *(c for c, _, _ in tables.planes)]).tolist()
     residuals = [
         np.concatenate(planes[first:end]).reshape(shape)
         for first, end, shape in zip(ends, ends[1:], tables.planes, strict=False)
     ]
-    tensors = _tensors(tables, residuals, weights)
-    graded, spent = classes[0] if classes else NO_CLASSES, {LZMA_GROUP: 8 * (len(codes) + len(stream))}
-    return LayerSymbols(layer, _voxels(steps), rises, own, graded, np.stack(rows), tensors, parameters.fill, spent)
+    graded, layer_rows = [*classes, NO_CLASSES][0], np.stack(moved) if moved else NO_LAYER_ROWS
+    bits = {LZMA_GROUP: 8 * (len(codes) + len(stream))}
+    return _voxels(steps), rises, own, graded, np.stack(rows), layer_rows, residuals, weights, bits
 
 
 def _voxels(steps: Sequence[np.ndarray]) -> np.ndarray:
@@ -232,12 +262,6 @@ def _voxels(steps: Sequence[np.ndarray]) -> np.ndarray:
     if np.any(np.diff(morton_codes(cells)) <= 0):
         raise Malformed("voxels out of Morton order")
     return cells.astype(np.int32)
-
-
-def _tensors(tables: Tables, residuals: Sequence[np.ndarray], weights: Sequence[np.ndarray]) -> Tensors:
-    predictors = [predictor for grid in tables.grids for predictor in grid.predictors]
-    samples, pairs = restore(list(zip(predictors, residuals, strict=True))), zip(weights, tables.weights, strict=True)
-    return Tensors(tables, samples, [array.reshape(shape) for array, shape in pairs])
 
 
 def _check_classes(classes: np.ndarray = NO_CLASSES) -> None:

@@ -16,7 +16,7 @@ from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.payload import write_slice
 from pd4dgs_codec.format.quantise import NO_CLASSES, RowTable
-from pd4dgs_codec.format.symbols import Growing, LayerSymbols, first_duplicate
+from pd4dgs_codec.format.symbols import NO_LAYER_ROWS, Growing, LayerSymbols, first_duplicate
 from pd4dgs_codec.format.tables import NOTHING, Kind, Tensors
 from pd4dgs_codec.kinds import hexplane
 from pd4dgs_codec.morton import morton_order
@@ -49,7 +49,7 @@ class LeftOut:
 def tensor_bytes(symbols: Tensors, options: EncodeOptions) -> int:
     """Returns the bytes of grids and chains, coded as a layer without anchors."""
     empty = np.zeros(0, np.int32)
-    alone = LayerSymbols(0, np.zeros((0, 3), np.int32), empty, empty, empty, np.zeros((0, 0), np.int32), symbols)
+    alone = LayerSymbols(0, RowTable(), np.zeros((0, 3), np.int32), empty, empty, empty, NO_LAYER_ROWS, symbols)
     return len(write_slice(alone, options)[0])
 
 
@@ -125,6 +125,7 @@ def layer_symbols(scene: Scene, index: int, tensors: Tensors = NOTHING) -> Layer
     values = {name: x[first:last] for name, x in scene.attributes.items()}
     return LayerSymbols(
         layer=scene.layers[index],
+        table=table,
         anchor_q=scene.anchor_q[first:last],
         rises=codes[:first] - before,
         codes=codes[first:],

@@ -37,6 +37,7 @@ class LayerReader:
         self._scene_id = b""
         self._declared = Declared()
         self._taken = TakenVoxels()
+        self._tables = Tables()  # of the first slice of the layer in progress
         self._past = Past[Prior]()  # copied for each slice, so that a fault leaves it unchanged
 
     @property
@@ -133,12 +134,15 @@ class LayerReader:
     def _read_slice(self, chunk: Chunk, layer: int, header: Header) -> LayerSymbols:
         later = layer == self._layer
         past = self._past.copy() if later else Past[Prior]()
-        part, declared = read_slice(chunk.payload, layer, header.table, header.mode, self._declared, later, past)
-        check_slice(part, self.grown.codes, header.info.voxel_size, header.table)
+        of, earlier = self._tables if later else None, self.grown.classes
+        found = read_slice(chunk.payload, layer, header.table, header.mode, self._declared, of, earlier, past)
+        part, declared = found
+        check_slice(part, self.grown.codes, header.info.voxel_size)
         if not later:
             tables = {number: tensors.tables for number, tensors in self.grown.tensors.items()}
             self._check(header.kind, header.table, {**tables, layer: part.tensors.tables})
         self._taken.take(part.anchor_q)
+        self._tables = self._tables if later else part.tensors.tables
         self._declared, self._past = declared, past if chunk.more else Past()
         self._layer, self._number, self.count = layer, chunk.slice, self.count + 1
         self.grown.add(part, not later)

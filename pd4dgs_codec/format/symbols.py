@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import chain
 
 import numpy as np
 
 from pd4dgs_codec.errors import Malformed
-from pd4dgs_codec.format.quantise import MAX_SYMBOL, RowTable, all_finite, dequantise, row_blocks
-from pd4dgs_codec.format.tables import NOTHING, Fill, Tensors
+from pd4dgs_codec.format.quantise import NO_CLASSES, RowTable, all_finite, dequantise, row_blocks
+from pd4dgs_codec.format.tables import Fill, Tables, Tensors
 from pd4dgs_codec.morton import MAX_VOXEL, morton_order
 from pd4dgs_codec.scene import Network
+
+NO_LAYER_ROWS = np.zeros((0, 0), np.int32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,11 +23,14 @@ class LayerSymbols:
 
     anchor_q: int32 [n, 3] voxel indices of its own anchors, in Morton order. rises: int32 [rows before], of the earlier
     anchors' mask codes. codes: int32 [n], of its own anchors. classes: int32 [n] step classes, or NO_CLASSES. rows:
-    int32 [W, n]. tensors: int32. fill: what a prefix that ends here has behind its Gaussians; None: the background.
-    bits: that each group of channels took in the file, by its name, if it was read from one.
+    int32 [W, n], in steps. tensors: int32. fill: what a prefix that ends here has behind its Gaussians; None: the
+    background. earlier: int32 [rows before], the step classes of earlier anchors, empty without any and in a later
+    slice. layer_rows: int32 [channels, rows before + n], in steps; in a later slice only of its own anchors. bits: that
+    each group of channels took in the file, by its name, if it was read from one.
     """
 
     layer: int
+    table: RowTable
     anchor_q: np.ndarray
     rises: np.ndarray
     codes: np.ndarray
@@ -32,17 +38,31 @@ class LayerSymbols:
     rows: np.ndarray
     tensors: Tensors
     fill: Fill | None = None
+    earlier: np.ndarray = field(default_factory=lambda: NO_CLASSES)
+    layer_rows: np.ndarray = field(default_factory=lambda: NO_LAYER_ROWS)
     bits: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def layer_table(self) -> RowTable:
+        """The table of the layer rows."""
+        rows = RowTable(self.tensors.tables.rows)
+        return RowTable(rows.tensors, np.zeros(rows.channels, np.int32)) if self.table.graded else rows
+
+    @property
+    def all_classes(self) -> np.ndarray:
+        """int32 [rows before + n], or NO_CLASSES: the step classes of the layer rows."""
+        return np.concatenate([self.earlier, self.classes])
 
     def arrays(self) -> list[np.ndarray]:
         """All arrays, in the order in which info --hashes digests them."""
-        return [self.anchor_q, self.rises, self.codes, self.classes, self.rows, *self.tensors.arrays]
+        own = [self.anchor_q, self.rises, self.codes, self.classes, self.rows, self.layer_rows]
+        return own + self.tensors.arrays
 
     def bits_per_row(self) -> np.ndarray:
         """Estimates the bits of each anchor, float64 [n], from the frequencies of its symbols in their channels."""
         n = len(self.anchor_q)
         bits = np.full(n, 3.0 * max(n, 2).bit_length())  # of a position
-        for channel in (self.codes, *self.rows):
+        for channel in (self.codes, *self.table.symbols(self.rows, self.classes)):
             _, index, counts = np.unique(channel, return_inverse=True, return_counts=True)
             bits += np.log2(n / counts)[index]
         return bits
@@ -53,8 +73,11 @@ def merged(slices: Sequence[LayerSymbols]) -> LayerSymbols:
     if len(slices) == 1:
         return slices[0]
     anchor_q = np.concatenate([part.anchor_q for part in slices])
-    order = morton_order(anchor_q)
+    order, earlier = morton_order(anchor_q), len(slices[0].rises)
     classes = np.concatenate([part.classes for part in slices])
+    layer_rows = np.concatenate([part.layer_rows for part in slices], axis=1)
+    if layer_rows.size:
+        layer_rows = layer_rows[:, np.concatenate([np.arange(earlier), earlier + order])]
     return replace(
         slices[0],
         anchor_q=anchor_q[order],
@@ -62,16 +85,21 @@ def merged(slices: Sequence[LayerSymbols]) -> LayerSymbols:
         classes=classes[order] if len(classes) else classes,
         rows=np.concatenate([part.rows for part in slices], axis=1)[:, order],
         fill=slices[-1].fill,
+        layer_rows=layer_rows,
         bits={name: sum(part.bits.get(name, 0) for part in slices) for name in slices[0].bits},
     )
 
 
 def sliced(layer: LayerSymbols, rows: np.ndarray, first: bool) -> LayerSymbols:
     """Returns a slice with the anchors `rows` int64 [n] of a layer. first: whether it carries the layer's rest too."""
-    rows = rows[morton_order(layer.anchor_q[rows])]
-    part = layer if first else replace(layer, rises=layer.rises[:0], tensors=NOTHING)
+    rows, earlier = rows[morton_order(layer.anchor_q[rows])], len(layer.rises)
+    part, kept = layer, np.concatenate([np.arange(earlier if first else 0), earlier + rows])
+    if not first:
+        tensors = Tensors(Tables(rows=layer.tensors.tables.rows))
+        part = replace(layer, rises=layer.rises[:0], tensors=tensors, earlier=NO_CLASSES)
     return replace(
         part,
+        layer_rows=layer.layer_rows[:, kept] if layer.layer_rows.size else layer.layer_rows,
         anchor_q=layer.anchor_q[rows],
         codes=layer.codes[rows],
         classes=layer.classes[rows] if len(layer.classes) else layer.classes,
@@ -86,8 +114,8 @@ class LayerTensors:
     layer: its number. kind: of its deformation (number, parameters), empty if it states none. fill: RGB 0..255 behind
     its Gaussians, None for the background. voxels: int32 [n, 3] and positions: float32 [n, 3] of its own anchors.
     codes: uint8 [N], the mask codes of the anchors of all layers so far. classes: uint8 [n] step classes, 0 without
-    any. rows: float32 [n, C] by id. grids: planes float32 [C, H, W] by id. chains: (weight [outputs, inputs], bias
-    [outputs]) of each linear layer by id, float32.
+    any. rows: float32 [n, C] by id. layer_rows: float32 [N, C] by id. grids: planes float32 [C, H, W] by id. chains:
+    (weight [outputs, inputs], bias [outputs]) of each linear layer by id, float32.
     """
 
     layer: int
@@ -98,6 +126,7 @@ class LayerTensors:
     codes: np.ndarray
     classes: np.ndarray
     rows: dict[int, np.ndarray]
+    layer_rows: dict[int, np.ndarray]
     grids: dict[int, tuple[np.ndarray, ...]]
     chains: dict[int, Network]
 
@@ -156,6 +185,7 @@ class Growing:
         self._anchor_q, self._classes = _Column(np.int32, 3), _Column(np.uint8)
         self._rows = [_Column(np.float32, tensor.channels) for tensor in table.tensors]
         self._codes = list[_Column]()
+        self._layer_rows = list[list[_Column]]()  # by layer present
         self.tensors = dict[int, Tensors]()  #: float32, by layer
         self.fills = dict[int, Fill | None]()  #: by layer
         self._first = 0  # row of the layer in progress
@@ -172,22 +202,25 @@ class Growing:
             np.add(before, part.rises, out=raised, casting="unsafe")
             self._codes.append(codes)
             self.tensors[part.layer] = part.tensors.dequantised()
+            self._layer_rows.append([_Column(np.float32, tensor.channels) for tensor in part.tensors.tables.rows])
         self.fills[part.layer] = part.fill
         self._sorted = first or (self._sorted and not n)
         self._codes[-1].grow(n)[:] = part.codes
         self._anchor_q.grow(n)[:] = part.anchor_q
         self._classes.grow(part.classes.size)[:] = part.classes
-        rows = [column.grow(n) for column in self._rows]
-        for at in row_blocks(n):
-            for own, x in zip(rows, self._table.dequantise(part.rows[:, at], part.classes[at]), strict=True):
-                own[at] = x
+        tables = ((self._table, self._rows, part.rows), (part.layer_table, self._layer_rows[-1], part.layer_rows))
+        for table, columns, v in tables if part.layer_rows.size else tables[:1]:
+            grown = [column.grow(v.shape[1]) for column in columns]
+            for at in row_blocks(v.shape[1]):
+                for own, x in zip(grown, table.dequantise(v[:, at]), strict=True):
+                    own[at] = x
 
     def sort(self) -> None:
         """Sorts the rows of the layer in progress by Morton order."""
         if self._sorted:
             return
         order = morton_order(self._anchor_q.values[self._first :])
-        for column in (self._anchor_q, self._classes, *self._rows, self._codes[-1]):
+        for column in (self._anchor_q, self._classes, *self._rows, self._codes[-1], *self._layer_rows[-1]):
             if column.size:
                 column.reorder(self._first, order)
         self._sorted = True
@@ -197,21 +230,28 @@ class Growing:
         """uint8 [rows so far]: the mask codes of the latest layer."""
         return self._codes[-1].values if self._codes else np.zeros(0, np.uint8)
 
-    def arrays(self, writeable: bool = True) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    @property
+    def classes(self) -> np.ndarray:
+        """int32 [rows so far], or NO_CLASSES: the step classes."""
+        return self._classes.values.astype(np.int32)
+
+    def arrays(self, writeable: bool = True) -> tuple[list[np.ndarray], list[np.ndarray], list[list[np.ndarray]]]:
         """Returns (voxels int32 [N, 3], classes uint8 [N or 0] and the rows of each tensor float32 [N, C]; the mask
-        codes of each layer, uint8 [rows so far]). Later calls may return the same arrays."""
+        codes of each layer, uint8 [rows so far]; its layer rows of each tensor, float32 [rows so far, C]). Later calls
+        may return the same arrays."""
         values = [column.give() for column in (self._anchor_q, self._classes, *self._rows)]
         codes = [column.give() for column in self._codes]
-        for array in (*values, *codes):
+        layer_rows = [[column.give() for column in columns] for columns in self._layer_rows]
+        for array in (*values, *codes, *chain(*layer_rows)):
             array.flags.writeable = writeable
-        return values, codes
+        return values, codes, layer_rows
 
     def layers(self) -> list[LayerTensors]:
         """Returns the layers so far."""
-        (voxels, classes, *rows), codes = self.arrays()
+        (voxels, classes, *rows), codes, layer_rows = self.arrays()
         classes = classes if self._table.graded else np.zeros(len(voxels), np.uint8)
         found, first = list[LayerTensors](), 0
-        for (layer, tensors), own_codes in zip(self.tensors.items(), codes, strict=True):
+        for (layer, tensors), own_codes, of_layer in zip(self.tensors.items(), codes, layer_rows, strict=True):
             own, first = slice(first, len(own_codes)), len(own_codes)
             found.append(
                 LayerTensors(
@@ -223,6 +263,7 @@ class Growing:
                     codes=own_codes,
                     classes=classes[own],
                     rows={tensor.id: x[own] for tensor, x in zip(self._table.tensors, rows, strict=True)},
+                    layer_rows={tensor.id: x for tensor, x in zip(tensors.tables.rows, of_layer, strict=True)},
                     grids=tensors.grids,
                     chains=tensors.chains,
                 )
@@ -233,22 +274,19 @@ class Growing:
 # -- rules between slices ----------------------------------------------------------------------------------------------
 
 
-def check_slice(part: LayerSymbols, before: np.ndarray, voxel_size: float, table: RowTable) -> None:
+def check_slice(part: LayerSymbols, before: np.ndarray, voxel_size: float) -> None:
     """Checks a slice against the header and the mask codes before it, uint8 [rows before].
 
-    Raises Malformed if a mask code is above 255, a row lies too many steps from 0, or a dequantised value would not be
-    finite.
+    Raises Malformed if a mask code is above 255 or a dequantised value would not be finite.
     """
     where = f"layer {part.layer}"
     if part.rises.size:
         highest = int((before + part.rises).max())
         if highest > 255:
             raise Malformed(f"{where}: mask code {highest}, expected at most 255")
-    farthest = table.farthest(part.rows, part.classes)
-    if max(farthest) > MAX_SYMBOL:
-        raise Malformed(f"{where}: a value of a row more than {MAX_SYMBOL} steps from 0")
     stored = [(part.anchor_q, voxel_size), *zip(part.tensors.arrays, part.tensors.tables.steps, strict=True)]
-    stored += [(np.array(k), tensor.step) for k, tensor in zip(farthest, table.tensors, strict=True)]
+    for table, v in ((part.table, part.rows), (part.layer_table, part.layer_rows)):
+        stored += [(own, tensor.step) for tensor, own in table.of_each(v)]
     if not all(all_finite(k, step) for k, step in stored):
         raise Malformed(f"{where}: a dequantised value is not finite")
 

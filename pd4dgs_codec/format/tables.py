@@ -19,7 +19,7 @@ from pd4dgs_codec.errors import LimitExceeded, Malformed
 from pd4dgs_codec.format import canonical
 from pd4dgs_codec.format.canonical import Fields, as_integer, as_list, as_long, as_registered
 from pd4dgs_codec.format.planes import PREDICTORS, PlaneShape
-from pd4dgs_codec.format.quantise import dequantise, is_step, quantise
+from pd4dgs_codec.format.quantise import ROW_PREDICTORS, Rows, RowTable, dequantise, is_step, quantise
 from pd4dgs_codec.format.registry import (
     MAX_ANCHORS,
     MAX_AXES,
@@ -33,13 +33,15 @@ from pd4dgs_codec.format.registry import (
     MAX_KIND_LENGTH,
     MAX_PARAMETERS,
     MAX_PAYLOAD,
+    MAX_ROWS,
+    MAX_ROWS_WIDTH,
     MAX_SIDE,
     MAX_WIDTH,
 )
 from pd4dgs_codec.scene import Network
 
 # Keys of the parameters of a slice.
-KEYS = ROWS, CODES, FILL, GRIDS, CHAINS, KIND = range(1, 7)
+KEYS = OWN_ROWS, CODES, FILL, GRIDS, CHAINS, KIND, LAYER_ROWS = range(1, 8)
 
 #: A file of S symbols has at least (S - FREE_SYMBOLS) / SYMBOLS_PER_BYTE bytes, so that a few bytes that declare
 #: constant channels cannot make a decoder allocate without end. Real scenes spend over 0.1 bit per symbol.
@@ -85,14 +87,15 @@ class Chain:
 
 @dataclass(frozen=True)
 class Tables:
-    """The grids and chains of a layer, by ascending id. grid_step, chain_step: their steps, 0 without any. kind: of the
-    deformation, empty if none is stated."""
+    """The grids, chains and layer rows of a layer, by ascending id. grid_step, chain_step: their steps, 0 without any.
+    kind: of the deformation, empty if none is stated. rows: tensors with a row for each earlier and each own anchor."""
 
     grids: tuple[Grid, ...] = ()
     chains: tuple[Chain, ...] = ()
     grid_step: float = 0.0
     chain_step: float = 0.0
     kind: Kind = ()
+    rows: tuple[Rows, ...] = ()
 
     @property
     def planes(self) -> list[PlaneShape]:
@@ -120,8 +123,10 @@ class Tables:
         return [self.grid_step] * len(self.planes) + [self.chain_step] * len(self.weights)
 
     def json(self) -> dict[str, Any]:
-        """grids: [id, C, sides ...] each. chains: [id, widths ...] each. kind: numbers, None if not stated."""
+        """grids: [id, C, sides ...] each. chains: [id, widths ...] each. kind: numbers, None if not stated. layer_rows:
+        [id, C, step, predictor] each."""
         return {
+            "layer_rows": [[t.id, t.channels, t.step, t.predictor] for t in self.rows],
             "grids": [[grid.id, grid.channels, *grid.sides] for grid in self.grids],
             "chains": [[chain.id, *chain.widths] for chain in self.chains],
             "grid_step": self.grid_step or None,
@@ -189,7 +194,8 @@ class Declared:
 @dataclass(frozen=True)
 class Parameters:
     """The parameters of a slice. rows: its own anchors. rises: earlier anchors whose mask codes it raises. codes:
-    length of its codes in bytes. symbols: number of all its symbols, those of voxel indices and masks included."""
+    length of its codes in bytes. tables: in a later slice, of the rows of its layer alone. symbols: number of all its
+    symbols, those of voxel indices and masks included."""
 
     rows: int
     codes: int
@@ -201,7 +207,7 @@ class Parameters:
 
 def pack_parameters(rows: int, codes: int, fill: Fill | None, tables: Tables) -> bytes:
     """Returns the bytes before the codes: the parameters behind their length."""
-    fields: dict[int, object] = {ROWS: rows, CODES: codes}
+    fields: dict[int, object] = {OWN_ROWS: rows, CODES: codes}
     if fill:
         fields[FILL] = list(fill)
     if tables.grids:
@@ -211,6 +217,8 @@ def pack_parameters(rows: int, codes: int, fill: Fill | None, tables: Tables) ->
         fields[CHAINS] = [tables.chain_step, *([chain.id, *chain.widths] for chain in tables.chains)]
     if tables.kind:
         fields[KIND] = list(tables.kind)
+    if tables.rows:
+        fields[LAYER_ROWS] = pack_rows(tables.rows)
     packed = canonical.pack(fields)
     return struct.pack("<I", len(packed)) + packed
 
@@ -225,15 +233,15 @@ def with_fill(payload: bytes, fill: Fill | None) -> bytes:
 
 
 def read_parameters(
-    payload: bytes | memoryview, layer: int, scalars: int, before: Declared, later: bool = False
+    payload: bytes | memoryview, layer: int, table: RowTable, before: Declared, of: Tables | None = None
 ) -> tuple[Parameters, int, Declared]:
     """Returns (parameters, offset of the codes, sums with this slice) of a payload. Checks all lengths against the
     payload's size and all counts against their limits.
 
-    scalars: symbols of a row, without those of its voxel and mask code. before: sums over earlier slices. later:
-    whether it is not the first slice of its layer. Raises subclasses of DecodeError.
+    table: of the header's rows. before: sums over earlier slices. of: in a later slice, the tables of its layer's first
+    one. Raises subclasses of DecodeError.
     """
-    where = f"layer {layer}"
+    where, later = f"layer {layer}", of is not None
     if len(payload) < 4:
         raise Malformed(f"{where}: payload of {len(payload)} bytes, expected at least 4")
     (length,) = struct.unpack_from("<I", payload)
@@ -243,15 +251,16 @@ def read_parameters(
     if start > len(payload):
         raise Malformed(f"{where}: parameters of {length} bytes, expected at most {len(payload) - 4}")
     fields = Fields(canonical.unpack(payload[4:start]), where, set(KEYS))
-    misplaced = [key for key in (GRIDS, CHAINS, KIND) if later and key in fields]
+    misplaced = [key for key in (GRIDS, CHAINS, KIND, LAYER_ROWS) if later and key in fields]
     if misplaced:
         raise Malformed(f"{where}: key {misplaced[0]} in a later slice, expected it in the first one only")
-    rows, codes = fields.integer(ROWS, MAX_ANCHORS - before.rows), fields.integer(CODES, MAX_PAYLOAD)
+    rows, codes = fields.integer(OWN_ROWS, MAX_ANCHORS - before.rows), fields.integer(CODES, MAX_PAYLOAD)
     if codes > len(payload) - start:
         raise Malformed(f"{where}: codes of {codes} bytes, expected at most {len(payload) - start}")
     fill: Any = tuple(as_integer(c, 255, f"{where} fill") for c in fields.sequence(FILL, 3)) if FILL in fields else None
-    tables, rises = _unpack_tables(fields, where), 0 if later else before.rows
-    symbols = rises + (scalars + 4) * rows + tables.symbols
+    tables = Tables(rows=of.rows) if of else _unpack_tables(fields, where)
+    rises, width = 0 if later else before.rows, RowTable(tables.rows).channels
+    symbols = rises + (table.channels + table.graded + 4) * rows + width * (rises + rows) + tables.symbols
     total = Declared(before.rows + rows, before.symbols + symbols, before.payload_bytes + len(payload))
     _check_declared(tables.cells, total, where)
     return Parameters(rows, codes, fill, tables, rises, symbols), start, total
@@ -273,6 +282,8 @@ def _check_declared(cells: int, total: Declared, where: str) -> None:
 
 def _unpack_tables(fields: Fields, where: str) -> Tables:
     tables = Tables(kind=unpack_kind(fields.get(KIND), f"{where} kind") if KIND in fields else ())
+    if LAYER_ROWS in fields:
+        tables = replace(tables, rows=unpack_rows(fields.get(LAYER_ROWS), f"{where}: layer rows"))
     if GRIDS in fields:
         grids = as_long(fields.get(GRIDS), f"{where} grids", MAX_GRIDS + 1, 2)
         tables = replace(tables, grid_step=as_step(grids[0], f"{where} grids"))
@@ -307,14 +318,33 @@ def _unpack_chain(row: object, where: str) -> Chain:
 
 
 def _ascending(tensors: list[Any], where: str) -> tuple[Any, ...]:
-    check_ascending([tensor.id for tensor in tensors], where)
+    _check_ascending([tensor.id for tensor in tensors], where)
     return tuple(tensors)
 
 
-def check_ascending(ids: Sequence[int], where: str) -> None:
-    """Raises Malformed unless ids ascend."""
+def _check_ascending(ids: Sequence[int], where: str) -> None:
     if any(a >= b for a, b in pairwise(ids)):
         raise Malformed(f"{where}: ids {list(ids)}, expected them to ascend")
+
+
+def pack_rows(tensors: Iterable[Rows]) -> list[list[object]]:
+    """Returns the records of tensors of rows."""
+    return [[tensor.id, tensor.channels, float(np.float32(tensor.step)), tensor.predictor] for tensor in tensors]
+
+
+def unpack_rows(value: object, where: str) -> tuple[Rows, ...]:
+    """Returns the tensors of rows of these records. Raises subclasses of DecodeError."""
+    tensors = []
+    for row in as_long(value, where, MAX_ROWS):
+        number, channels, step, predictor = as_list(row, where, 4)
+        as_integer(number, MAX_ID, f"{where}: id")
+        as_integer(channels, MAX_CHANNELS, f"{where} {number}: channels", 1)
+        as_registered(predictor, ROW_PREDICTORS, f"{where} {number}: predictor")
+        tensors.append(Rows(number, channels, as_step(step, f"{where} {number}"), predictor))
+    _check_ascending([tensor.id for tensor in tensors], where)
+    if (width := RowTable(tuple(tensors)).channels) > MAX_ROWS_WIDTH:
+        raise LimitExceeded(f"{where} of {width} channels, limit {MAX_ROWS_WIDTH}")
+    return tuple(tensors)
 
 
 def unpack_kind(value: object, where: str) -> Kind:

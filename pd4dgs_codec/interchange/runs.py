@@ -50,10 +50,9 @@ MAX_WIDTH = 1024
 Layer = tuple[np.ndarray, np.ndarray]  #: weight float32 [outputs, inputs], bias float32 [outputs]
 
 
-def iteration(folder: Path, number: int | None = None) -> Path | None:
-    """Finds the folder with point_cloud.ply: `folder` itself, or iteration `number` below it (None: the last);
-    None if it has no such iteration."""
-    if (folder / PLY).is_file() and (number is None or folder.name == f"iteration_{number}"):
+def iteration(folder: Path) -> Path | None:
+    """Finds the folder with point_cloud.ply: `folder` itself, or the last iteration below it; None if it has none."""
+    if (folder / PLY).is_file():
         return folder
     base = folder / "point_cloud" if (folder / "point_cloud").is_dir() else folder
     found = {
@@ -61,7 +60,7 @@ def iteration(folder: Path, number: int | None = None) -> Path | None:
         for path in base.glob("iteration_*")
         if (match := re.fullmatch(r"iteration_(\d{1,9})", path.name)) and (path / PLY).is_file()
     }
-    return found.get(max(found, default=0) if number is None else number)
+    return found.get(max(found, default=0))
 
 
 def run_of(place: Path) -> Path:

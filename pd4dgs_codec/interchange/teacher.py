@@ -38,11 +38,11 @@ from pd4dgs_codec.interchange.splats import (
     SH_SPAN,
     Splats,
     checked,
+    evenly,
     looking,
     picture,
     read_splats,
     sphere,
-    spread,
 )
 from pd4dgs_codec.quality.frames import shrunk
 from pd4dgs_codec.scene import Camera
@@ -115,7 +115,7 @@ def _around(source: str, place: Path, teacher: Teacher, options: Options, downsc
     still = teacher.times is not None and len(teacher.times) == 1
     poses = [(camera, 0.0 if still else i * GOLDEN % 1.0) for i, camera in enumerate(cameras)]
     times = teacher.times or tuple(np.linspace(0, 1, BOX_TIMES))
-    some = spread(times, BOX_TIMES)
+    some = evenly(times, BOX_TIMES)
     everywhere = np.concatenate([teacher.splats(t).means[_solid(source, teacher, t)] for t in some])
     box = points_box(everywhere).astype(np.float32)
     near, far = depth_range([c.viewmat.astype(np.float64) for c in cameras], box, everywhere)
@@ -177,13 +177,13 @@ def _cameras(place: Path, points: np.ndarray, options: Options, downscale: int) 
     beside = next((p / "cameras.json" for p in (place, *place.parents[:2]) if (p / "cameras.json").is_file()), None)
     if beside is not None:
         cameras, up = read_cameras(beside)
-        some = spread(cameras, options.views)
+        some = evenly(cameras, options.views)
         return [shrunk(c, downscale * math.ceil(max(c.width, c.height) / max(options.size))) for c in some], up
     middle = np.median(points, axis=0).astype(np.float64)
     radius = max(float(np.percentile(np.linalg.norm(points - middle, axis=1), 90)), 1e-6)
     axis = np.asarray(options.up) / max(float(np.linalg.norm(options.up)), 1e-12)
     places = sphere(2 * options.views)
-    places = np.stack(spread(list(places[places @ axis >= LOWEST]), options.views))
+    places = np.stack(evenly(list(places[places @ axis >= LOWEST]), options.views))
     width, height = options.size
     focal = 0.5 * max(width, height) / math.tan(FIELD_OF_VIEW / 2)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32)

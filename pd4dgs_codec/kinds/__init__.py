@@ -49,8 +49,8 @@ def check(kind: Kind, table: RowTable, tables: Mapping[int, Tables]) -> None:
         elif own != NOTHING.tables:
             if own.kind:
                 _known(f"{where}: deformation", own.kind, DEFORMATIONS)
-            if not (own.kind and own.grids and own.chains):
-                raise Malformed(f"{where}: a deformation without kind, grids or chains, expected all three")
+            if not (own.kind and own.grids and own.chains) or own.rows:
+                raise Malformed(f"{where}: a deformation of rows, or without kind, grids or chains")
             hexplane.check(own, {i: other for i, other in tables.items() if 0 < i < layer}, widths, where)
 
 
@@ -77,7 +77,7 @@ def _steps(layer: int, tables: Tables) -> dict[str, float]:
 
 def json(kind: Kind, table: RowTable) -> dict[str, Any]:
     """Returns the kind and the rows of a header, in the kind's words if it is known and its rules hold."""
-    found = {"kind": list(kind), "rows": [[t.id, t.channels, t.step] for t in table.tensors]}
+    found = {"kind": list(kind), "rows": [[t.id, t.channels, t.step, t.predictor] for t in table.tensors]}
     with suppress(DecodeError):
         check(kind, table, {})
         found |= scaffold.json(kind, table)

@@ -66,8 +66,8 @@ def widths_of(kind: Kind, table: RowTable) -> Widths:
 
 def check(tables: Tables, widths: Widths) -> None:
     """Raises Malformed if layer 0 breaks the rules of the kind."""
-    if tables.grids or tables.kind:
-        raise Malformed("layer 0: grids or a deformation, expected chains only")
+    if tables.grids or tables.kind or tables.rows:
+        raise Malformed("layer 0: grids, layer rows or a deformation, expected chains only")
     found = [(chain.id, chain.widths[0], chain.widths[-1]) for chain in tables.chains]
     both = zip(widths.inputs.values(), widths.networks.values(), strict=True)
     expected = [(i, inputs, outputs) for i, (inputs, outputs) in enumerate(both)]
@@ -120,7 +120,7 @@ def scene_of(
 ) -> Scene:
     """Returns the scene of the slices so far, of at least one. deformations: by layer."""
     widths = widths_of(kind, table)
-    (anchor_q, classes, *rows), codes = grown.arrays(writeable)
+    (anchor_q, classes, *rows), codes, _ = grown.arrays(writeable)
     shapes = widths.attributes.items()
     return Scene(
         info=info,

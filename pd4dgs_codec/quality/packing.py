@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, replace
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.data.view import spread
+from pd4dgs_codec.data.view import spread, thinned
 from pd4dgs_codec.format.decoder import decode, every_prefix
 from pd4dgs_codec.format.encoder import Report, encode_with_report, with_metadata
 from pd4dgs_codec.format.metadata import Metadata
@@ -47,8 +47,7 @@ class Views:
     def of(cls, dataset: Dataset, source: str, most: int) -> Views:
         """Picks about `most` training and as many held-out views (training views if there are none), evenly spread."""
         fitting = [(view.camera, view.time) for view in spread(dataset.train, most)]
-        held_out = dataset.test or dataset.train
-        return cls(f"training views of {source}", fitting, held_out[:: -(-len(held_out) // most)])
+        return cls(f"training views of {source}", fitting, thinned(dataset.test or dataset.train, most))
 
     @classmethod
     def remembered(cls, viewpoints: Sequence[Viewpoint]) -> Views:

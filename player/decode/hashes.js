@@ -1,8 +1,10 @@
 // Clause 12.4: digests of what a file decodes to.
 
+import { channelsOf } from "./channels.js";
 import { Column } from "./columns.js";
 import { hex, sha256 } from "./digests.js";
 import { readAll } from "./reader.js";
+import { widthOf } from "./rows.js";
 import { mortonOrder } from "./voxels.js";
 /** @import { Slice } from "./slice.js" */
 /** @import { Tensors } from "./tensors.js" */
@@ -20,13 +22,14 @@ function digest(arrays) {
   return hex(sha256(bytes));
 }
 
-/** One behind the other, in another order if given. @template {Uint8Array | Int32Array} A
- * @param {new (length: number) => A} type @param {A[]} arrays @param {Uint32Array | null} [order] @returns {A} */
-function joined(type, arrays, order = null) {
+/** One behind the other, from `first` on in another order if given. @template {Uint8Array | Int32Array} A
+ * @param {new (length: number) => A} type @param {A[]} arrays @param {Uint32Array | null} [order] @param {number} [first]
+ * @returns {A} */
+function joined(type, arrays, order = null, first = 0) {
   const all = new Column(type, 1);
   all.reserve(arrays.reduce((sum, { length }) => sum + length, 0), 1);
   for (const array of arrays) all.append(array);
-  if (order) all.reorder(0, order, 1);
+  if (order) all.reorder(first, order, 1);
   return all.values;
 }
 
@@ -52,29 +55,32 @@ export function hashes(bytes, options = {}) {
 
 /** @param {Tensors} tensors @param {number} i index of the layer @param {number} first row of its own
  * @param {Slice[]} slices of it */
-function symbolsOf({ header, voxels, layers }, i, first, slices) {
+function symbolsOf({ header: { width }, voxels, layers }, i, first, slices) {
   const order = slices.length > 1 ? mortonOrder(joined(Int32Array, slices.map((slice) => slice.voxels))) : null;
-  /** A channel of all slices. @param {(slice: Slice) => Int32Array} of */
-  const rows = (of) => joined(Int32Array, slices.map(of), order);
-  const [{ rises, planes, weights }] = slices;
-  const { codes } = layers[i];
-  const classes = header.centres ? [rows((slice) => slice.stepClasses)] : [];
-  const channels = Array.from({ length: header.width }, (_, c) =>
-    rows((slice) => slice.rows.subarray(c * slice.codes.length, (c + 1) * slice.codes.length)),
-  );
+  const [{ rises, stepClasses, planes, weights }] = slices;
+  const { codes, rowTensors } = layers[i];
+  /** Channels of all slices, which first have so many rows of earlier layers. @param {number} count
+   * @param {(slice: Slice) => Int32Array} of @param {number} [earlier] */
+  const channels = (count, of, earlier = 0) => {
+    const parts = slices.map((slice) => channelsOf(of(slice), count));
+    return Array.from({ length: count }, (_, c) => joined(Int32Array, parts.map((part) => part[c]), order, earlier));
+  };
+  const classes = stepClasses ? channels(1, (slice) => /** @type {Int32Array} */ (slice.stepClasses)) : [];
+  const rows = channels(width, (slice) => slice.rows);
+  const layerRows = channels(widthOf(rowTensors), (slice) => slice.layerRows, first);
   const own = [voxels.subarray(3 * first, 3 * codes.length), rises, Int32Array.from(codes.subarray(first))];
-  return [...own, ...classes, ...channels, ...planes, ...weights];
+  return [...own, ...classes, ...rows, ...layerRows, ...planes, ...weights];
 }
 
 /** @param {Tensors} tensors @param {number} i index of the layer @param {number} first row of its own
  * @param {number} end behind its rows */
 function valuesOf({ header, positions, rows, layers }, i, first, end) {
-  const { grids, chains } = layers[i];
+  const { rows: layerRows, grids, chains } = layers[i];
   const own = rows.map((values, k) => {
     const { channels } = header.rows[k];
     return values.subarray(channels * first, channels * end);
   });
   const planes = grids.flatMap((grid) => grid.planes.map(({ data }) => data));
   const weights = chains.flatMap(({ network }) => network.flatMap(({ weight, bias }) => [weight, bias]));
-  return [positions.subarray(3 * first, 3 * end), ...own, ...planes, ...weights];
+  return [positions.subarray(3 * first, 3 * end), ...own, ...layerRows, ...planes, ...weights];
 }

@@ -6,6 +6,7 @@ import { Fields, asId, asInteger, asIntegers, asItems, asList, asRegistered, asS
 import { MAX_CHANNELS, MAX_CHUNKS, MAX_KIND, MAX_PAYLOAD } from "./limits.js";
 import { MAX_ROW_CHANNELS, MAX_ROW_TENSORS, MAX_SYMBOL } from "./limits.js";
 import { unpack } from "./msgpack.js";
+import { ROW_PREDICTORS, widthOf } from "./rows.js";
 /** @import { Value } from "./msgpack.js" */
 /** @import { Camera, Info, RowTensor } from "./tensors.js" */
 
@@ -38,9 +39,8 @@ export function readHeader(bytes) {
   const chunks = readChunkList(fields.get(1));
   const mode = asRegistered(fields.get(2), 2, "header: mode");
   const kind = readKind(fields.get(3), "header: kind of the scene");
-  const rows = readRows(fields.get(4));
-  const width = rows.reduce((sum, { channels }) => sum + channels, 0);
-  if (width > MAX_ROW_CHANNELS) throw limitExceeded(`header: rows of ${width} channels, limit ${MAX_ROW_CHANNELS}`);
+  const rows = readRows(fields.get(4), "header");
+  const width = widthOf(rows);
   const where = "header: centres";
   const centres = fields.has(5) ? asIntegers(asList(fields.get(5), where, width), -MAX_SYMBOL, MAX_SYMBOL, where) : null;
   const info = readInfo(fields);
@@ -73,19 +73,23 @@ function readChunkList(value) {
   return chunks;
 }
 
-/** @param {Value} value @returns {RowTensor[]} */
-function readRows(value) {
-  const where = "header: a tensor of rows";
+/** Tensors of rows of the header or of a layer. @param {Value} value @param {string} place @returns {RowTensor[]} */
+export function readRows(value, place) {
+  const where = `${place}: a tensor of rows`;
   let last = -1;
-  return asItems(value, 1, MAX_ROW_TENSORS, "header: rows").map((row) => {
-    const [id, channels, step] = asList(row, where, 3);
+  const rows = asItems(value, 1, MAX_ROW_TENSORS, `${place}: rows`).map((row) => {
+    const [id, channels, step, predictor] = asList(row, where, 4);
     last = asId(id, last, where);
     return {
       id: last,
       channels: asInteger(channels, 1, MAX_CHANNELS, `${where}: channels`),
       step: asStep(step, `${where}: step`),
+      predictor: asRegistered(predictor, ROW_PREDICTORS, `${where}: predictor`),
     };
   });
+  const width = widthOf(rows);
+  if (width > MAX_ROW_CHANNELS) throw limitExceeded(`${place}: rows of ${width} channels, limit ${MAX_ROW_CHANNELS}`);
+  return rows;
 }
 
 /** @param {Fields} fields @returns {Info} */

@@ -2,16 +2,18 @@
 
 import { limitExceeded, malformed } from "./errors.js";
 import { Fields, asId, asInteger, asIntegers, asItems, asList, asRegistered, asStep } from "./fields.js";
-import { readKind } from "./header.js";
+import { readKind, readRows } from "./header.js";
 import { MAX_AXES, MAX_CHAINS, MAX_CHANNELS, MAX_FIELDS, MAX_GRIDS } from "./limits.js";
 import { MAX_LINEAR_LAYERS, MAX_PAYLOAD, MAX_PLANE_CELLS, MAX_ROWS, MAX_SIDE, MAX_WIDTH } from "./limits.js";
 import { unpack } from "./msgpack.js";
 import { PREDICTORS } from "./grids.js";
+import { widthOf } from "./rows.js";
 /** @import { Value } from "./msgpack.js" */
+/** @import { RowTensor } from "./tensors.js" */
 
 /** The keys of a slice's parameters (6.2), and those that a later slice of a layer lacks. */
-const KEYS = [1, 2, 3, 4, 5, 6];
-const FIRST_KEYS = [4, 5, 6];
+const KEYS = [1, 2, 3, 4, 5, 6, 7];
+const FIRST_KEYS = [4, 5, 6, 7];
 
 /** @typedef {{channels: number, height: number, width: number, predictor: number}} PlaneShape */
 /** @typedef {{id: number, channels: number, sides: number[], planes: PlaneShape[]}} GridShape */
@@ -30,6 +32,7 @@ const FIRST_KEYS = [4, 5, 6];
  * @property {Stepped<GridShape>} grids
  * @property {Stepped<ChainShape>} chains
  * @property {number[] | null} kind of the deformation: its number, then its parameters
+ * @property {RowTensor[]} layerRows those of the layer, with a row for each rise and each own row
  * @property {Uint8Array} codes
  * @property {Uint8Array} stream
  * @property {number} symbols so many as 6.5 counts for this slice
@@ -40,11 +43,11 @@ const FIRST_KEYS = [4, 5, 6];
  * The parameters of a slice's payload; all counts are held against the limits and the payload.
  *
  * @param {Uint8Array} payload @param {Pick<import("./header.js").Header, "width" | "centres">} header
- * @param {Declared} before by the slices before @param {boolean} later whether slices of the layer came before: this one
- * holds anchors alone @param {string} where
+ * @param {Declared} before by the slices before @param {RowTensor[] | null} known the layer's own tensors of rows if slices
+ * of it came before: this one holds rows alone @param {string} where
  * @returns {Parameters}
  */
-export function readParameters(payload, { width, centres }, before, later, where) {
+export function readParameters(payload, { width, centres }, before, known, where) {
   if (payload.length < 4) throw malformed(`${where}: a payload of ${payload.length} bytes, expected at least 4`);
   const length = new DataView(payload.buffer, payload.byteOffset).getUint32(0, true);
   if (length > MAX_FIELDS) throw limitExceeded(`${where}: parameters of ${length} bytes, limit ${MAX_FIELDS}`);
@@ -54,16 +57,18 @@ export function readParameters(payload, { width, centres }, before, later, where
   const rows = asInteger(fields.get(1), 0, MAX_ROWS - before.rows, `${where}: own rows`);
   const size = asInteger(fields.get(2), 0, MAX_PAYLOAD, `${where}: length of the codes`);
   if (size > rest) throw malformed(`${where}: codes of ${size} bytes, expected at most ${rest}`);
-  for (const key of FIRST_KEYS) if (later && fields.has(key)) throw malformed(`${where}: key ${key} in a later slice`);
+  for (const key of FIRST_KEYS) if (known && fields.has(key)) throw malformed(`${where}: key ${key} in a later slice`);
   const grids = readStepped(fields, 4, MAX_GRIDS, `${where}: a grid`, readGrid);
   const chains = readStepped(fields, 5, MAX_CHAINS, `${where}: a chain`, readChain);
+  const layerRows = known ?? (fields.has(7) ? readRows(fields.get(7), where) : []);
   const planes = grids.list.flatMap((grid) => grid.planes);
   const linears = chains.list.flatMap((chain) => chain.linears);
   const cells = planes.reduce((sum, plane) => sum + plane.channels * plane.height * plane.width, 0);
   if (cells > MAX_PLANE_CELLS) throw limitExceeded(`${where}: ${cells} plane samples, limit ${MAX_PLANE_CELLS}`);
   const weights = linears.reduce((sum, { inputs, outputs }) => sum + (inputs + 1) * outputs, 0);
-  const rises = later ? 0 : before.rows;
-  const symbols = rises + (width + (centres ? 5 : 4)) * rows + cells + weights;
+  const rises = known ? 0 : before.rows;
+  const own = (width + (centres ? 5 : 4)) * rows;
+  const symbols = rises + own + widthOf(layerRows) * (rises + rows) + cells + weights;
   const declared = {
     rows: before.rows + rows,
     symbols: before.symbols + symbols,
@@ -79,6 +84,7 @@ export function readParameters(payload, { width, centres }, before, later, where
     grids,
     chains,
     kind: fields.has(6) ? readKind(fields.get(6), `${where}: kind of the deformation`) : null,
+    layerRows,
     codes: payload.subarray(4 + length, 4 + length + size),
     stream: payload.subarray(4 + length + size),
     symbols,

@@ -4,7 +4,8 @@ import { Column } from "./columns.js";
 import { CHUNK_OVERHEAD, PREAMBLE_SIZE, readChunk, readPreamble } from "./container.js";
 import { DecodeError, limitExceeded, malformed, unsupported } from "./errors.js";
 import { LAYER_TYPES, readHeader } from "./header.js";
-import { MOST_CODE, chainsOf, decodeSlice, dequantise, gridsOf, rowsOf } from "./slice.js";
+import { dequantise, rowsOf } from "./rows.js";
+import { MOST_CODE, chainsOf, decodeSlice, gridsOf } from "./slice.js";
 import { VoxelTable, mortonOrder } from "./voxels.js";
 /** @import { Header } from "./header.js" */
 /** @import { Declared } from "./parameters.js" */
@@ -16,15 +17,17 @@ import { VoxelTable, mortonOrder } from "./voxels.js";
  *
  * @typedef {object} Rules
  * @property {(header: Header) => void} checkHeader
- * @property {(header: Header, layers: Pick<LayerTensors, "layer" | "grids" | "chains" | "kind">[]) => void} checkLayer
+ * @property {(header: Header, layers: LayerTables[]) => void} checkLayer
  */
 
+/** @typedef {Omit<LayerTensors, "codes" | "fill" | "rows">} LayerTables */
+
 /**
- * A layer as far as it has been read: `first` row of its own; codes of the mask, of all rows up to its own; `sorted`,
- * whether its rows are.
+ * A layer as far as it has been read: `first` row of its own; codes of the mask, of all rows up to its own, and its own
+ * tensors of rows; `sorted`, whether its rows are.
  *
- * @typedef {Omit<LayerTensors, "codes">
- *   & {slices: number, first: number, sorted: boolean, codes: Column<Uint8Array>, priors: Priors}} Layer
+ * @typedef {Omit<LayerTensors, "codes" | "rows"> & {slices: number, first: number, sorted: boolean,
+ *   codes: Column<Uint8Array>, rows: Column<Float32Array>[], priors: Priors}} Layer
  */
 
 /**
@@ -81,6 +84,7 @@ export class TensorReader {
     this._positions = new Column(Float32Array, 3);
     /** By tensor of the header's. @type {Column<Float32Array>[]} */
     this._rows = [];
+    this._classes = new Column(Uint8Array, 1);
     this._taken = new VoxelTable();
     /** Voxels that are not in the table yet: of one slice nothing is looked up. @type {Int32Array[]} */
     this._loose = [];
@@ -100,7 +104,7 @@ export class TensorReader {
 
   /** What all rows hold. @returns {Column<any>[]} */
   get _columns() {
-    return [this._voxels, this._positions, ...this._rows];
+    return [this._voxels, this._positions, ...this._rows, ...(this.header?.centres ? [this._classes] : [])];
   }
 
   /** Reads the header. Raises Truncated, with nothing consumed, if `bytes` end before. @param {Uint8Array} bytes */
@@ -188,7 +192,8 @@ export class TensorReader {
     const lists = had ? Object.values(had.priors) : [];
     const lengths = lists.map(({ length }) => length);
     try {
-      const slice = decodeSlice(payload, layer, header, this._declared, had?.priors ?? null);
+      const before = { declared: this._declared, classes: this._classes.values, layer: had };
+      const slice = decodeSlice(payload, layer, header, before);
       this._accept(slice, had, header);
       return slice;
     } catch (error) {
@@ -200,7 +205,8 @@ export class TensorReader {
   /** The rules of 12.1 that need earlier slices, dequantisation, the rules of kinds; then the slice is added.
    * @param {Slice} slice @param {Layer | null} had its layer, null if this is the first slice @param {Header} header */
   _accept(slice, had, header) {
-    const { layer: number, parameters, voxels, rises } = slice;
+    const { layer: number, parameters, voxels, rises, stepClasses } = slice;
+    const own = slice.codes.length;
     const earlier = Uint8Array.from(rises);
     const before = this._layers[this._layers.length - 1]?.codes.values; // of a whole layer, in order
     for (let i = 0; i < rises.length; i++) {
@@ -209,16 +215,19 @@ export class TensorReader {
       earlier[i] = code;
     }
     this._checkVoxels(voxels);
-    const rows = [voxels, dequantise(voxels, header.info.voxelSize), ...rowsOf(slice, header)];
+    const rows = [voxels, dequantise(voxels, header.info.voxelSize), ...rowsOf(header.rows, slice.rows, own)];
+    if (stepClasses) rows.push(stepClasses);
+    const layerRows = rowsOf(parameters.layerRows, slice.layerRows, rises.length + own);
     const layer = had ?? this._begun(slice);
     if (!had) this._rules?.checkLayer(header, [...this._layers, layer]);
     const following = this._following[this._index + 1];
     const growth = following === null ? 1 : Math.max(1.5, 1.25 / this._share[this._index]);
-    for (const column of this._columns) column.reserve(slice.codes.length, growth);
-    layer.codes.reserve(earlier.length + slice.codes.length, growth);
+    for (const column of this._columns) column.reserve(own, growth);
+    for (const column of [layer.codes, ...layer.rows]) column.reserve(rises.length + own, growth);
     // from here on nothing fails, but for want of memory to sort
     if (!had) this._layers.push(layer);
     this._columns.forEach((column, i) => column.append(rows[i]));
+    layer.rows.forEach((column, i) => column.append(layerRows[i]));
     layer.codes.append(earlier);
     layer.codes.append(slice.codes);
     layer.slices++;
@@ -232,8 +241,9 @@ export class TensorReader {
 
   /** A layer without rows. @param {Slice} slice its first @returns {Layer} */
   _begun(slice) {
-    const { layer, parameters: { kind }, priors } = slice;
-    const made = { grids: gridsOf(slice), chains: chainsOf(slice), codes: new Column(Uint8Array, 1) };
+    const { layer, parameters: { kind, layerRows: rowTensors }, priors } = slice;
+    const rows = rowTensors.map(({ channels }) => new Column(Float32Array, channels));
+    const made = { grids: gridsOf(slice), chains: chainsOf(slice), codes: new Column(Uint8Array, 1), rowTensors, rows };
     return { layer, kind, ...made, fill: [], slices: 0, first: this._voxels.rows, sorted: true, priors };
   }
 
@@ -242,7 +252,7 @@ export class TensorReader {
     const layer = this._layers[this._layers.length - 1];
     if (!layer || layer.sorted) return;
     const order = mortonOrder(this._voxels.values.subarray(3 * layer.first));
-    for (const column of [...this._columns, layer.codes]) column.reorder(layer.first, order, growth);
+    for (const column of [...this._columns, layer.codes, ...layer.rows]) column.reorder(layer.first, order, growth);
     layer.sorted = true;
   }
 
@@ -267,8 +277,9 @@ export class TensorReader {
     if (!this.header || !this._layers.length) throw new TypeError("no layer has been read");
     return {
       header: this.header,
-      layers: this._layers.map(({ layer, codes, fill, grids, chains, kind }) => {
-        return { layer, codes: codes.values, fill, grids, chains, kind };
+      layers: this._layers.map(({ layer, codes, fill, grids, chains, kind, rowTensors, rows }) => {
+        const arrays = { codes: codes.values, rows: rows.map(({ values }) => values) };
+        return { layer, ...arrays, fill, grids, chains, kind, rowTensors };
       }),
       voxels: this._voxels.values,
       positions: this._positions.values,

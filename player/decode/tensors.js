@@ -24,7 +24,7 @@
  */
 
 /** A tensor of rows: so many numbers of each anchor, multiples of the step.
- * @typedef {{id: number, channels: number, step: number}} RowTensor */
+ * @typedef {{id: number, channels: number, step: number, predictor: number}} RowTensor */
 
 /** A plane of a grid, [channels, height, width].
  * @typedef {{data: Float32Array, channels: number, height: number, width: number}} Plane */
@@ -50,6 +50,8 @@
  * @property {Grid[]} grids
  * @property {Chain[]} chains
  * @property {number[] | null} kind of its deformation: its number, then its parameters
+ * @property {RowTensor[]} rowTensors its own, which have a row for each anchor that `codes` has one for
+ * @property {Float32Array[]} rows [anchors, channels] of each of them
  */
 
 /**

@@ -1,10 +1,12 @@
 """encode, decode and info, as their users call them."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from strategies import make_scene
+from tiny import disc
 
 from pd4dgs_codec.cli import options
 from pd4dgs_codec.format.decoder import decode
@@ -184,9 +186,17 @@ def test_max_bytes_and_a_truncated_file_stop_at_a_slice(cli, tmp_path):
 
 
 def test_a_file_says_where_the_0_of_a_moved_scene_lies(cli, model_pt, tmp_path):
-    moved, out = tmp_path / "moved.pt", tmp_path / "m.pd4"
-    checkpoint.save(moved, checkpoint.load(model_pt)[0], {"place": "0 is 465000, 5243000, 0 of the data"})
-    for given, said in (((), ""), (("--source", "a square"), "a square; ")):
-        assert cli("encode", moved, "-o", out, "-f", "--effort", 1, *given).code == 0
-        told = cli("info", out, "--json").json["metadata"]["source"]
-        assert told == f"{said}0 is 465000, 5243000, 0 of the data"
+    moved, out, again = tmp_path / "moved.pt", tmp_path / "m.pd4", tmp_path / "again.pd4"
+    shift, mine = (465000.0, 5243000.0, 0.0), ("--source", "a square")
+    place = replace(disc(), shift=shift).place
+    assert place == "0 is 465000, 5243000, 0 of the data"
+    checkpoint.save(moved, checkpoint.load(model_pt)[0], {"place": place})
+    for source, file, given, told in (
+        (moved, out, mine, f"a square; {place}"),
+        (moved, out, (), place),
+        (out, again, (), place),
+        (out, again, mine, f"a square; {place}"),  # encoded again
+        (again, out, ("--source", "a park"), f"a park; {place}"),
+    ):
+        assert cli("encode", source, "-o", file, "-f", "--effort", 1, *given).code == 0
+        assert cli("info", file, "--json").json["metadata"]["source"] == told

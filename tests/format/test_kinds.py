@@ -45,8 +45,12 @@ def with_tables(layer, **changes):
     """The small file, with other tables in a layer."""
     header, layers = symbols()
     tables = replace(layers[layer].tensors.tables, **changes)
-    tensors = zeros(tables)
-    return file_of([replace(part, tensors=tensors) if part.layer == layer else part for part in layers])
+    tensors, rows = (
+        zeros(tables),
+        layers[layer].rows[:1, :1].repeat(len(layers[layer].rises) + len(layers[layer].codes), 1),
+    )
+    changed = replace(layers[layer], tensors=tensors, **({"layer_rows": rows} if tables.rows else {}))
+    return file_of([changed if part.layer == layer else part for part in layers])
 
 
 def test_tensors_are_those_of_the_scene():
@@ -71,9 +75,11 @@ def test_tensors_are_those_of_the_scene():
 def test_an_unknown_scene_of_any_forms_decodes_to_tensors():
     """Grids in layer 0, of one to three axes; rows and chains that no kind of today has."""
     header, layers = symbols()
-    tables = Tables((Grid(3, 2, (4,)), Grid(9, 5, (2, 3, 4))), (Chain(200, (7, 2)),), 0.5, 0.25, (65535, 1))
-    rows = RowTable((Rows(17, 1, 2.0), Rows(255, 3, 0.25)))
-    first = replace(layers[0], tensors=zeros(tables), rows=layers[0].rows[:4])
+    grids, chains = (Grid(3, 2, (4,)), Grid(9, 5, (2, 3, 4))), (Chain(200, (7, 2)),)
+    tables = Tables(grids, chains, 0.5, 0.25, (65535, 1), (Rows(8, 2, 0.5),))
+    rows = RowTable((Rows(17, 1, 2.0), Rows(255, 3, 0.25, 1)))
+    first = replace(layers[0], table=rows, tensors=zeros(tables), rows=layers[0].rows[:4])
+    first = replace(first, layer_rows=layers[0].rows[4:6])
     data = file_of([first], kind=(7, 3), table=rows)
     (found,) = decode_tensors(data)
     assert {i: [p.shape for p in planes] for i, planes in found.grids.items()} == {
@@ -82,9 +88,11 @@ def test_an_unknown_scene_of_any_forms_decodes_to_tensors():
     }
     assert found.kind == (65535, 1) and [w.shape for w, _ in found.chains[200]] == [(2, 7)]
     np.testing.assert_array_equal(found.rows[255], first.rows[1:].T * np.float32(0.25))
+    np.testing.assert_array_equal(found.layer_rows[8], first.layer_rows.T * np.float32(0.5))
     told = info(data)
-    assert told["kind"] == [7, 3] and told["rows"] == [[17, 1, 2.0], [255, 3, 0.25]] and "slots" not in told
+    assert told["kind"] == [7, 3] and told["rows"] == [[17, 1, 2.0, 0], [255, 3, 0.25, 1]] and "slots" not in told
     assert told["layers"][0]["grids"] == [[3, 2, 4], [9, 5, 2, 3, 4]]
+    assert told["layers"][0]["layer_rows"] == [[8, 2, 0.5, 0]]
     assert told["layers"][0]["chains"] == [[200, 7, 2]] and told["layers"][0]["kind"] == [65535, 1]
     assert len(hashes(data)) == 1
     for door in (decode, open_stream().feed):
@@ -112,15 +120,17 @@ def chains(*widths):
 WIDE, TRUNK, POSITION = Grid(0, 2, (3, 2, 4, 5)), (0, (2, 3)), (1, (3, 3))
 #: Rule -> (layer, what is other in its tables, what the error says).
 BROKEN = {
-    "layer 0 with a grid": (0, {"grids": (Grid(0, 1, (2,)),), "grid_step": 1.0}, "layer 0: grids or a deformation"),
-    "layer 0 with a deformation": (0, {"kind": (0,)}, "layer 0: grids or a deformation"),
+    "layer 0 with a grid": (0, {"grids": (Grid(0, 1, (2,)),), "grid_step": 1.0}, "layer 0: grids, layer rows or"),
+    "layer 0 with a deformation": (0, {"kind": (0,)}, "layer 0: grids, layer rows or a deformation"),
+    "layer 0 with layer rows": (0, {"rows": (Rows(0, 1, 1.0),)}, "layer 0: grids, layer rows or a deformation"),
+    "layer 1 with layer rows": (1, {"rows": (Rows(0, 1, 1.0),)}, "layer 1: a deformation of rows, or without kind"),
     "layer 0 without a network": (0, {"chains": chains((0, (35, 10)), (1, (35, 70)))}, r"layer 0: chains \[\(0, "),
     "layer 0 with another input": (
         0, {"chains": chains((0, (32, 10)), (1, (35, 70)), (2, (35, 30)))}, r"expected \[\(0, 35, 10\)",
     ),
-    "no kind": (1, {"kind": ()}, "layer 1: a deformation without kind, grids or chains, expected all three"),
-    "no grids": (1, {"grids": ()}, "layer 1: a deformation without kind, grids or chains"),
-    "no chains": (2, {"chains": ()}, "layer 2: a deformation without kind, grids or chains"),
+    "no kind": (1, {"kind": ()}, "layer 1: a deformation of rows, or without kind, grids or chains"),
+    "no grids": (1, {"grids": ()}, "layer 1: a deformation of rows, or without kind"),
+    "no chains": (2, {"chains": ()}, "layer 2: a deformation of rows, or without kind"),
     "a kind of three integers": (1, {"kind": (0, 1, 2)}, r"layer 1: deformation \[0, 1, 2\]"),
     "three axes": (1, {"grids": (Grid(0, 2, (3, 2, 4)),)}, "layer 1 grid 0: 3 sides and 2 channels, expected 4 and 2"),
     "other channels than below": (2, {"grids": (Grid(0, 3, (1, 1, 1, 1)),)}, "layer 2 grid 0: .* expected 4 and 2"),
@@ -156,7 +166,7 @@ def test_a_broken_rule_is_malformed_at_its_slice(rule):
 def test_a_header_that_breaks_the_rules_of_its_kind(kind, rows):
     header, layers = symbols()
     table = header.table if rows is None else RowTable(tuple(Rows(i, c, 0.5) for i, c in rows))
-    first = replace(layers[0], rows=np.zeros((table.channels, len(layers[0].codes)), np.int32))
+    first = replace(layers[0], table=table, rows=np.zeros((table.channels, len(layers[0].codes)), np.int32))
     data = file_of([first], kind=kind, table=table)
     assert len(decode_tensors(data)) == 1
     with pytest.raises(Malformed, match="header: (kind|rows)"):

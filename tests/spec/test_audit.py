@@ -64,7 +64,9 @@ def test_each_registered_key_prior_predictor_and_kind_has_a_row():
     assert {int(row[0]) for row in rows("Header")} == numbers(header)
     assert {int(row[0]) for row in rows("Layer parameters")} == numbers(layer)
     coded = "\n".join(row[0] for row in rows("Coded channels"))
-    assert set(map(int, re.findall(r"predictor (\d)", coded))) == numbers(registry("predictors").split()[0])
+    for form in ("rows", "planes"):
+        found = set(map(int, re.findall(rf"predictor of {form} (\d)", coded)))
+        assert found == numbers(registry(f"predictors of {form}").split()[0])
     assert set(map(int, re.findall(r"prior family (\d)", coded))) == numbers(registry("prior families").split()[0])
     kinds = {
         f"{role} {kind}" for role in ("scene", "deformation") for kind in registry(f"kinds of {role}s").split(", ")
@@ -74,7 +76,7 @@ def test_each_registered_key_prior_predictor_and_kind_has_a_row():
 
 def test_each_item_of_the_channels_has_a_row():
     items = re.findall(r"^(\d)\. ", section("6.4 Channels", FORMAT), re.MULTILINE)
-    assert [row[0] for row in rows("Channels")] == items and len(items) == 7
+    assert [row[0] for row in rows("Channels")] == items and len(items) == 8
 
 
 def test_each_clause_that_a_row_names_is_there():

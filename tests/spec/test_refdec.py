@@ -18,6 +18,7 @@ from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.info import hashes
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, dequantise
+from pd4dgs_codec.interchange.splats import harmonics
 from pd4dgs_codec.morton import morton_order
 
 SPEC = Path(__file__).parents[2] / "spec"
@@ -113,6 +114,27 @@ def test_the_tables_and_limits_of_the_specification():
     residuals, magnitudes = re.search(sentence, text).groups()
     found = refdec.relative_magnitude([[int(v.replace("−", "-")) for v in residuals.split(",")]], 4)
     assert found == [int(v) for v in magnitudes.split(",")]
+    sentence = r"predictor 1 and m = (\d+), symbols ([\d, −]+) of classes ([\d, ]+) give v = ([\d, ]+)\."
+    (m,), *lists = ([int(v.replace("−", "-")) for v in part.split(",")] for part in re.search(sentence, text).groups())
+    assert refdec.row_values(*lists[:2], m, 1) == lists[2]
+
+
+def test_the_formulas_of_harmonics():
+    block = TEXT.split("### 13.7 Splats")[1].split("```")[3]
+    formulas = dict(re.findall(r"H_(\d+) = (.*?)(?=\s+H_\d|\n)", block))
+    d = np.random.default_rng(1).normal(size=(20, 3))
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    of_axes = dict(zip("xyz", d.T, strict=True))
+
+    def value(formula):
+        """Of each direction."""
+        formula = re.sub(r"√\((\d+)/(\d+)π\)", r"sqrt(\1/(\2*pi))", formula)
+        formula = re.sub(r"(\d)([xyz])", r"\1*\2", formula.replace("²", "**2"))
+        formula = formula.replace("−", "-").replace("·", "*")
+        return eval(formula, {"sqrt": np.sqrt, "pi": np.pi}, of_axes) * np.ones(len(d))
+
+    found = np.stack([value(formulas[str(j)]) for j in range(16)], axis=1)
+    assert np.abs(found - harmonics(d, 3)).max() < 1e-12
 
 
 def test_the_example_of_an_octree():
