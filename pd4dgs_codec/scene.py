@@ -364,12 +364,21 @@ class LayeredScene:
         """Arrays float32 [N, ...] by attribute name, in coding order."""
         raise NotImplementedError
 
+    @property
+    def row_steps(self) -> dict[str, float]:
+        """Quantisation steps by attribute name."""
+        raise NotImplementedError
+
+    def scaled(self: S, factor: float) -> S:
+        """Returns the scene with every step times `factor`, rounded to binary32."""
+        raise NotImplementedError
+
     def of_anchors(self, rows: np.ndarray | slice) -> dict[str, Any]:
         """Returns the fields of the anchors `rows`, without masks, as arguments of `dataclasses.replace`."""
         raise NotImplementedError
 
-    def of_layers(self, layers: Sequence[int]) -> dict[str, Any]:
-        """Returns the deformations without those of other layers, as arguments of `dataclasses.replace`."""
+    def of_layers(self) -> dict[str, Any]:
+        """Returns the deformations without those of absent layers, as arguments of `dataclasses.replace`."""
         raise NotImplementedError
 
     def _evaluated(self, t: float, eye: np.ndarray) -> Gaussians:
@@ -389,11 +398,23 @@ class LayeredScene:
         return self.layers[-1]
 
     @property
+    def anchor(self) -> np.ndarray:
+        """float32 [N, 3] positions of the anchors at rest, world, scene units, computed at each access."""
+        return self.anchor_at(slice(None))
+
+    def anchor_at(self, rows: np.ndarray | slice) -> np.ndarray:
+        """Returns the positions float32 [n, 3] of the anchors `rows`, world, scene units."""
+        voxel = np.float64(np.float32(self.info.voxel_size))
+        with np.errstate(over="ignore"):  # a huge voxel size gives infinities, which the decoder refuses
+            position: np.ndarray = (self.anchor_q[rows].astype(np.float64) * voxel).astype(np.float32)
+        return position
+
+    @property
     def active(self) -> np.ndarray:
         """int64 [n]: the anchors active at the highest level, ascending."""
         return np.flatnonzero(self.mask[-1] * MASK_STEP > MASK_THRESHOLD)
 
-    def at(self: AnyScene, t: float, level: int | None) -> AnyScene:
+    def at(self: S, t: float, level: int | None) -> S:
         """Returns the prefix to draw at a level, None for the highest. Raises RenderError unless normalised time t is
         from 0 to 1 and the level 0, 1 or 2."""
         if not 0 <= t <= 1:
@@ -424,19 +445,19 @@ class LayeredScene:
         """Returns mask codes uint8 [N] per layer present; anchors that a layer's prefix lacks have code 0."""
         return [np.concatenate([codes, np.zeros(self.rows[-1] - codes.size, np.uint8)]) for codes in self.mask]
 
-    def prefix(self: AnyScene, max_layer: int) -> AnyScene:
+    def prefix(self: S, max_layer: int) -> S:
         """Returns the layers <= max_layer, or `self` if it has no others. Raises ValueError if max_layer < 0."""
         n = sum(layer <= max_layer for layer in self.layers)
         if n == len(self.layers):
             return self
         if n == 0:
             raise ValueError(f"max_layer must be >= 0, found {max_layer}")
-        kept = {name: getattr(self, name)[:n] for name in ("layers", "rows", "mask", "fills")}
-        rows = slice(self.rows[n - 1])
-        return replace(self, **kept, **self.of_anchors(rows), **self.of_layers(self.layers[:n]))
+        kept: dict[str, Any] = {name: getattr(self, name)[:n] for name in ("layers", "rows", "mask", "fills")}
+        part = replace(self, **kept, **self.of_anchors(slice(self.rows[n - 1])))
+        return replace(part, **part.of_layers())
 
 
-AnyScene = TypeVar("AnyScene", bound=LayeredScene)
+S = TypeVar("S", bound=LayeredScene)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -464,18 +485,6 @@ class Scene(LayeredScene):
         inputs = {name: network[0][0].shape[1:] for name, network in self.networks.items() if network}
         viewing = tuple(name for name in SCAFFOLD_NETWORKS if inputs.get(name) != self.feature.shape[1:])
         return Widths(self.feature.shape[1], self.offset.shape[1], self.grading is not None, viewing)
-
-    @property
-    def anchor(self) -> np.ndarray:
-        """float32 [N, 3] anchor positions, world, scene units, computed at each access."""
-        return self.anchor_at(slice(None))
-
-    def anchor_at(self, rows: np.ndarray | slice) -> np.ndarray:
-        """Returns the positions float32 [n, 3] of the anchors `rows`, world, scene units."""
-        voxel = np.float64(np.float32(self.info.voxel_size))
-        with np.errstate(over="ignore"):  # a huge voxel size gives infinities, which the decoder refuses
-            position: np.ndarray = (self.anchor_q[rows].astype(np.float64) * voxel).astype(np.float32)
-        return position
 
     @property
     def attributes(self) -> dict[str, np.ndarray]:
@@ -527,12 +536,13 @@ class Scene(LayeredScene):
             return replace(self, global_deformation=deformation)
         return replace(self, local_deformation=deformation)
 
-    def of_layers(self, layers: Sequence[int]) -> dict[str, Any]:
-        return {
-            "global_deformation": self.global_deformation if 1 in layers else None,
-            "local_deformation": self.local_deformation if 2 in layers else None,
-        }
+    def of_layers(self) -> dict[str, Any]:
+        names = ("global_deformation", "local_deformation")
+        return {name: getattr(self, name) if layer in self.layers else None for layer, name in enumerate(names, 1)}
+
+    @property
+    def row_steps(self) -> dict[str, float]:
+        return self.steps.attributes
 
     def scaled(self, factor: float) -> Scene:
-        """Returns the scene with every step times `factor`, rounded to binary32."""
         return replace(self, steps=self.steps.scaled(factor))

@@ -29,7 +29,7 @@ Fitting takes a minute or more, and longer with --slices.
 --slices 50k lets the first frame appear after 50 kB and improve with each further slice. The anchors that matter most
 in renderings come first; without target sizes others pass to a higher layer, so that motion need not wait for them.
 This lowers the levels below the highest, as the report shows; --keep-levels leaves them as trained. Ordering the
-anchors takes up to some minutes. A slice also holds the color that best fills what is still open behind it.
+anchors takes up to some minutes. A slice also holds the colour that best fills what is still open behind it.
 
 Sizes and slices are measured on renderings by cameras of --data, else by training cameras in the checkpoint, else by
 the file's own camera.

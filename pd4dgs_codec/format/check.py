@@ -1,5 +1,6 @@
 """Checks a scene before it is written."""
 
+import math
 from itertools import pairwise
 
 import numpy as np
@@ -8,7 +9,9 @@ from pd4dgs_codec import kinds
 from pd4dgs_codec.errors import DecodeError, EncodeError
 from pd4dgs_codec.format.header import MAX_CAMERA_SIDE, info_fault
 from pd4dgs_codec.format.quantise import all_finite, expect, expect_array, is_step, magnitude
-from pd4dgs_codec.format.tables import Tables
+from pd4dgs_codec.format.tables import Tensors
+from pd4dgs_codec.kinds import AnyScene
+from pd4dgs_codec.kinds.tracks import Tracks
 from pd4dgs_codec.morton import MAX_VOXEL
 from pd4dgs_codec.scene import (
     INSTANTS,
@@ -25,8 +28,8 @@ from pd4dgs_codec.scene import (
 )
 
 
-def check_scene(scene: Scene) -> None:
-    """Raises EncodeError unless `scene` has the shapes, dtypes and ranges that scene.Scene documents."""
+def check_scene(scene: AnyScene) -> None:
+    """Raises EncodeError unless `scene` has the shapes, dtypes and ranges that its class documents."""
     layers, rows = scene.layers, scene.rows
     expect(layers[:1] == (0,) and set(layers) <= {0, 1, 2}, f"layers {layers}, expected 0 first and only 0, 1, 2")
     expect(all(a < b for a, b in pairwise(layers)), f"layers {layers}, expected ascending numbers")
@@ -39,22 +42,20 @@ def check_scene(scene: Scene) -> None:
     size = scene.info.voxel_size
     finite = not is_step(size) or all_finite(scene.anchor_q, size)
     expect(finite, f"anchor_q: a position is infinite at voxel size {size:g}, expected finite positions")
-    for name, axes in (("feature", 2), ("offset", 3)):
-        found = scene.attributes[name].shape
-        expect(len(found) == axes, f"{name}: an array of {len(found)} axes, expected {axes}")
-    widths = scene.widths
-    for what, width, limit in (("feature width", widths.feature, MAX_FEATURE), ("slots", widths.slots, MAX_SLOTS)):
-        expect(1 <= width <= limit, f"{what}: {width}, expected 1..{limit}")
-    for name, shape in widths.attributes.items():
-        expect_array(name, scene.attributes[name], np.float32, (n, *shape))
+    if isinstance(scene, Scene):
+        _check_widths(scene)
+    width = 0
+    for name, values in scene.attributes.items():
+        expect_array(name, values, np.float32, (n, *values.shape[1:]))
+        width += math.prod(values.shape[1:])
     if scene.grading is not None:
         expect_array("step classes", scene.grading.classes, np.uint8, (n,))
         largest = int(scene.grading.classes.max(initial=0))
         expect(largest <= MAX_CLASS, f"step classes: {largest}, expected at most {MAX_CLASS}")
-        expect_array("centre of the attributes", scene.grading.centre, np.float32, (widths.channels,))
+        expect_array("centre of the attributes", scene.grading.centre, np.float32, (width,))
     _check_masks(scene)
     check_info(scene.info)
-    for name, step in vars(scene.steps).items():
+    for name, step in (vars(scene.steps) if isinstance(scene, Scene) else scene.steps).items():
         expect(is_step(step), f"step of {name}: {step!r}, expected a positive normal binary32 value")
     for fill in scene.fills:
         valid = fill is None or (len(fill) == 3 and all(type(c) is int and 0 <= c <= 255 for c in fill))
@@ -63,41 +64,76 @@ def check_scene(scene: Scene) -> None:
     _check_tensors(scene)
 
 
-def _check_tensors(scene: Scene) -> None:
-    """Checks the grids and chains of all layers, and then the rules of the kinds."""
-    found = dict[int, Tables]()
-    for layer, own in enumerate(kinds.NAMES):
-        given = scene.deformation(layer) if layer else Deformation((), scene.networks)
-        if given is None:
+def _check_widths(scene: Scene) -> None:
+    for name, axes in (("feature", 2), ("offset", 3)):
+        found = scene.attributes[name].shape
+        expect(len(found) == axes, f"{name}: an array of {len(found)} axes, expected {axes}")
+    widths = scene.widths
+    for what, width, limit in (("feature width", widths.feature, MAX_FEATURE), ("slots", widths.slots, MAX_SLOTS)):
+        expect(1 <= width <= limit, f"{what}: {width}, expected 1..{limit}")
+    for name, shape in widths.attributes.items():
+        expect_array(name, scene.attributes[name], np.float32, (scene.rows[-1], *shape))
+
+
+def _check_tensors(scene: AnyScene) -> None:
+    """Checks the grids, chains and layer rows of all layers, and then the rules of the kinds."""
+    found = dict[int, Tensors]()
+    for layer in range(3):
+        given, own = scene.deformation(layer), kinds.layer_name(scene, layer)
+        if layer and given is None:
             continue
         expect(layer in scene.layers, f"{own} is given, but layer {layer} is not among {scene.layers}")
-        known, required = (kinds.hexplane.CHAINS, (TRUNK,)) if layer else (SCAFFOLD_NETWORKS, SCAFFOLD_NETWORKS)
-        unknown = [name for name in given.networks if name not in known]
-        expect(not unknown, f"{own}: networks {unknown}, expected some of {list(known)}")
-        missing = [name for name in required if name not in given.networks]
-        expect(not missing, f"{own} networks {missing} are missing")
-        for name, network in given.networks.items():
-            axes = [(weight.ndim, bias.ndim) for weight, bias in network]
-            expect(set(axes) == {(2, 1)}, f"{own} network {name}: no layers, or other axes than of weight and bias")
-        for s, planes in enumerate(given.planes):
-            expect(set(planes) == {p for p, _, _ in PLANES}, f"{own} scale {s}: planes {sorted(planes)}, expected six")
-            flat = [name for name, plane in planes.items() if plane.ndim != 3 or not plane.size]
-            expect(not flat, f"{own} scale {s}: planes {flat} are empty or do not have 3 axes")
-        key = given.key
-        valid = key is None or (type(key) is int and 0 <= key <= INSTANTS)
-        expect(valid, f"{own}: key instant {key!r}, expected None or an integer 0..{INSTANTS}")
+        if isinstance(given, Tracks):
+            _check_tracks(given, own, scene.rows[-1])
+        elif isinstance(scene, Scene):
+            _check_deformation(given or Deformation((), scene.networks), layer)
         tensors = kinds.tensors_of(scene, layer)
-        names, shapes = kinds.array_names(layer, tensors.tables), tensors.tables.planes + tensors.tables.weights
+        names = [f"{own} {name}" for name in kinds.array_names(layer, tensors.tables)]
+        shapes = tensors.tables.planes + tensors.tables.weights
         for name, array, shape in zip(names, tensors.arrays, shapes, strict=True):
-            expect_array(f"{own} {name}", array, np.float32, shape)
-        found[layer] = tensors.tables
+            expect_array(name, array, np.float32, shape)
+        valued = isinstance(given, Tracks)  # the instants have rules of their own
+        found[layer] = tensors.quantised(names.__getitem__) if valued else Tensors(tensors.tables)
         try:
-            kinds.check(kinds.scaffold.kind_of(scene.widths), kinds.scaffold.row_table(scene), found)
+            kinds.check(kinds.kind_of(scene), kinds.row_table(scene), found)
         except DecodeError as error:
             raise EncodeError(f"{own}: {error}") from None
 
 
-def _check_masks(scene: Scene) -> None:
+def _check_deformation(given: Deformation, layer: int) -> None:
+    own = kinds.NAMES[layer]
+    known, required = (kinds.hexplane.CHAINS, (TRUNK,)) if layer else (SCAFFOLD_NETWORKS, SCAFFOLD_NETWORKS)
+    unknown = [name for name in given.networks if name not in known]
+    expect(not unknown, f"{own}: networks {unknown}, expected some of {list(known)}")
+    missing = [name for name in required if name not in given.networks]
+    expect(not missing, f"{own} networks {missing} are missing")
+    for name, network in given.networks.items():
+        axes = [(weight.ndim, bias.ndim) for weight, bias in network]
+        expect(set(axes) == {(2, 1)}, f"{own} network {name}: no layers, or other axes than of weight and bias")
+    for s, planes in enumerate(given.planes):
+        expect(set(planes) == {p for p, _, _ in PLANES}, f"{own} scale {s}: planes {sorted(planes)}, expected six")
+        flat = [name for name, plane in planes.items() if plane.ndim != 3 or not plane.size]
+        expect(not flat, f"{own} scale {s}: planes {flat} are empty or do not have 3 axes")
+    key = given.key
+    valid = key is None or (type(key) is int and 0 <= key <= INSTANTS)
+    expect(valid, f"{own}: key instant {key!r}, expected None or an integer 0..{INSTANTS}")
+
+
+def _check_tracks(given: Tracks, own: str, rows: int) -> None:
+    count = len(given.instants)
+    expect_array(f"{own} instants", given.instants, np.float32, (count,))
+    unknown = [name for name in given.heads if name not in kinds.tracks.HEADS]
+    expect(not unknown, f"{own}: heads {unknown}, expected some of {list(kinds.tracks.HEADS)}")
+    for name, head in given.heads.items():
+        number = len(head.bases)
+        expect(number > 0, f"{own}: no bases of {name}, expected some, or no such head")
+        expect_array(f"{own} bases of {name}", head.bases, np.float32, (number, kinds.tracks.HEADS[name], count))
+        most = min(len(head.coefficients), rows)
+        expect_array(f"{own} coefficients of {name}", head.coefficients, np.float32, (most, number))
+        expect(is_step(head.step), f"{own} step of {name}: {head.step!r}, expected a positive normal binary32 value")
+
+
+def _check_masks(scene: AnyScene) -> None:
     for layer, rows, codes in zip(scene.layers, scene.rows, scene.mask, strict=True):
         expect_array(f"mask of layer {layer}", codes, np.uint8, (rows,))
         odd = (codes > 0) & (codes < MASK_MIN_CODE)

@@ -1,4 +1,4 @@
-"""Decodes a `.pd4` file to a `Scene`, at once or as its bytes arrive."""
+"""Decodes a `.pd4` file to a scene, at once or as its bytes arrive."""
 
 from collections.abc import Iterator
 from os import PathLike
@@ -7,7 +7,7 @@ from pd4dgs_codec import kinds
 from pd4dgs_codec.errors import DecodeError, Truncated
 from pd4dgs_codec.format.reader import LayerReader, bytes_of
 from pd4dgs_codec.format.symbols import LayerSymbols
-from pd4dgs_codec.scene import Scene
+from pd4dgs_codec.kinds import AnyScene
 
 
 def decode(
@@ -16,7 +16,7 @@ def decode(
     max_layer: int | None = None,
     max_bytes: int | None = None,
     allow_partial: bool = False,
-) -> Scene:
+) -> AnyScene:
     """Decodes a file, its layers <= max_layer, or the slices within its first max_bytes bytes, at least one. Later
     bytes are ignored.
 
@@ -30,7 +30,7 @@ def decode(
 
 def decode_partial(
     data: bytes, *, max_layer: int | None = None, max_bytes: int | None = None, allow_partial: bool = True
-) -> tuple[Scene, bool]:
+) -> tuple[AnyScene, bool]:
     """Returns (scene as from `decode`, whether every requested slice was there)."""
     reader, complete = LayerReader(kinds.check), True
     try:
@@ -46,7 +46,7 @@ def decode_partial(
     return _scene(reader), complete
 
 
-def _scene(reader: LayerReader, writeable: bool = True) -> Scene:
+def _scene(reader: LayerReader, writeable: bool = True) -> AnyScene:
     assert reader.header is not None
     header = reader.header
     return kinds.scene_of(header.kind, header.table, header.info, reader.grown, writeable)
@@ -80,7 +80,7 @@ class Stream:
         """Number of slices that are complete so far."""
         return self._reader.count
 
-    def feed(self, data: bytes) -> list[Scene]:
+    def feed(self, data: bytes) -> list[AnyScene]:
         """Decodes further bytes; returns the newest scene of each layer of which they complete a slice.
 
         The rows of a layer are in order of arrival until its last slice, and then in the order of `decode`. Scenes
@@ -94,7 +94,7 @@ class Stream:
         self._buffer.extend(data)  # `+=` with a numpy array would add numbers
         if self.consumed + len(self._buffer) < self._needs:
             return []
-        scenes, pending = list[Scene](), False
+        scenes, pending = list[AnyScene](), False
         try:
             while self._next() is not None:
                 pending = not self._reader.whole  # a scene of each slice would keep arrays that are about to be copied
@@ -107,7 +107,7 @@ class Stream:
                 raise
         return [*scenes, self._scene()] if pending else scenes
 
-    def _scene(self) -> Scene:
+    def _scene(self) -> AnyScene:
         return _scene(self._reader, writeable=False)
 
     def finish(self) -> None:
@@ -128,7 +128,7 @@ class Stream:
             del self._buffer[: self.consumed - start]
 
 
-def every_prefix(data: bytes) -> Iterator[Scene]:
+def every_prefix(data: bytes) -> Iterator[AnyScene]:
     """Yields the scene after each slice of a complete file, in the row order of `Stream.feed`. Raises DecodeError."""
     reader = LayerReader(kinds.check)
     while reader.next_slice(data) is not None:

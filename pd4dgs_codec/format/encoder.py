@@ -32,7 +32,7 @@ from pd4dgs_codec.format.reader import read_layers
 from pd4dgs_codec.format.registry import MAX_CHUNKS
 from pd4dgs_codec.format.symbols import LayerSymbols, sliced
 from pd4dgs_codec.format.tables import Fill, with_fill
-from pd4dgs_codec.scene import Scene
+from pd4dgs_codec.kinds import AnyScene, utility_of
 from pd4dgs_codec.threads import one_blas_thread
 
 LATER = 2 / 3  #: size of the slices behind the first one of layer 0, of that one's
@@ -105,29 +105,29 @@ class Report:
         return asdict(self)
 
 
-def encode(scene: Scene, options: EncodeOptions = DEFAULTS, **changes: Any) -> bytes:
+def encode(scene: AnyScene, options: EncodeOptions = DEFAULTS, **changes: Any) -> bytes:
     """Returns the bytes of a `.pd4` file. Options, changes and errors as in encode_with_report."""
     return encode_with_report(scene, options, **changes)[0]
 
 
 @one_blas_thread()
 def encode_with_report(
-    scene: Scene,
+    scene: AnyScene,
     options: EncodeOptions = DEFAULTS,
     *,
     left_out: Sequence[LeftOut] = (),
     metadata: Metadata | None = None,
-    utility: Callable[[Scene], np.ndarray] | None = None,
-    fill: Callable[[Scene], Fill | None] | None = None,
+    utility: Callable[[AnyScene], np.ndarray] | None = None,
+    fill: Callable[[AnyScene], Fill | None] | None = None,
     **changes: Any,
 ) -> tuple[bytes, Report]:
     """Encodes a scene; returns (bytes of the file, report).
 
     left_out: parts that the caller has removed from the scene, added to the report. metadata: stored in the file.
     utility: function of the decoded scene, float [N], the gain in image quality by each anchor. It orders the anchors
-    of sliced layers; by_size if None. fill: function of the scene that ends with a slice, its fill; called for each
-    slice but the last. If None, each slice has the fill of its layer. changes: fields of EncodeOptions that replace
-    those of `options`. Raises EncodeError.
+    of sliced layers; `kinds.utility_of` if None. fill: function of the scene that ends with a slice, its fill; called
+    for each slice but the last. If None, each slice has the fill of its layer. changes: fields of EncodeOptions that
+    replace those of `options`. Raises EncodeError.
     """
     started = time.perf_counter()
     scene, options = replace(options, **changes).apply_scale(scene)
@@ -135,7 +135,7 @@ def encode_with_report(
     planned = plan(scene, options)
     symbols, omitted = planned.symbols, planned.left_out
     del planned  # as large as the scene
-    written = _write_layers(symbols, options, utility or by_size, None if fill is None else LONGEST)
+    written = _write_layers(symbols, options, utility or utility_of, None if fill is None else LONGEST)
     if fill is not None:
         written = _filled(symbols, options, written, fill)
     data, about_bytes = _container(symbols, options.mode, written), 0
@@ -151,14 +151,6 @@ def encode_with_report(
     rows = [item.row(options, kept, kept_bits) for item in (*left_out, *omitted)]
     seconds = round(time.perf_counter() - started, 4)
     return data, Report(options.mode, len(data), options.verify, seconds, reports, rows, about_bytes)
-
-
-def by_size(scene: Scene) -> np.ndarray:
-    """Estimates each anchor's utility without views, float32 [N]: its mask code in the highest layer times the largest
-    area, relative to other anchors, that its Gaussians may cover."""
-    scales = np.sort(scene.scaling_log[:, 3:], axis=1)[:, 1:].sum(axis=1)
-    utility: np.ndarray = scene.mask[-1] * np.exp(scales - scales.max(initial=0))
-    return utility
 
 
 def with_metadata(data: bytes, metadata: Metadata) -> tuple[bytes, int]:
@@ -180,7 +172,7 @@ def header_size(symbols: SceneSymbols, mode: str, chunks: int, most: int) -> int
 
 
 def _write_layers(
-    symbols: SceneSymbols, options: EncodeOptions, utility: Callable[[Scene], np.ndarray], fill: Fill | None
+    symbols: SceneSymbols, options: EncodeOptions, utility: Callable[[AnyScene], np.ndarray], fill: Fill | None
 ) -> list[list[_Slice]]:
     """Writes the slices of each layer. The preamble and the header count with the first slice. fill: of all slices,
     None for that of each layer."""
@@ -242,7 +234,7 @@ def _write_slices(layer: LayerSymbols, options: EncodeOptions, size: float, util
 
 
 def _filled(
-    symbols: SceneSymbols, options: EncodeOptions, written: list[list[_Slice]], fill: Callable[[Scene], Fill | None]
+    symbols: SceneSymbols, options: EncodeOptions, written: list[list[_Slice]], fill: Callable[[AnyScene], Fill | None]
 ) -> list[list[_Slice]]:
     """Gives the last slice of the file the fill of its layer, every other one that of the prefix that ends with it."""
     data, last = _container(symbols, options.mode, written), written[-1][-1]

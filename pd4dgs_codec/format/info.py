@@ -14,7 +14,9 @@ from pd4dgs_codec.format.quantise import NO_CLASSES, dequantise, quantise
 from pd4dgs_codec.format.reader import read_layers
 from pd4dgs_codec.format.registry import LAYERS
 from pd4dgs_codec.format.tables import Declared, Tables, read_parameters
-from pd4dgs_codec.scene import MASK_STEP, Scene
+from pd4dgs_codec.kinds import AnyScene
+from pd4dgs_codec.kinds.splats import SplatScene
+from pd4dgs_codec.scene import MASK_STEP
 
 FORMAT_VERSION = f"{MAJOR}.{MINOR}"
 
@@ -23,10 +25,10 @@ def info(data: bytes) -> dict[str, Any]:
     """Returns the header and layers of a file, or of a prefix of it that holds at least the preamble and header.
 
     layers: {layer, offset, bytes, end, slices}; bytes counts whole chunks, and end is the length of the prefix with
-    layers 0 .. this one. Layers that `data` holds whole also have anchors, and of a known kind steps, planes ([C, x, y,
-    z, t] per scale), networks (output widths) and key_instant if any, else grids, chains, their steps and kind, see
-    `Tables.json`. slices: {offset, bytes, end}, and anchors and fill if `data` holds the slice whole. kind, rows: of
-    the header; of a known kind also feature_width, slots, view_dependent and steps.
+    layers 0 .. this one. Layers that `data` holds whole also have anchors, and of a known kind what its `json_of_layer`
+    in `kinds` says, else grids, chains, layer rows, their steps and kind, see `Tables.json`. slices: {offset, bytes,
+    end}, and anchors and fill if `data` holds the slice whole. kind, rows: of the header; of a known kind also what its
+    `json` says.
     metadata: {title, source, licence, command, quality, slices, still_bytes} as far as given, {"fault"} if it cannot be
     read, None if `data` holds no metadata chunk. Raises DecodeError.
     """
@@ -129,42 +131,50 @@ def _digest(arrays: list[np.ndarray], dtype: str) -> str:
 
 # -- arrays for readers without this package ---------------------------------------------------------------------------
 
-#: Part of the names of each layer's networks and planes.
+#: Part of the names of each layer's networks and planes in a scaffold.
 OWNERS = {0: "", 1: "global", 2: "local"}
 
 
-def to_npz_dict(scene: Scene, symbols: bool = False) -> dict[str, np.ndarray]:
-    """Returns a scene as arrays by key, for numpy.savez: anchor, feature, scaling_log, offset (float32, one row per
-    anchor); mask_L per layer L present (float32 masks of the first rows); mlp.NAME.weight.i and .bias.i with NAME
-    opacity, covariance, color, {global,local}.trunk and {global,local}.HEAD; planes.{global,local}.SCALE.PLANE; meta_*
-    for the rest.
+def to_npz_dict(scene: AnyScene, symbols: bool = False) -> dict[str, np.ndarray]:
+    """Returns a scene as arrays by key, for numpy.savez: anchor (float32 positions at rest), the attributes (float32,
+    one row per anchor); mask_L per layer L present (float32 masks of the first rows); meta_* for the rest.
+
+    A scaffold has mlp.NAME.weight.i and .bias.i with NAME opacity, covariance, color, {global,local}.trunk and
+    {global,local}.HEAD, and planes.{global,local}.SCALE.PLANE. Splats have tracks.L.instants, tracks.L.bases.HEAD
+    [K c, 1, T] and tracks.L.coefficients.HEAD [n, K].
 
     Step classes add step_class (uint8), and NAME_centre (float32) per attribute, whose values are the centre plus
     multiples of 2^step_class steps.
 
     symbols: adds NAME_q (int32) and NAME_step (float32) for every quantised array; anchor_step is the voxel size.
+    Coefficients are NAME_q steps, whatever their class.
     """
     arrays, steps = {"anchor": scene.anchor, **scene.attributes}, dict[str, float]()
-    table, shapes = kinds.scaffold.row_table(scene), scene.widths.attributes
+    table, tracks = kinds.row_table(scene), scene.tracks if isinstance(scene, SplatScene) else None
     if scene.grading is not None:
         arrays["step_class"] = scene.grading.classes
-        for (name, shape), (_, centre) in zip(shapes.items(), table.of_each(scene.grading.centre), strict=True):
-            arrays[f"{name}_centre"] = centre.reshape(shape)
+        for (name, values), (_, centre) in zip(
+            scene.attributes.items(), table.of_each(scene.grading.centre), strict=True
+        ):
+            arrays[f"{name}_centre"] = centre.reshape(values.shape[1:])
     for layer in LAYERS:
         tensors = kinds.tensors_of(scene, layer)
         names = kinds.array_names(layer, tensors.tables)
         for step, name, array in zip(tensors.tables.steps, names, tensors.arrays, strict=True):
             family, rest = name.split(".", 1)
-            name = ".".join(filter(None, (family, OWNERS[layer], rest)))
+            name = ".".join(filter(None, (family, OWNERS[layer] if tracks is None else str(layer), rest)))
             arrays[name], steps[name] = array, step
+        for name, head in tracks[layer].heads.items() if tracks and layer in tracks else ():
+            name = f"tracks.{layer}.coefficients.{name}"
+            arrays[name], steps[name] = head.coefficients, head.step
     if symbols:
         quantised = {name: quantise(arrays[name], step, name) for name, step in steps.items()}
         classes = NO_CLASSES if scene.grading is None else scene.grading.classes.astype(np.int32)
-        v = table.quantise(list(scene.attributes.values()), classes, list(shapes))
+        v = table.quantise(list(scene.attributes.values()), classes, list(scene.attributes))
         channels = table.symbols(v, classes)
-        for name, (_, rows) in zip(shapes, table.of_each(channels), strict=True):
+        for name, (_, rows) in zip(scene.attributes, table.of_each(channels), strict=True):
             quantised[name] = rows.T.reshape(arrays[name].shape)
-        steps |= scene.steps.attributes
+        steps |= scene.row_steps
         arrays |= {f"{name}_q": k for name, k in quantised.items()}
         arrays |= {f"{name}_step": np.float32(step) for name, step in steps.items()}
         arrays |= {"anchor_q": scene.anchor_q, "anchor_step": np.float32(scene.info.voxel_size)}
@@ -175,7 +185,7 @@ def to_npz_dict(scene: Scene, symbols: bool = False) -> dict[str, np.ndarray]:
     return {name: np.asarray(a) for name, a in (arrays | _meta(scene)).items()}
 
 
-def _meta(scene: Scene) -> dict[str, np.ndarray]:
+def _meta(scene: AnyScene) -> dict[str, np.ndarray]:
     info = scene.info
     meta = {
         "layers": np.array(scene.layers, np.int32),

@@ -14,7 +14,7 @@ from pd4dgs_codec.entropy import EFFORTS, PRIORS
 from pd4dgs_codec.errors import EncodeError
 
 if TYPE_CHECKING:
-    from pd4dgs_codec.scene import Scene
+    from pd4dgs_codec.scene import S
 
 #: How symbols are coded, with the numbers of the header.
 MODES = {"ans": 0, "lzma": 1}
@@ -66,9 +66,9 @@ class EncodeOptions:
         if self.slices and self.mode != "ans":
             raise EncodeError(f"slices in mode {self.mode}, expected mode ans or one slice per layer")
 
-    def apply_scale(self, scene: Scene) -> tuple[Scene, EncodeOptions]:
+    def apply_scale(self, scene: S) -> tuple[S, EncodeOptions]:
         """Returns (`scene` with its steps scaled and rounded to binary32, these options with step_scale 1)."""
-        return replace(scene, steps=scene.steps.scaled(self.step_scale)), replace(self, step_scale=1.0)
+        return scene.scaled(self.step_scale), replace(self, step_scale=1.0)
 
 
 DEFAULTS = EncodeOptions()

@@ -12,15 +12,18 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec import kinds
+from pd4dgs_codec.entropy.channels import Places
+from pd4dgs_codec.entropy.fitting import entropy_bits
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.payload import write_slice
-from pd4dgs_codec.format.quantise import NO_CLASSES, RowTable
+from pd4dgs_codec.format.quantise import NO_CLASSES, ROW_PREDICTORS, Rows, RowTable, expect
 from pd4dgs_codec.format.symbols import NO_LAYER_ROWS, Growing, LayerSymbols, first_duplicate
 from pd4dgs_codec.format.tables import NOTHING, Kind, Tensors
-from pd4dgs_codec.kinds import hexplane
+from pd4dgs_codec.kinds import AnyScene, hexplane
+from pd4dgs_codec.kinds.splats import SplatScene
 from pd4dgs_codec.morton import morton_order
-from pd4dgs_codec.scene import Deformation, Scene, SceneInfo
+from pd4dgs_codec.scene import MAX_CLASS, Deformation, S, Scene, SceneInfo
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +65,7 @@ class SceneSymbols:
     table: RowTable
     layers: Sequence[LayerSymbols]
 
-    def scene(self) -> Scene:
+    def scene(self) -> AnyScene:
         """Returns the dequantised scene (clause 11.5)."""
         grown = Growing(self.table, self.info.voxel_size)
         for layer in self.layers:
@@ -75,19 +78,19 @@ class Plan:
     """scene: the parts of the given scene that the file holds, with other values where an omission changed symbols.
     symbols: of that scene, as the file stores them. left_out: the parts of the given scene that the file lacks."""
 
-    scene: Scene
+    scene: AnyScene
     symbols: SceneSymbols
     left_out: list[LeftOut]
 
 
-def plan(scene: Scene, options: EncodeOptions = DEFAULTS) -> Plan:
+def plan(scene: AnyScene, options: EncodeOptions = DEFAULTS) -> Plan:
     """Plans a file of `scene` by options.layers and options.omit; options.step_scale is not applied.
 
     Steps are rounded to binary32, and rows sorted by (layer, Morton order). Raises EncodeError for a value that has no
     symbol, and for voxels with two anchors.
     """
     left_out: list[LeftOut] = []
-    scene = replace(scene, steps=scene.steps.scaled(1.0))
+    scene = scene.scaled(1.0)
     auto = options.layers == "auto"
     if not auto:
         scene, left_out = _cut(scene, int(options.layers))
@@ -100,30 +103,57 @@ def plan(scene: Scene, options: EncodeOptions = DEFAULTS) -> Plan:
     if inactive := scene.rows[-1] - len(rows):
         why = f"mask at or below the threshold at level {scene.level}"
         left_out.append(LeftOut(f"{inactive} anchors", why, anchors=inactive))
-    if options.omit != "nothing":
+    if options.omit != "nothing" and isinstance(arranged, Scene):
         arranged, unread = _without_unread(arranged, tensors)
         left_out += unread
-    layers = [layer_symbols(arranged, index, tensors[layer]) for index, layer in enumerate(kept)]
-    kind, table = kinds.scaffold.kind_of(arranged.widths), kinds.scaffold.row_table(arranged)
-    return Plan(arranged, SceneSymbols(arranged.info, kind, table, layers), left_out)
+    table = kinds.row_table(arranged)
+    if isinstance(arranged, SplatScene) and not table.graded:
+        table = _predicted(table, list(arranged.attributes.values()), NO_CLASSES)
+    layers = [layer_symbols(arranged, index, tensors[layer], table, options) for index, layer in enumerate(kept)]
+    return Plan(arranged, SceneSymbols(arranged.info, kinds.kind_of(arranged), table, layers), left_out)
 
 
-def symbols_of(scene: Scene, layer: int) -> Tensors:
+def _predicted(table: RowTable, values: Sequence[np.ndarray], classes: np.ndarray) -> RowTable:
+    """Returns the table with the predictor of each tensor that takes the fewest bits by order-0 entropy. values:
+    float32 [n, any] of each, in coding order."""
+
+    def bits(tensor: Rows, x: np.ndarray, centre: np.ndarray | None) -> float:
+        alone = RowTable((tensor,), centre)
+        symbols = alone.symbols(alone.quantise([x], classes, [f"rows {tensor.id}"]), classes)
+        parts = Places.by(classes, MAX_CLASS + 1).parts(symbols) if alone.graded else symbols
+        return sum(map(entropy_bits, parts))
+
+    centres = [None] * len(values) if table.centre is None else [m for _, m in table.of_each(table.centre)]
+    chosen = [
+        min((replace(tensor, predictor=p) for p in ROW_PREDICTORS), key=lambda one: bits(one, x, m))  # noqa: B023
+        for tensor, x, m in zip(table.tensors, values, centres, strict=True)
+    ]
+    return RowTable(tuple(chosen), table.centre)
+
+
+def symbols_of(scene: AnyScene, layer: int) -> Tensors:
     """Returns the symbols of the grids and chains of a layer. Raises EncodeError for a value without a symbol."""
     given = kinds.tensors_of(scene, layer)
-    names = kinds.array_names(layer, given.tables)
-    return given.quantised(lambda i: f"{kinds.NAMES[layer]} {names[i]}")
+    names, own = kinds.array_names(layer, given.tables), kinds.layer_name(scene, layer)
+    return given.quantised(lambda i: f"{own} {names[i]}")
 
 
-def layer_symbols(scene: Scene, index: int, tensors: Tensors = NOTHING) -> LayerSymbols:
-    """Returns scene.layers[index] of a scene in file order, with these symbols of its grids and chains. Raises
-    EncodeError for a value that has no symbol."""
-    table, first, last = kinds.scaffold.row_table(scene), (scene.rows[index - 1] if index else 0), scene.rows[index]
+def layer_symbols(
+    scene: AnyScene,
+    index: int,
+    tensors: Tensors = NOTHING,
+    table: RowTable | None = None,
+    options: EncodeOptions = DEFAULTS,
+) -> LayerSymbols:
+    """Returns scene.layers[index] of a scene in file order, with these symbols of its grids and chains. table: of its
+    rows. Raises EncodeError for a value that has no symbol."""
+    first, last = scene.rows[index - 1] if index else 0, scene.rows[index]
+    table = kinds.row_table(scene) if table is None else table
     codes = scene.mask[index].astype(np.int32)
     before = scene.mask[index - 1].astype(np.int32) if index else codes[:0]
     classes = NO_CLASSES if scene.grading is None else scene.grading.classes[first:last].astype(np.int32)
     values = {name: x[first:last] for name, x in scene.attributes.items()}
-    return LayerSymbols(
+    own = LayerSymbols(
         layer=scene.layers[index],
         table=table,
         anchor_q=scene.anchor_q[first:last],
@@ -134,9 +164,25 @@ def layer_symbols(scene: Scene, index: int, tensors: Tensors = NOTHING) -> Layer
         tensors=tensors,
         fill=scene.fills[index] if scene.fills else None,
     )
+    return _with_layer_rows(own, scene, last, options) if isinstance(scene, SplatScene) and tensors.tables.rows else own
 
 
-def _cut(scene: Scene, highest: int) -> tuple[Scene, list[LeftOut]]:
+def _with_layer_rows(own: LayerSymbols, scene: SplatScene, last: int, options: EncodeOptions) -> LayerSymbols:
+    """Adds the layer rows of the scene's first `last` rows. Raises EncodeError for others that are not 0."""
+    given = scene.tracks[own.layer]
+    lost = [name for name, head in given.heads.items() if head.coefficients[last:].any()]
+    expect(not lost, f"tracks of layer {own.layer}: {lost} of anchors of a later layer, expected coefficients of 0")
+    earlier = NO_CLASSES if scene.grading is None else scene.grading.classes[: last - len(own.codes)].astype(np.int32)
+    own, values = replace(own, earlier=earlier), kinds.tracks.coefficients(given, last)
+    table = own.layer_table
+    if not (options.slices and table.graded and len(own.codes)):  # else a row's predecessor depends on its slice
+        table = _predicted(table, list(values.values()), own.all_classes)
+    names = [f"tracks of layer {own.layer} {name}" for name in values]
+    tensors = replace(own.tensors, tables=replace(own.tensors.tables, rows=table.tensors))
+    return replace(own, tensors=tensors, layer_rows=table.quantise(list(values.values()), own.all_classes, names))
+
+
+def _cut(scene: AnyScene, highest: int) -> tuple[AnyScene, list[LeftOut]]:
     """Returns (the layers <= highest with the anchors of all layers, a LeftOut for each layer above)."""
     why = f"only layers up to {highest} were requested"
     above = [layer for layer in scene.layers if layer > highest]
@@ -148,14 +194,14 @@ def _cut(scene: Scene, highest: int) -> tuple[Scene, list[LeftOut]]:
         mask=tuple(scene.full_masks()[:kept]),
         **scene.of_anchors(slice(None)),
     )
-    return cut, left_out
+    return replace(cut, **cut.of_layers()), left_out
 
 
-def _drop_heads(scene: Scene, layer: int, symbols: Tensors) -> tuple[Scene, Tensors, list[LeftOut]]:
+def _drop_heads(scene: AnyScene, layer: int, symbols: Tensors) -> tuple[AnyScene, Tensors, list[LeftOut]]:
     """Removes the heads of a layer that are zero after quantisation, or its deformation if no head is left and no layer
     above reads its planes. Returns (scene, symbols of the layer, parts left out)."""
-    given, name = scene.deformation(layer), kinds.NAMES[layer]
-    if given is None:
+    given, name = scene.deformation(layer), kinds.layer_name(scene, layer)
+    if not isinstance(given, Deformation) or isinstance(scene, SplatScene):
         return scene, symbols, []
     whole = hexplane.deformation_of(symbols)
     zero, heads = hexplane.zero_heads(whole), len(given.networks) - 1
@@ -185,7 +231,7 @@ def passed(scene: Scene, index: int, rows: np.ndarray) -> Scene:
     return replace(scene, rows=(scene.rows[-1],) * len(masks), mask=tuple(masks))
 
 
-def in_file_order(scene: Scene, kept: tuple[int, ...]) -> tuple[Scene, np.ndarray]:
+def in_file_order(scene: S, kept: tuple[int, ...]) -> tuple[S, np.ndarray]:
     """Returns (scene with the layers `kept` and rows sorted by (layer, Morton order), int64 [n], rows of the given
     scene in this order). Anchors with masks of 0 in all of these layers are dropped."""
     codes = scene.full_masks()

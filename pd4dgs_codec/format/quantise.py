@@ -173,11 +173,18 @@ class RowTable:
         yield from ((tensor, own, other, m) for (tensor, own), (_, other), (_, m) in parts)
 
     def quantise(self, given: Sequence[np.ndarray], classes: np.ndarray, names: Sequence[str]) -> np.ndarray:
-        """Returns v of float32 [n, any], one array per tensor, without predictors. names: for messages. Raises
-        EncodeError for a value without a symbol."""
+        """Returns v of float32 [n, any], one array per tensor, the nearest that symbols can give. names: for messages.
+        Raises EncodeError for a value without a symbol."""
         v = np.empty((self.channels, len(given[0])), np.int32)
         spacing = np.int32(1) << classes if self.graded else np.ones(v.shape[1], np.int32)
         for x, name, (tensor, own, _, m) in zip(given, names, self._mapped(v, v), strict=True):
+            if tensor.predictor and self.graded:  # v is whole steps from that of the last row of a lower class
+                flat = x.reshape(-1, tensor.channels).T
+                for c, upto, of_class in _runs(classes, v.shape[1]):
+                    last, rows = _last_lower(of_class)[of_class], upto[of_class]
+                    base = np.concatenate([own[:, upto], m], axis=1)[:, last]
+                    own[:, rows] = base + (quantise(flat[:, rows], tensor.step, name, base, 1 << c) << c)
+                continue
             for rows in row_blocks(v.shape[1]):
                 channels = x[rows].reshape(-1, tensor.channels).T
                 own[:, rows] = quantise(channels, tensor.step, name, m, spacing[rows]) * spacing[rows] + m
@@ -227,12 +234,19 @@ def _runs(classes: np.ndarray, n: int) -> Iterator[tuple[int, np.ndarray, np.nda
         yield c, rows, classes[rows] == c
 
 
+def _last_lower(own: np.ndarray) -> np.ndarray:
+    """Returns the place of the last row of a lower class before each row, int64 [n], or -1. own: which have the class.
+    A row of a lower class is its own."""
+    found: np.ndarray = np.maximum.accumulate(np.where(own, -1, np.arange(len(own))))
+    return found
+
+
 def _accumulated(k: np.ndarray, m: np.ndarray, classes: np.ndarray) -> np.ndarray:
     """Undoes predictor 1: int64 [C, n] of symbols k [C, n] and centres m [C, 1]."""
     v = np.zeros(k.shape, np.int64)
     for c, rows, own in _runs(classes, k.shape[1]):
         sums = np.cumsum(np.where(own, k[:, rows].astype(np.int64) << c, 0), axis=1)
-        last = np.maximum.accumulate(np.where(own, -1, np.arange(len(rows))))  # place of the last row of a lower class
+        last = _last_lower(own)
         base = np.concatenate([v[:, rows] - sums, np.broadcast_to(m, (len(m), 1))], axis=1)
         v[:, rows[own]] = (base[:, last] + sums)[:, own]
     return v

@@ -12,20 +12,20 @@ from pd4dgs_codec.format.payload import Past, read_slice
 from pd4dgs_codec.format.quantise import RowTable
 from pd4dgs_codec.format.registry import LAYERS
 from pd4dgs_codec.format.symbols import Growing, LayerSymbols, LayerTensors, TakenVoxels, check_slice, merged
-from pd4dgs_codec.format.tables import Declared, Kind, Tables
+from pd4dgs_codec.format.tables import Declared, Kind, Tables, Tensors
 
-#: Checks a header's kind and rows and the last of the tables so far, by layer: see `kinds.check`.
-Check = Callable[[Kind, RowTable, Mapping[int, Tables]], None]
+#: Checks a header's kind and rows and the last of the layers so far, by number: see `kinds.check`.
+Check = Callable[[Kind, RowTable, Mapping[int, Tensors]], None]
 
 
 class LayerReader:
     """Reads a file's chunks in order. It keeps neither bytes nor slices: each call gets the bytes from the next chunk
     on and returns one slice. A fault leaves the reader as it was before the slice.
 
-    check: called with the header, and again with the tables of each layer; raises a DecodeError.
+    check: called with the header, and again with the first slice of each layer; raises a DecodeError.
     """
 
-    def __init__(self, check: Check = lambda kind, table, tables: None) -> None:
+    def __init__(self, check: Check = lambda kind, table, layers: None) -> None:
         self.header: Header | None = None
         self._check = check
         self.offset = 0  #: of the next chunk
@@ -139,8 +139,7 @@ class LayerReader:
         part, declared = found
         check_slice(part, self.grown.codes, header.info.voxel_size)
         if not later:
-            tables = {number: tensors.tables for number, tensors in self.grown.tensors.items()}
-            self._check(header.kind, header.table, {**tables, layer: part.tensors.tables})
+            self._check(header.kind, header.table, {**self.grown.tensors, layer: part.tensors})
         self._taken.take(part.anchor_q)
         self._tables = self._tables if later else part.tensors.tables
         self._declared, self._past = declared, past if chunk.more else Past()

@@ -24,9 +24,12 @@ CHAINS = (TRUNK, "position", "feature", "scaling", "offset")
 MAX_GRIDS = 8  #: of a layer
 
 
-def check(tables: Tables, below: Mapping[int, Tables], widths: Widths, where: str) -> None:
+def check(tensors: Tensors, below: Mapping[int, Tables], widths: Widths, where: str) -> None:
     """Raises Malformed if the tables of a layer break the rules of the kind. below: of the layers before that have a
     deformation."""
+    tables = tensors.tables
+    if not (tables.grids and tables.chains) or tables.rows:
+        raise Malformed(f"{where}: a deformation of rows, or without grids or chains")
     if len(tables.kind) > 2:
         raise Malformed(f"{where}: deformation {list(tables.kind)}, expected [{NUMBER}] or [{NUMBER}, key instant]")
     read = [grid for layer in below.values() for grid in layer.grids]

@@ -9,10 +9,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from pd4dgs_codec.errors import Malformed
-from pd4dgs_codec.format.quantise import Rows, RowTable, quantise
+from pd4dgs_codec.format.quantise import RowTable
 from pd4dgs_codec.format.symbols import Growing
 from pd4dgs_codec.format.tables import Chain, Kind, Tables, Tensors
 from pd4dgs_codec.scene import (
@@ -35,20 +33,6 @@ NUMBER, NAME = 0, "scaffold"
 def kind_of(widths: Widths) -> Kind:
     """Returns the integers of the kind."""
     return NUMBER, widths.slots, sum(1 << SCAFFOLD_NETWORKS.index(name) for name in widths.viewing)
-
-
-def row_table(scene: Scene) -> RowTable:
-    """Returns the table of a scene's rows. Raises EncodeError for a centre without a symbol."""
-    sizes = [math.prod(shape) for shape in scene.widths.attributes.values()]
-    rows = [Rows(i, size, getattr(scene.steps, ATTRIBUTES[i])) for i, size in enumerate(sizes)]
-    table = RowTable(tuple(rows))
-    if scene.grading is None:
-        return table
-    centre = [
-        quantise(x, tensor.step, f"centre of {ATTRIBUTES[tensor.id]}")
-        for tensor, x in table.of_each(scene.grading.centre)
-    ]
-    return RowTable(table.tensors, np.concatenate(centre))
 
 
 def widths_of(kind: Kind, table: RowTable) -> Widths:
