@@ -41,8 +41,9 @@ from pd4dgs_codec.format import canonical
 from pd4dgs_codec.format.container import read_preamble, write_chunk, write_preamble
 from pd4dgs_codec.format.header import scene_id_of
 from pd4dgs_codec.interchange import runs
-from pd4dgs_codec.interchange.splats import Splats, fourdgs_bytes, read_splats
+from pd4dgs_codec.interchange.splats import fourdgs_bytes, read_splats
 from pd4dgs_codec.interchange.teacher import read_model
+from pd4dgs_codec.kinds.splats import Splats
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.quality.frames import write_mp4
 from pd4dgs_codec.web.client import SceneClient

@@ -115,11 +115,11 @@ def view(level: Level, frame: Frame) -> View:
     import torch
 
     from pd4dgs_codec.draw.gaussians import near_plane
-    from pd4dgs_codec.draw.player import Player
+    from pd4dgs_codec.draw.player import Drawer
 
     model, camera = level.model, frame.camera
     gaussians: Any
-    if isinstance(model, Player):
+    if isinstance(model, Drawer):
         gaussians = model.gaussians(camera, frame.time)
     else:
         with torch.no_grad():

@@ -25,7 +25,7 @@ from pd4dgs_codec.threads import configure
 
 if TYPE_CHECKING:
     from pd4dgs_codec.data.view import Dataset
-    from pd4dgs_codec.scene import Scene, SceneInfo, Viewpoint
+    from pd4dgs_codec.scene import LayeredScene, Scene, SceneInfo, Viewpoint
     from pd4dgs_codec.train.loop import Trainer
 
 #: A last garbage collection at exit took a quarter of the time of a cold start's first picture.
@@ -260,7 +260,7 @@ def checkpoint_scene(path: str, data: bytes) -> tuple[Scene, list[Viewpoint], st
     return to_scene(model), training.get("viewpoints", []), str(training.get("place", ""))
 
 
-def write_checkpoint(path: str, scene: Scene, overwrite: bool) -> None:
+def write_checkpoint(path: str, scene: LayeredScene, overwrite: bool) -> None:
     """Writes a scene as a checkpoint, whole or not at all."""
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.model.model import from_scene

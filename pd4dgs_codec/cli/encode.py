@@ -15,8 +15,9 @@ from pd4dgs_codec.format.options import CHOICES, DEFAULTS, EncodeOptions
 
 if TYPE_CHECKING:
     from pd4dgs_codec.format.metadata import Metadata
+    from pd4dgs_codec.kinds import AnyScene
     from pd4dgs_codec.quality.packing import Views
-    from pd4dgs_codec.scene import Scene, SceneInfo, Viewpoint
+    from pd4dgs_codec.scene import SceneInfo, Viewpoint
 
 DETAILS = f"""\
 A .pd4 file holds layer 0 (the scene at one instant), layer 1 (its motion) and layer 2 (motion finer in time) in this
@@ -128,11 +129,12 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
     size = f"{len(scene.anchor_q)} anchors, layers {list(scene.layers)}"
     console.detail(f"{shown_name(args.input)}: {size}, steps {scene.steps}")
     from pd4dgs_codec.quality.packing import Views, pack
+    from pd4dgs_codec.scene import Scene
 
     views = _views(args, scene.info, console)
     if views is None and viewpoints:
         views = Views.remembered(viewpoints)
-    elif views is None and scene.info.camera and (args.slices or args.target_size):
+    elif views is None and isinstance(scene, Scene) and scene.info.camera and (args.slices or args.target_size):
         say(f"{shown_name(args.input)} holds no training cameras: its own camera measures; --data SOURCE gives others")
     packed = pack(
         scene,
@@ -152,7 +154,7 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
 main = common.command(parser, _encode)
 
 
-def _load(args: argparse.Namespace) -> tuple[Scene, list[Viewpoint], Metadata | None]:
+def _load(args: argparse.Namespace) -> tuple[AnyScene, list[Viewpoint], Metadata | None]:
     """Reads (scene, training cameras and times, metadata) from a checkpoint or a `.pd4` file, which has no cameras."""
     data = common.read_bytes(args.input)
     if common.is_pd4(data):
@@ -229,8 +231,10 @@ def _slice_lines(result: dict[str, Any]) -> list[str]:
         for layer, own in zip(result["layers"], sizes, strict=True)
     ]
     if over := [row["layer"] for row, own in zip(result["layers"], sizes, strict=True) if own[0] > about["size"]]:
-        lines.append(f"first slices of layers {over} exceed {about['size']:,} bytes: networks and planes stay whole")
-    seen = f" on {about['pictures']} views: {about['cameras']}" if about["pictures"] else ": the file has no camera"
+        what = "networks, planes and tracks stay whole"
+        lines.append(f"first slices of layers {over} exceed {about['size']:,} bytes: {what}")
+    seen = f" on {about['pictures']} views: {about['cameras']}" if about["pictures"] else ""
+    seen = ": the file has no camera" if about["order"].startswith("gate") else seen
     lines.append(f"anchors ordered by {about['order']}{seen}")
     fills = [row["fill"] for layer in result["layers"] for row in layer["slices"]]
     if any(fills):

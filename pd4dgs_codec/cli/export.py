@@ -18,16 +18,16 @@ if TYPE_CHECKING:
     import numpy as np
 
     from pd4dgs_codec.data.view import View
-    from pd4dgs_codec.draw.player import Player
+    from pd4dgs_codec.draw.player import Drawer
     from pd4dgs_codec.interchange.export import Eyes
-    from pd4dgs_codec.interchange.splats import Splats
+    from pd4dgs_codec.kinds.splats import Splats
     from pd4dgs_codec.scene import SceneInfo
 
 DETAILS = f"""\
-View-dependent colours become spherical harmonics, and view-dependent opacities and sizes become means over many
-viewpoints. If only colours are view-dependent (pd4dgs-info --json), only the harmonics are approximate. Viewpoints are
-the training cameras of --data, or else lie around the point that the file's camera looks at. --compare measures the
-loss of quality.
+Splats are exported as they are, with harmonics of at most the degree of --sh. In a scene with networks, view-dependent
+colours become spherical harmonics, and view-dependent opacities and sizes become means over many viewpoints. If only
+colours are view-dependent (pd4dgs-info --json), only the harmonics are approximate. Viewpoints are the training cameras
+of --data, or else lie around the point that the file's camera looks at. --compare measures the loss of quality.
 
   ply       one PLY file in the layout of 3D Gaussian Splatting
   ply-seq   a folder of such files, one per frame
@@ -82,14 +82,14 @@ def _export(args: argparse.Namespace, console: Console) -> int:
         _check_folder(args.output, args.overwrite)
     else:
         common.check_output(args.output, args.overwrite)
-    from pd4dgs_codec.draw.player import Player
+    from pd4dgs_codec.draw.player import drawer
     from pd4dgs_codec.format.decoder import decode
     from pd4dgs_codec.interchange.export import cost
     from pd4dgs_codec.interchange.splats import EXTRA
 
     if args.to in LIBRARIES:
         required(LIBRARIES[args.to], EXTRA, f"{args.to} files")
-    player = Player(decode(common.read_bytes(args.input), max_layer=args.level))
+    player = drawer(decode(common.read_bytes(args.input), max_layer=args.level))
     views, eyes = _compared(args, player), _eyes(args, player)
     start = time.perf_counter()
     result = {"input": args.input, "output": args.output, "to": args.to, "level": player.level, "sh": args.sh}
@@ -128,15 +128,21 @@ def _check_folder(path: str, overwrite: bool) -> None:
         raise DataError(f"{path}: contains PLY files already; --overwrite removes them")
 
 
-def _eyes(args: argparse.Namespace, player: Player) -> Eyes:
+def _eyes(args: argparse.Namespace, player: Drawer) -> Eyes | None:
+    """The viewpoints from which a scaffold is baked, None for splats, of which the degree of --sh is the highest."""
+    from pd4dgs_codec.draw.player import Player
     from pd4dgs_codec.interchange.export import eyes_of_cameras, eyes_of_scene
 
+    if not isinstance(player, Player):
+        if args.data is not None:
+            raise UsageError(f"--data has no effect: {args.input} holds splats, which are exported as they are")
+        return None
     if args.data is None:
         return eyes_of_scene(player)
     return eyes_of_cameras([view.camera for view in common.read_dataset(args.data, args, player.info).train])
 
 
-def _compared(args: argparse.Namespace, player: Player) -> Sequence[View]:
+def _compared(args: argparse.Namespace, player: Drawer) -> Sequence[View]:
     """The held-out views of --compare, empty without it. Raises DataError if it has none."""
     if args.compare is None:
         return ()
@@ -146,15 +152,15 @@ def _compared(args: argparse.Namespace, player: Player) -> Sequence[View]:
     return views
 
 
-def _write_still(args: argparse.Namespace, player: Player, eyes: Eyes) -> dict[str, Any]:
+def _write_still(args: argparse.Namespace, player: Drawer, eyes: Eyes | None) -> dict[str, Any]:
     """Writes the Gaussians of one time."""
     import numpy as np
 
-    from pd4dgs_codec.interchange.export import UNTURNED, bake, upright
+    from pd4dgs_codec.interchange.export import UNTURNED, exported, upright
     from pd4dgs_codec.interchange.splats import SPZ_SCALE, SPZ_STEP, glb_bytes, ply_bytes, spz_bytes
 
     turn = upright(player.info.up) if args.to in ("glb", "spz") else UNTURNED
-    splats, _ = bake(player, args.time, eyes, args.sh, turn)
+    splats, _ = exported(player, args.time, eyes, args.sh, turn)
     _check_some(len(splats.means), args)
     splats, sizes = splats.scaled(args.scale), args.scale * splats.scales.max(axis=1)
     if args.to == "spz" and (size := float(np.median(sizes))) < 4 * SPZ_STEP:
@@ -185,9 +191,9 @@ def frame_times(info: SceneInfo, fps: float) -> list[float]:
     return [i / fps for i in range(count)]
 
 
-def _write_sequence(args: argparse.Namespace, player: Player, eyes: Eyes) -> dict[str, Any]:
+def _write_sequence(args: argparse.Namespace, player: Drawer, eyes: Eyes | None) -> dict[str, Any]:
     """Writes frames over the whole time range."""
-    from pd4dgs_codec.interchange.export import bake
+    from pd4dgs_codec.interchange.export import exported
     from pd4dgs_codec.interchange.splats import fourdgs_bytes
 
     start, stop = player.info.time_range
@@ -196,7 +202,7 @@ def _write_sequence(args: argparse.Namespace, player: Player, eyes: Eyes) -> dic
     def frames(step: Callable[[], None]) -> Iterator[tuple[float, Splats, np.ndarray]]:
         for seconds in starts:
             t = min(seconds / (stop - start), 1.0) if stop > start else 0.0
-            splats, slots = bake(player, t, eyes, args.sh)
+            splats, slots = exported(player, t, eyes, args.sh)
             yield seconds, splats.scaled(args.scale), slots
             step()
 

@@ -17,9 +17,11 @@ examples:
   pd4dgs-info scene.pd4 --check --at 500k,2M,50M --json
   pd4dgs-info http://127.0.0.1:8000/scene.pd4"""
 
-#: Shown per layer with -v: quantisation steps, planes as [channels, x, y, z, t], widths of the networks' layers,
-#: the normalised time of a key instant; of an unknown kind the tensors, see `Tables.json`.
-DETAIL_KEYS = ("steps", "planes", "networks", "key_instant", "kind", "grid_step", "grids", "chain_step", "chains")
+#: Shown per layer with -v: quantisation steps; planes as [channels, x, y, z, t], widths of the networks' layers and the
+#: normalised time of a key instant, or the numbers of instants and of bases by head; of an unknown kind the tensors of
+#: `Tables.json`.
+DETAIL_KEYS = ("steps", "planes", "networks", "key_instant", "instants", "heads", "kind", "grid_step", "grids",
+               "chain_step", "chains")  # fmt: skip
 
 
 def parser() -> options.Parser:
@@ -137,11 +139,12 @@ def _text(result: dict[str, Any]) -> str:
     rest = result["available"] - result["bytes"]
     cut = f", truncated to {result['available']:,}" if rest < 0 else f", {rest:,} more behind its end" if rest else ""
     low, high = result["time_range"]
+    what = f"splats with harmonics of degree {result['degree']}" if "degree" in result else "anchors"
     left_out = result["left_out"]
     lines = [
         f"{shown_name(result['input'])}: .pd4 format {result['format_version']}, {result['bytes']:,} bytes{cut}",
         f"mode {result['mode']}, header {result['header_bytes']} bytes, "
-        f"{number(result['anchors'], 0)} anchors on a grid of {result['voxel_size']:.6g} scene units, "
+        f"{number(result['anchors'], 0)} {what} on a grid of {result['voxel_size']:.6g} scene units, "
         f"time {low:g} to {high:g} s",
         table(
             ("layer", "offset", "bytes", "prefix", "new anchors"),

@@ -1,6 +1,8 @@
-"""Checks a scene before it is written."""
+"""Checks a scene before it is written, and the quantisation errors of its symbols."""
 
 import math
+from collections.abc import Iterator
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -8,7 +10,8 @@ import numpy as np
 from pd4dgs_codec import kinds
 from pd4dgs_codec.errors import DecodeError, EncodeError
 from pd4dgs_codec.format.header import MAX_CAMERA_SIDE, info_fault
-from pd4dgs_codec.format.quantise import all_finite, expect, expect_array, is_step, magnitude
+from pd4dgs_codec.format.plan import SceneSymbols
+from pd4dgs_codec.format.quantise import all_finite, dequantise, expect, expect_array, is_step, magnitude, row_blocks
 from pd4dgs_codec.format.tables import Tensors
 from pd4dgs_codec.kinds import AnyScene
 from pd4dgs_codec.kinds.tracks import Tracks
@@ -163,3 +166,59 @@ def check_info(info: SceneInfo) -> None:
         expect(bool((form == ((0, 0, 0), (0, 0, 0), (0, 0, 1))).all()), "camera.K: expected fx 0 cx, 0 fy cy, 0 0 1")
     fault = info_fault(info)
     expect(fault is None, str(fault))
+
+
+# -- errors ------------------------------------------------------------------------------------------------------------
+
+#: Extra share of Q: |x| / Q <= 2^23 in binary64 is off by at most 2^-30, which may round a tie the other way.
+_TIES = 2.0**-29
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors of all values that share a step, in the unit of the values, divided by 2^c in step class c. what: the
+    field of Steps, or the tensor of splats or of their tracks. step: Q. bound: of rounding, for the largest value.
+    largest: the largest error."""
+
+    what: str
+    step: float
+    bound: float
+    largest: float
+
+
+def verify_errors(given: AnyScene, symbols: SceneSymbols) -> list[Errors]:
+    """Returns the errors by step. given: the planned scene that was quantised. Raises EncodeError naming the step if a
+    value is farther from its dequantised one than rounding explains: half a step, and half a unit in the last place
+    because the product v Q is rounded to binary32."""
+    found = dict[str, Errors]()
+    for what, step, x, restored, spacing in _pairs(given, symbols):
+        bounds = (0.5 + _TIES) * step + 0.5 * np.spacing(np.abs(restored)).astype(np.float64) / spacing
+        errors = np.abs(x.astype(np.float64) - restored) / spacing
+        if not (errors <= bounds).all():
+            place = np.unravel_index(int((errors - bounds).argmax()), errors.shape)
+            row = f"{what}: {x[place]} is decoded as {restored[place]} at step {step:g}"
+            raise EncodeError(f"verification: {row}, expected an error of at most {bounds[place]:.9g}")
+        before = found.get(what, Errors(what, step, 0.0, 0.0))
+        worst = [max(a, float(b.max(initial=0.0))) for a, b in ((before.bound, bounds), (before.largest, errors))]
+        found[what] = Errors(what, step, *worst)
+    return list(found.values())
+
+
+def _pairs(
+    given: AnyScene, symbols: SceneSymbols
+) -> Iterator[tuple[str, float, np.ndarray, np.ndarray, np.ndarray | float]]:
+    """Yields (what has the step, the step, values given, values dequantised, 2^(step class) of each)."""
+    first = 0
+    for part in symbols.layers:
+        for at in row_blocks(len(part.codes)):
+            own, classes = slice(first + at.start, first + at.stop), part.classes[at]
+            spacing = 2.0 ** classes[:, None] if classes.size else 1.0
+            restored = zip(part.table.tensors, part.table.dequantise(part.rows[:, at]), strict=True)
+            for (name, x), (tensor, y) in zip(given.attributes.items(), restored, strict=True):
+                yield name, tensor.step, x[own].reshape(y.shape), y, spacing
+        first += len(part.codes)
+        layer, tensors = part.layer, kinds.tensors_of(given, part.layer)
+        names = kinds.step_names(layer) if isinstance(given, Scene) else (kinds.layer_name(given, layer),)
+        fields = [names[0]] * len(tensors.planes) + [names[-1]] * len(tensors.weights)
+        for what, step, x, k in zip(fields, tensors.tables.steps, tensors.arrays, part.tensors.arrays, strict=True):
+            yield what, step, x, dequantise(k, step), 1.0

@@ -11,7 +11,7 @@ import numpy as np
 
 from pd4dgs_codec.entropy.fitting import Fitted
 from pd4dgs_codec.errors import DecodeError, EncodeError, LimitExceeded
-from pd4dgs_codec.format.check import check_scene
+from pd4dgs_codec.format.check import Errors, check_scene, verify_errors
 from pd4dgs_codec.format.container import (
     CHUNK_OVERHEAD,
     FLAG_ANCILLARY,
@@ -80,7 +80,7 @@ class LayerReport:
 @dataclass(frozen=True)
 class Report:
     """The report of an encode. left_out: rows {what, why, lossless, bytes} with the estimated bytes of each part left
-    out. metadata_bytes: of the metadata chunk, 0 without one."""
+    out. errors: by field of Steps, empty if not verified. metadata_bytes: of the metadata chunk, 0 without one."""
 
     mode: str
     bytes: int
@@ -88,6 +88,7 @@ class Report:
     seconds: float
     layers: list[LayerReport]
     left_out: list[dict[str, Any]]
+    errors: list[Errors]
     metadata_bytes: int
 
     def added_bytes(self) -> dict[int, int]:
@@ -134,6 +135,7 @@ def encode_with_report(
     check_scene(scene)
     planned = plan(scene, options)
     symbols, omitted = planned.symbols, planned.left_out
+    errors = verify_errors(planned.scene, symbols) if options.verify else []
     del planned  # as large as the scene
     written = _write_layers(symbols, options, utility or utility_of, None if fill is None else LONGEST)
     if fill is not None:
@@ -150,7 +152,7 @@ def encode_with_report(
     kept_bits = sum(r.position_bits + s.payload_bits for r in reports for s in r.streams if s.name == "attributes")
     rows = [item.row(options, kept, kept_bits) for item in (*left_out, *omitted)]
     seconds = round(time.perf_counter() - started, 4)
-    return data, Report(options.mode, len(data), options.verify, seconds, reports, rows, about_bytes)
+    return data, Report(options.mode, len(data), options.verify, seconds, reports, rows, errors, about_bytes)
 
 
 def with_metadata(data: bytes, metadata: Metadata) -> tuple[bytes, int]:

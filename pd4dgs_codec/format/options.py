@@ -41,8 +41,8 @@ class EncodeOptions:
     after quantisation and anchors below the mask threshold are always left out. effort: 1 (fast) .. 9 (small). omit:
     "lossless" gives plane cells that no anchor reads values of little cost, "nothing" does not.
     step_scale: factor on every quantisation step. slices: most bytes of a slice, where planes and networks allow it,
-    the header counted with the first slice; 0 for one slice per layer. verify: decode the result and compare every
-    symbol.
+    the header counted with the first slice; 0 for one slice per layer. verify: check the error of every value, decode
+    the result and compare every symbol.
     """
 
     mode: str = "ans"

@@ -1,32 +1,32 @@
 """Exports a level of a scene as explicit Gaussians, and measures the loss of quality.
 
-The decoders take the view direction, so opacity, size, rotation and colour of a Gaussian depend on it. Baking evaluates
-them from a set of eyes, each with a weight per anchor. Opacity is the weighted mean over the eyes; an eye that does not
-see the Gaussian counts as 0. The weights of covariance and colour are multiplied by opacity. Covariance is a mean;
-colours are harmonics fitted by least squares, with a ridge that keeps unseen directions near the mean colour.
+Splats are explicit already. The decoders of a scaffold take the view direction, so opacity, size, rotation and colour
+of a Gaussian depend on it. Baking evaluates them from a set of eyes, each with a weight per anchor. Opacity is the
+weighted mean over the eyes; an eye that does not see the Gaussian counts as 0. The weights of covariance and colour are
+multiplied by opacity. Covariance is a mean; colours are harmonics fitted by least squares, with a ridge that keeps
+unseen directions near the mean colour.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pd4dgs_codec.data.view import View, rotation_matrix
 from pd4dgs_codec.draw.gaussians import LEAST_NEAR, near_plane
-from pd4dgs_codec.draw.player import Player
+from pd4dgs_codec.draw.player import Drawer, Player, SplatPlayer
 from pd4dgs_codec.interchange.splats import (
-    Splats,
     evenly,
-    harmonics,
+    finite_rows,
     looking,
     picture,
     principal_axes,
     quaternions,
     sphere,
-    unit,
 )
+from pd4dgs_codec.kinds.splats import Splats, harmonics, product, unit
 from pd4dgs_codec.quality.image import mpsnr
 from pd4dgs_codec.scene import MIN_OPACITY, Camera
 
@@ -88,6 +88,38 @@ def eyes_of_scene(player: Player, count: int = EYES) -> Eyes:
         like, weights = camera, np.exp(CONCENTRATION * (places @ (away / distance) - 1))
     up = np.asarray(info.up, np.float64)
     return Eyes(tuple(looking(middle + distance * d, -d, up, like) for d in places), weights)
+
+
+def exported(
+    player: Drawer, t: float, eyes: Eyes | None, degree: int, turn: np.ndarray = UNTURNED
+) -> tuple[Splats, np.ndarray]:
+    """Returns (Gaussians at normalised time t in 0..1, their slots int64 [N]), without Gaussians too faint to be drawn.
+
+    eyes: from which a scaffold is baked; None for splats, which stay as they are. degree: of the harmonics, at most.
+    turn: rotation of the world, [3, 3].
+    """
+    if isinstance(player, SplatPlayer):
+        splats, slots = player.splats(t)
+        if not (finite := finite_rows(vars(splats))).all():
+            splats, slots = splats.taken(finite), slots[finite]
+        return _turned(replace(splats, sh=splats.sh[:, : (degree + 1) ** 2]), turn), slots
+    assert isinstance(player, Player) and eyes
+    return bake(player, t, eyes, degree, turn)
+
+
+def _turned(splats: Splats, turn: np.ndarray) -> Splats:
+    """Returns the Gaussians in a world that is rotated by `turn` [3, 3]."""
+    if turn is UNTURNED:
+        return splats
+    directions = sphere(4 * splats.sh.shape[1])  # harmonics of a degree span what they are turned to
+    own, turned = harmonics(directions, splats.degree), harmonics(directions @ turn.T, splats.degree)
+    return Splats(
+        means=(splats.means @ turn.T).astype(np.float32),
+        quats=product(quaternions(turn[None]), splats.quats).astype(np.float32),
+        scales=splats.scales,
+        opacities=splats.opacities,
+        sh=np.einsum("jk,nkc->njc", np.linalg.lstsq(turned, own, rcond=None)[0], splats.sh).astype(np.float32),
+    )
 
 
 def bake(player: Player, t: float, eyes: Eyes, degree: int, turn: np.ndarray = UNTURNED) -> tuple[Splats, np.ndarray]:
@@ -176,7 +208,7 @@ def upright(up: Sequence[float]) -> np.ndarray:
 
 
 def cost(
-    player: Player, eyes: Eyes, degree: int, views: Sequence[View], step: Callable[[], None] = lambda: None
+    player: Drawer, eyes: Eyes | None, degree: int, views: Sequence[View], step: Callable[[], None] = lambda: None
 ) -> dict[str, float]:
     """Measures the loss by export: each view's time is exported by itself and drawn from the view's camera.
 
@@ -186,7 +218,7 @@ def cost(
     rows, info = [], player.info
     for view in views:
         direct = player.picture(view.camera, view.time)
-        splats, _ = bake(player, view.time, eyes, degree)
+        splats, _ = exported(player, view.time, eyes, degree)
         image = picture(splats, view.camera, player.background, near_plane(info))
         error = float(np.square(image.astype(np.float64) - direct).mean())
         to_direct = -10 * np.log10(max(error, np.finfo(float).tiny))

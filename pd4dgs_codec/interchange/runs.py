@@ -33,15 +33,14 @@ from pd4dgs_codec.data.files import LARGEST, WHITE, Color, array, number, read_f
 from pd4dgs_codec.data.view import check_rotation, rotation_matrix, up_direction, world_to_camera
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.splats import (
-    Splats,
     activated,
     checked,
     finite_rows,
     principal_axes,
     quaternions,
     read_parameters,
-    unit,
 )
+from pd4dgs_codec.kinds.splats import Splats, unit
 from pd4dgs_codec.scene import Camera
 
 PLY = "point_cloud.ply"

@@ -1,9 +1,6 @@
-"""Explicit Gaussians as in 3D Gaussian splatting: only colour depends on the view direction, by spherical harmonics.
+"""Files of explicit Gaussians as in 3D Gaussian splatting, see `kinds.splats`, and pictures of them.
 
-Real harmonics and their signs are those of its reference implementation (Kerbl et al. 2023), as in PLY, SPZ and
-KHR_gaussian_splatting. A colour is max(0, 0.5 + sum c_j Y_j(d)), d the unit vector from the eye to the mean.
-
-Files: reads PLY, SPZ, .splat and gsplat checkpoints, which it tells apart by their content, and writes PLY, glTF, SPZ
+Reads PLY, SPZ, .splat and gsplat checkpoints, which it tells apart by their content, and writes PLY, glTF, SPZ
 and 4dgs. SPZ and compressed PLY need gaussforge, 4dgs needs fourdgs; the extra `interchange` installs both.
 """
 
@@ -20,7 +17,7 @@ import sys
 import warnings
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -31,13 +28,11 @@ from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, LARGEST, MAX_HEADER, r
 from pd4dgs_codec.data.view import world_to_camera
 from pd4dgs_codec.draw.rasteriser import draw
 from pd4dgs_codec.errors import DamageWarning, DataError, one_line, required
+from pd4dgs_codec.kinds.splats import MAX_DEGREE, SH_C0, Splats, unit
 from pd4dgs_codec.scene import Camera
 
 T = TypeVar("T")
 
-MAX_DEGREE = 3
-#: Y_0, a constant: the factor between a colour and its first coefficient.
-SH_C0 = 0.28209479177387814
 EXTRA = "interchange"  #: the extra that installs gaussforge and fourdgs
 #: Number of coefficients of the harmonics without the constant -> degree.
 REST = {(degree + 1) ** 2 - 1: degree for degree in range(MAX_DEGREE + 1)}
@@ -80,45 +75,6 @@ TICK = 0.004
 FOURDGS_METADATA = {"color_space": "srgb-rec709-display", "visibility_profile": "box"}
 
 
-@dataclass(frozen=True, eq=False)
-class Splats:
-    """N Gaussians at an instant, float32."""
-
-    means: np.ndarray  #: [N, 3] world, scene units
-    quats: np.ndarray  #: [N, 4] wxyz, unit
-    scales: np.ndarray  #: [N, 3] standard deviations, scene units
-    opacities: np.ndarray  #: [N] 0..1
-    sh: np.ndarray  #: [N, (degree + 1)^2, 3] coefficients of red, green and blue
-
-    @property
-    def degree(self) -> int:
-        """Degree of the harmonics, 0 to 3."""
-        return int(np.sqrt(self.sh.shape[1])) - 1
-
-    def colors(self, eye: np.ndarray) -> np.ndarray:
-        """Returns the colours float32 [N, 3] >= 0 seen from `eye` [3], world."""
-        basis = harmonics(unit(self.means - eye.astype(np.float32)), self.degree)
-        return np.asarray(np.maximum(np.einsum("nj,njc->nc", basis, self.sh) + np.float32(0.5), 0))
-
-    @property
-    def base_colors(self) -> np.ndarray:
-        """float32 [N, 3] 0..1: the mean colours over all directions."""
-        return np.asarray(np.clip(self.sh[:, 0] * np.float32(SH_C0) + np.float32(0.5), 0, 1))
-
-    @property
-    def rest(self) -> np.ndarray:
-        """float32 [N, 3 ((degree + 1)^2 - 1)]: coefficients from degree 1 on, channel by channel as in files."""
-        return np.asarray(self.sh[:, 1:].transpose(0, 2, 1).reshape(len(self.sh), 3 * (self.sh.shape[1] - 1)))
-
-    def taken(self, rows: np.ndarray) -> Splats:
-        """Returns the Gaussians `rows`, indices or a mask."""
-        return Splats(*(part[rows] for part in vars(self).values()))
-
-    def scaled(self, factor: float) -> Splats:
-        """Returns the Gaussians with all lengths multiplied by `factor`."""
-        return replace(self, means=self.means * np.float32(factor), scales=self.scales * np.float32(factor))
-
-
 def picture(splats: Splats, camera: Camera, background: tuple[float, float, float], near: float = 0.01) -> np.ndarray:
     """Draws the Gaussians by our rasteriser, float32 [H, W, 3] in 0..1. near: scene units."""
     shapes, colors = (splats.means, splats.quats, splats.scales, splats.opacities), splats.colors(camera.eye)
@@ -147,36 +103,6 @@ def sphere(count: int) -> np.ndarray:
     i = np.arange(count) + 0.5
     polar, turn = np.arccos(1 - 2 * i / count), np.pi * (1 + 5**0.5) * i
     return np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
-
-
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """Divides vectors [..., d] by their length; zero vectors stay zero."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.asarray(vectors / np.maximum(length, np.finfo(vectors.dtype).tiny))
-
-
-def harmonics(directions: np.ndarray, degree: int) -> np.ndarray:
-    """Evaluates (degree + 1)^2 real harmonics [..., j], degree 0 to 3, at unit vectors [..., 3] in their dtype."""
-    x, y, z = np.moveaxis(directions, -1, 0)
-    rows = [np.full_like(x, SH_C0)]
-    if degree >= 1:
-        c = 0.4886025119029199
-        rows += [-c * y, c * z, -c * x]
-    if degree >= 2:
-        c = 1.0925484305920792
-        xx, yy, zz = x * x, y * y, z * z
-        rows += [c * x * y, -c * y * z, 0.31539156525252005 * (2 * zz - xx - yy), -c * x * z, c / 2 * (xx - yy)]
-    if degree >= 3:
-        rows += [
-            -0.5900435899266435 * y * (3 * xx - yy),
-            2.890611442640554 * x * y * z,
-            -0.4570457994644658 * y * (4 * zz - xx - yy),
-            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
-            -0.4570457994644658 * x * (4 * zz - xx - yy),
-            1.445305721320277 * z * (xx - yy),
-            -0.5900435899266435 * x * (xx - 3 * yy),
-        ]
-    return np.stack(rows, axis=-1).astype(directions.dtype)
 
 
 def quaternions(matrices: np.ndarray) -> np.ndarray:

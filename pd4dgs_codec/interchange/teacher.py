@@ -34,9 +34,7 @@ from pd4dgs_codec.errors import DataError, one_line, required
 from pd4dgs_codec.interchange.runs import read_cameras, read_deformed
 from pd4dgs_codec.interchange.splats import (
     EXTRA,
-    SH_C0,
     SH_SPAN,
-    Splats,
     checked,
     evenly,
     looking,
@@ -44,6 +42,7 @@ from pd4dgs_codec.interchange.splats import (
     read_splats,
     sphere,
 )
+from pd4dgs_codec.kinds.splats import SH_C0, Splats
 from pd4dgs_codec.quality.frames import shrunk
 from pd4dgs_codec.scene import Camera
 

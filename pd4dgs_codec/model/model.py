@@ -33,6 +33,7 @@ from pd4dgs_codec.scene import (
     SCAFFOLD_NETWORKS,
     Camera,
     Grading,
+    LayeredScene,
     Scene,
     SceneInfo,
     Steps,
@@ -274,11 +275,14 @@ def to_scene(model: Model) -> Scene:
     )
 
 
-def from_scene(scene: Scene) -> Model:
+def from_scene(scene: LayeredScene) -> Model:
     """Returns the model that renders `scene`, with anchors in the scene's order.
 
-    A level whose layer is absent equals the level below it; masks are reproduced to within 1e-6.
+    A level whose layer is absent equals the level below it; masks are reproduced to within 1e-6. Raises DataError for a
+    scene without networks.
     """
+    if not isinstance(scene, Scene):
+        raise DataError("found a scene of splats, which has no networks; models and checkpoints hold scaffolds only")
     n = len(scene.anchor_q)
     masks = np.zeros((n, 3), np.float64)
     for level in range(3):

@@ -10,10 +10,11 @@ import numpy as np
 import torch
 
 from pd4dgs_codec.data.view import View
-from pd4dgs_codec.draw.player import Player
+from pd4dgs_codec.draw.player import drawer
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import in_file_order, layer_symbols, passed, symbols_of, tensor_bytes
 from pd4dgs_codec.format.tables import Fill
+from pd4dgs_codec.kinds import AnyScene
 from pd4dgs_codec.model.model import Model, from_scene
 from pd4dgs_codec.model.networks import EXACT, Rounding
 from pd4dgs_codec.model.picture import render_image
@@ -55,19 +56,26 @@ def level_psnr(
 ) -> float:
     """Returns the mean mPSNR of a level over `views`, dB, of each at most MOST_DB. step is called after each."""
 
-    def draw(view: View) -> np.ndarray:
-        return render_image(model, level, view.time, view.camera, rounding)
+    return _mean_psnr(lambda view: render_image(model, level, view.time, view.camera, rounding), views, step)
 
+
+def _mean_psnr(draw: Callable[[View], np.ndarray], views: Sequence[View], step: Callable[[], None]) -> float:
     capped = {"mpsnr": lambda *pictures: min(mpsnr(*pictures), MOST_DB)}
     return mean_scores(draw, views, capped, step)["mpsnr"]
 
 
 def true_psnr(
-    scene: Scene, levels: Iterable[int], views: Sequence[View], step: Callable[[], None] = lambda: None
+    scene: AnyScene, levels: Iterable[int], views: Sequence[View], step: Callable[[], None] = lambda: None
 ) -> dict[int, float]:
     """Returns `level_psnr` of a decoded scene at each of `levels`, which may lie above its highest layer."""
-    model = from_scene(scene)
-    return {level: level_psnr(model, level, views, step) for level in levels}
+    if isinstance(scene, Scene):
+        model = from_scene(scene)
+        return {level: level_psnr(model, level, views, step) for level in levels}
+    players = {level: drawer(scene.prefix(level)) for level in levels}
+    return {
+        level: _mean_psnr(lambda view: player.picture(view.camera, view.time), views, step)  # noqa: B023
+        for level, player in players.items()
+    }
 
 
 # -- errors of a quantised scene ---------------------------------------------------------------------------------------
@@ -88,7 +96,7 @@ class RenderedLoss:
         model = from_scene(self.scene)
         return {level: pictures(model, level, self.viewpoints, self.step) for level in self.scene.layers}
 
-    def mse(self, scene: Scene) -> dict[int, float]:
+    def mse(self, scene: AnyScene) -> dict[int, float]:
         """Returns per level the mean squared error over all pictures, colours in 0..1."""
         model, found = from_scene(scene), {}
         for level, references in self.references.items():
@@ -96,7 +104,7 @@ class RenderedLoss:
             found[level] = float(np.mean([np.square(a - b).mean() for a, b in pairs]))
         return found
 
-    def mean_mse(self, scene: Scene) -> float:
+    def mean_mse(self, scene: AnyScene) -> float:
         """Returns the mean of `mse` over the levels."""
         return float(np.mean(list(self.mse(scene).values())))
 
@@ -183,14 +191,14 @@ def _enough(
 # -- what incomplete files leave open ----------------------------------------------------------------------------------
 
 
-def best_fill(prefix: Scene, viewpoints: Sequence[Viewpoint], whole: Sequence[np.ndarray]) -> Fill | None:
+def best_fill(prefix: AnyScene, viewpoints: Sequence[Viewpoint], whole: Sequence[np.ndarray]) -> Fill | None:
     """Returns the colour, RGB 0..255, behind the Gaussians of `prefix` that brings its pictures at `viewpoints` nearest
     to `whole`, float32 [H, W, 3] each. None if that gains less than FILL_GAIN over the background of the header.
 
     A picture over the colour b is J = C + T b, T the transmittance that is left. Over b + d its squared error against I
     is less by 2 d <T, I - J> - d^2 <T, T> in each channel, most for d = <T, I - J> / <T, T>.
     """
-    player, background = Player(replace(prefix, fills=())), np.array(prefix.info.background)
+    player, background = drawer(replace(prefix, fills=())), np.array(prefix.info.background)
     error, slope, curve = 0.0, np.zeros(3), 0.0
     for (camera, time), target in zip(viewpoints, whole, strict=True):
         picture, alpha = player.drawn(camera, time)

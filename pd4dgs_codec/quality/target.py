@@ -27,7 +27,7 @@ from pd4dgs_codec.format.payload import write_slice
 from pd4dgs_codec.format.plan import LeftOut, Plan, in_file_order, passed, plan
 from pd4dgs_codec.format.registry import MAX_PAYLOAD
 from pd4dgs_codec.format.symbols import LayerSymbols, sliced
-from pd4dgs_codec.kinds import step_names
+from pd4dgs_codec.kinds import AnyScene, step_names
 from pd4dgs_codec.scene import Scene
 
 #: Values tried: log2 of the factor on a step, and the share of a layer's anchors that leave it.
@@ -202,7 +202,7 @@ class Fitter:
 
     scene: Scene
     targets: Mapping[int | None, int]
-    loss: Callable[[Scene], float]
+    loss: Callable[[AnyScene], float]
     omission_error: Callable[[Scene, int], np.ndarray]
     options: EncodeOptions = DEFAULTS
     growth: defaultdict[int | None, float] = field(default_factory=lambda: defaultdict(lambda: 1.0))

@@ -34,7 +34,7 @@ from pd4dgs_codec.format.container import PREAMBLE_SIZE, read_preamble
 from pd4dgs_codec.format.decoder import open_stream
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.format.registry import MAX_HEADER
-from pd4dgs_codec.scene import Scene
+from pd4dgs_codec.kinds import AnyScene
 from pd4dgs_codec.web import is_url
 from pd4dgs_codec.web.headers import content_range, strong_etag
 
@@ -401,7 +401,7 @@ class SceneClient:
         """Closes the connection; `scenes` may be called again and opens another."""
         self.transfer.close()
 
-    def scenes(self, max_layer: int | None = None, max_bytes: int | None = None) -> Iterator[Scene]:
+    def scenes(self, max_layer: int | None = None, max_bytes: int | None = None) -> Iterator[AnyScene]:
         """Yields the newest scene, with all slices so far, as slices arrive. Only slices of layers up to max_layer that
         end within the first max_bytes of the file (None: MOST_BYTES) are fetched.
 
@@ -435,7 +435,7 @@ class SceneClient:
         self._stream, self._fed = open_stream(), 0
         self._slices: list[tuple[int, int]] = []
 
-    def _ready(self, max_layer: int | None, max_bytes: int) -> list[Scene]:
+    def _ready(self, max_layer: int | None, max_bytes: int) -> list[AnyScene]:
         """Feeds new bytes to the decoder. After a fault the transfer goes back to the end of the last valid slice."""
         data, end = self.transfer.data, len(self.transfer.data)
         try:

@@ -16,7 +16,7 @@ from urllib.parse import quote
 from pd4dgs_codec.errors import DeliveryError, printable
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.info import info
-from pd4dgs_codec.scene import Scene
+from pd4dgs_codec.kinds import AnyScene
 from pd4dgs_codec.web import PAGE
 from pd4dgs_codec.web.headers import cache_control
 from pd4dgs_codec.web.manifests import MAX_SECONDS, Video, dash, fragment, hls, hls_video, initialisation, ticks
@@ -36,8 +36,8 @@ def presentation_seconds(low: float, high: float) -> float:
 
 def package(
     data: bytes,
-    render: Callable[[Scene], Video | None] = lambda scene: None,
-    draw: Callable[[Scene], Still | None] = lambda scene: None,
+    render: Callable[[AnyScene], Video | None] = lambda scene: None,
+    draw: Callable[[AnyScene], Still | None] = lambda scene: None,
     *,
     immutable: bool = False,
 ) -> dict[str, bytes]:

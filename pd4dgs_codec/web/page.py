@@ -19,7 +19,8 @@ from pathlib import Path
 from pd4dgs_codec.errors import DataError, DeliveryError
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.info import info
-from pd4dgs_codec.scene import Scene
+from pd4dgs_codec.kinds import AnyScene
+from pd4dgs_codec.scene import LayeredScene
 from pd4dgs_codec.web import PAGE, is_url
 
 #: The page's script, and the one that requests the scene while the rest of the page arrives.
@@ -199,7 +200,7 @@ class Shown:
         return f"<a page of {len(self.page):,} characters; a notebook shows it>"
 
 
-def show(scene: Scene | bytes | str | os.PathLike[str], *, width: str = "100%", height: int = 480) -> Shown:
+def show(scene: AnyScene | bytes | str | os.PathLike[str], *, width: str = "100%", height: int = 480) -> Shown:
     """Shows a scene in a notebook, as the last line of a cell or by `display(show(scene))`.
 
     scene: a decoded scene, the bytes of a `.pd4`, its path or its URL. The page embeds the scene, except for a URL,
@@ -208,7 +209,7 @@ def show(scene: Scene | bytes | str | os.PathLike[str], *, width: str = "100%", 
     """
     if isinstance(scene, str) and is_url(scene):
         return Shown(page(scene), width, height)
-    if isinstance(scene, Scene):
+    if isinstance(scene, LayeredScene):
         from pd4dgs_codec.format.encoder import encode
 
         data = encode(scene, effort=EFFORT)

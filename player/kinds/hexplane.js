@@ -3,7 +3,8 @@
 import { malformed } from "../decode/errors.js";
 import { chainOf, checkAlike, described } from "./rules.js";
 /** @import { Header } from "../decode/header.js" */
-/** @import { LayerTensors, Network, Plane } from "../decode/tensors.js" */
+/** @import { LayerTables } from "../decode/reader.js" */
+/** @import { Network, Plane } from "../decode/tensors.js" */
 
 /** Plane ab: rows follow b, columns a. @typedef {Record<"xy" | "xz" | "xt" | "yz" | "yt" | "zt", Plane>} Scale */
 
@@ -20,12 +21,12 @@ const MAX_SCALES = 8;
 /** Normalised times are multiples of 1 / INSTANTS. */
 const INSTANTS = 65535;
 
-/** @typedef {Pick<LayerTensors, "layer" | "grids" | "chains" | "kind">} Layer */
-
 export const hexplane = {
   name: "hexplane",
+  scene: "scaffold",
+  forms: ["grids", "chains"],
 
-  /** @param {Header} header @param {Layer[]} layers up to the one of the deformation, which has grids and chains */
+  /** @param {Header} header @param {LayerTables[]} layers up to that of the deformation, which has grids and chains */
   check({ rows }, layers) {
     const { layer, grids, chains, kind } = layers[layers.length - 1];
     const where = `layer ${layer}: a hexplane`;
@@ -44,7 +45,7 @@ export const hexplane = {
     if (chains.length < 2) throw malformed(`${where} of ${chains.length} chain, expected the trunk and a head at least`);
   },
 
-  /** @param {Header} header @param {Layer[]} layers as in check @returns {Deformation} */
+  /** @param {Header} header @param {LayerTables[]} layers as in check @returns {Deformation} */
   deformationOf({ rows }, layers) {
     const { chains, kind } = layers[layers.length - 1];
     const scales = layers.flatMap(({ grids }) => grids);

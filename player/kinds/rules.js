@@ -1,7 +1,7 @@
 // What kinds demand of tensors.
 
 import { malformed } from "../decode/errors.js";
-/** @import { Chain } from "../decode/tensors.js" */
+/** @import { Chain, RowTensor } from "../decode/tensors.js" */
 
 /** Malformed at the first of these descriptions that is not as expected. @param {string} where @param {string[]} found
  * @param {string[]} expected */
@@ -11,6 +11,12 @@ export function checkAlike(where, found, expected) {
     if (is !== should) throw malformed(`${where}: ${is}, expected ${should}`);
   }
 }
+
+/** @param {number} id @param {number} channels */
+export const rowsOf = (id, channels) => `tensor ${id} of ${channels} channels`;
+
+/** @param {RowTensor} tensor */
+export const describedRows = ({ id, channels }) => rowsOf(id, channels);
 
 /** @param {number} id @param {number} inputs @param {number} outputs */
 export const chainOf = (id, inputs, outputs) => `chain ${id} of ${inputs} inputs and ${outputs} outputs`;

@@ -1,7 +1,7 @@
 // Scene kind 0 (clause 13.2), scaffold: anchors that spawn G Gaussians each, by three networks.
 
 import { malformed } from "../decode/errors.js";
-import { chainOf, checkAlike, described } from "./rules.js";
+import { chainOf, checkAlike, described, describedRows, rowsOf } from "./rules.js";
 /** @import { Header } from "../decode/header.js" */
 /** @import { LayerTensors, Network, Tensors } from "../decode/tensors.js" */
 
@@ -12,6 +12,7 @@ import { chainOf, checkAlike, described } from "./rules.js";
  * What N anchors hold.
  *
  * @typedef {object} Anchors
+ * @property {"scaffold"} kind
  * @property {Widths} widths
  * @property {Float32Array} anchor [N, 3] positions, scene units
  * @property {Float32Array} feature [N, D]
@@ -38,13 +39,11 @@ export const scaffold = {
       throw malformed(`header: a scaffold of the parameters [${kind.slice(1).join(", ")}], expected ${expected}`);
     }
     const widths = [Math.min(rows[0].channels, MAX_FEATURE), 6, 3 * slots];
-    const found = rows.map(({ id, channels }) => `tensor ${id} of ${channels} channels`);
-    checkAlike("header: rows of a scaffold", found, widths.map((width, id) => `tensor ${id} of ${width} channels`));
+    checkAlike("header: rows of a scaffold", rows.map(describedRows), widths.map((width, id) => rowsOf(id, width)));
   },
 
-  /** @param {Header} header @param {Pick<LayerTensors, "grids" | "chains">} layer 0 */
-  checkFirstLayer({ kind: [, slots, views], rows }, { grids, chains }) {
-    if (grids.length) throw malformed(`layer 0: ${grids.length} grids, expected none`);
+  /** @param {Header} header @param {Pick<LayerTensors, "chains">} layer 0 */
+  checkFirstLayer({ kind: [, slots, views], rows }, { chains }) {
     const inputs = OUTPUTS.map((_, id) => rows[0].channels + (views & (1 << id) ? 3 : 0));
     const expected = OUTPUTS.map((each, id) => chainOf(id, inputs[id], each * slots));
     checkAlike("layer 0", chains.map(described), expected);
@@ -55,6 +54,7 @@ export const scaffold = {
     const [opacity, covariance, color] = chains.map(({ network }) => network);
     const [feature, scalingLog, offset] = rows;
     const networks = { opacity, covariance, color };
-    return { widths: { feature: channels, slots, views }, anchor: positions, feature, scalingLog, offset, networks };
+    const widths = { feature: channels, slots, views };
+    return { kind: "scaffold", widths, anchor: positions, feature, scalingLog, offset, networks };
   },
 };

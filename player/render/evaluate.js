@@ -7,7 +7,7 @@ import { cellsOf, eachAttribute, GAUSSIAN_COLUMNS as COLUMNS, headsIn, levelOf }
 import { MIN_OPACITY, SPATIAL, sliceAt } from "./level.js";
 import { anchorColumns } from "./record.js";
 /** @import { Network } from "../decode/tensors.js" */
-/** @import { Deformation, Scale, Scene } from "../kinds/index.js" */
+/** @import { Deformation, Scale, AnchorScene } from "../kinds/index.js" */
 
 /**
  * The visible Gaussians in ascending order of their slot, anchor · slots + i. records: [count, GAUSSIAN_COLUMNS], all
@@ -110,7 +110,7 @@ function spatialPlanes(planes) {
 
 /** A deformation in an arena: planes, trunk, and heads that add to anchors' records. */
 class Field {
-  /** @param {Arena} arena @param {Deformation} deformation @param {Scene} scene */
+  /** @param {Arena} arena @param {Deformation} deformation @param {AnchorScene} scene */
   constructor(arena, deformation, scene) {
     this._arena = arena;
     this._deformation = deformation;
@@ -193,11 +193,12 @@ function normaliseQuaternion(q, at) {
   for (let k = 0; k < 4; k++) q[at + k] = norm > 0 ? q[at + k] / norm : k === 0 ? 1 : 0;
 }
 
-/** A deformation, and the attributes of the anchors to which it adds. @typedef {{field: Field, rest: Scene}} Motion */
+/** A deformation, and the attributes of the anchors to which it adds.
+ * @typedef {{field: Field, rest: AnchorScene}} Motion */
 
 /** A scene's networks in an arena, whose content they replace. */
 class Evaluator {
-  /** @param {Scene} scene @param {Arena} arena */
+  /** @param {AnchorScene} scene @param {Arena} arena */
   constructor(scene, arena) {
     arena.reset();
     this.scene = scene;
@@ -245,7 +246,7 @@ class Evaluator {
     return motion;
   }
 
-  /** The scene with its attributes without F(x, t*). @param {Field} field @param {number} key t* @returns {Scene} */
+  /** The scene with its attributes without F(x, t*). @param {Field} field @param {number} key t* @returns {AnchorScene} */
   _withoutStill(field, key) {
     const { scene, _anchors: records, _anchorStride: wide } = this;
     const attributes = [scene.anchor, scene.feature, scene.offset, scene.scalingLog];
@@ -358,7 +359,7 @@ let current = null;
 /**
  * The Gaussians of a level.
  *
- * @param {Scene} scene @param {number} level 0, 1 or 2 @param {number} t normalised time
+ * @param {AnchorScene} scene @param {number} level 0, 1 or 2 @param {number} t normalised time
  * @param {number[]} eye the camera's centre, scene units
  * @param {Arena} [arena] to work in, which is then the thread's; by default one is made
  * @returns {Gaussians}

@@ -11,7 +11,7 @@ import { eachAttribute, GAUSSIAN_COLUMNS, levelOf } from "./level.js";
 import { anchorColumns } from "./record.js";
 import { ANCHOR_BITS, NO_ENTRY } from "./sort.js";
 /** @import { Network } from "../decode/tensors.js" */
-/** @import { Deformation, Scene } from "../kinds/index.js" */
+/** @import { Deformation, AnchorScene } from "../kinds/index.js" */
 /** @import { Field, Gpu } from "./gl.js" */
 /** @import { List, Lister } from "./sort.js" */
 
@@ -31,7 +31,7 @@ import { ANCHOR_BITS, NO_ENTRY } from "./sort.js";
 /** Block of an anchor's record where its features begin. */
 const FEATURE_BLOCK = 3;
 /** Block of a Gaussian's record that is its colour. */
-const COLOR_BLOCK = 3;
+export const COLOR_BLOCK = 3;
 /** Blocks of a Gaussian's record. */
 export const SPLAT_BLOCKS = GAUSSIAN_COLUMNS / 4;
 /** Limit of the textures of all anchors, bytes: beyond it devices fail in ways that cannot be distinguished. */
@@ -103,7 +103,7 @@ export class GpuEvaluator {
   /**
    * Throws TooLarge where the scene's networks or planes are larger than shaders take.
    *
-   * @param {Gpu} gpu @param {Scene} scene
+   * @param {Gpu} gpu @param {AnchorScene} scene
    */
   constructor(gpu, scene) {
     this._gpu = gpu;

@@ -4,7 +4,7 @@ import { blocksOf, Linear, repeat, targets, TooLarge } from "./layers.js";
 import { cellsOf, headsIn, sliceAt, SPATIAL } from "./level.js";
 import { anchorColumns } from "./record.js";
 /** @import { Network } from "../decode/tensors.js" */
-/** @import { Deformation, Scale, Scene } from "../kinds/index.js" */
+/** @import { Deformation, Scale, AnchorScene } from "../kinds/index.js" */
 /** @import { Field, Gpu } from "./gl.js" */
 
 /** Source of the functions that sample planes. */
@@ -26,7 +26,7 @@ vec4 row(int y, int a, int b, float f, int z) {
 `;
 
 export class FieldPass {
-  /** @param {Gpu} gpu @param {Deformation} deformation @param {Scene} scene */
+  /** @param {Gpu} gpu @param {Deformation} deformation @param {AnchorScene} scene */
   constructor(gpu, deformation, scene) {
     this._gpu = gpu;
     this._deformation = deformation;
@@ -216,7 +216,7 @@ function padInputs(layer, channels, scales) {
 /**
  * All heads as one layer, whose outputs are the columns of an anchor's record.
  *
- * @param {Deformation} deformation @param {Scene} scene
+ * @param {Deformation} deformation @param {AnchorScene} scene
  * @returns {Network[number]}
  */
 function joinHeads(deformation, scene) {

@@ -1,23 +1,39 @@
 // The parts of a scene that a level shows (clauses 13.4 and 13.6), in the forms that both evaluators take.
 
 import { columnsOf, quantitiesOf } from "./record.js";
-/** @import { Deformation, Scale, Scene } from "../kinds/index.js" */
+/** @import { AnchorScene, Deformation, Scale, Scene } from "../kinds/index.js" */
 
 /**
  * One level of a scene: the highest layer that is there and at most the requested one. It has the first `rows` anchors.
- * codes: their gates times 255. fill: the colour behind the Gaussians. motion: what moves the anchors, null if nothing
- * does.
+ * codes: their gates times 255. fill: the colour behind the Gaussians. motion: what moves it, null if nothing does.
  *
- * @typedef {{number: number, rows: number, codes: Uint8Array, fill: number[], motion: Deformation | null}} Level
+ * @template {Scene} S
+ * @typedef {{number: number, rows: number, codes: Uint8Array, fill: number[], motion: S["motion"][number]}} Level
  */
 
 /** Columns of a Gaussian's record: mean and opacity; scale, 0; quaternion w x y z; colour, 0. In scene units. */
 export const GAUSSIAN_COLUMNS = 16;
 
+/**
+ * Gaussians as texels, [4, height, width, 4], of which the first `count` are filled: columns 4·b to 4·b + 3 of a record
+ * in block b.
+ *
+ * @typedef {{count: number, data: Float32Array, width: number, height: number}} Texels
+ */
+
+/** Room for Gaussians. @param {number} most @param {Float32Array | null} spare data of others, to take if it fits
+ * @returns {Texels} */
+export function texelsFor(most, spare) {
+  const width = 2 ** Math.max(4, Math.ceil(Math.log2(Math.sqrt(most + 1))));
+  const height = Math.max(1, Math.ceil(most / width));
+  const length = GAUSSIAN_COLUMNS * width * height;
+  return { count: 0, data: spare?.length === length ? spare : new Float32Array(length), width, height };
+}
+
 /** Lower opacities never reach a pixel: a picture has 255 steps. */
 export const MIN_OPACITY = 1 / 255;
 
-/** @param {Scene} scene @param {number} level 0, 1 or 2 @returns {Level} */
+/** @template {Scene} S @param {S} scene @param {number} level 0, 1 or 2 @returns {Level<S>} */
 export function levelOf(scene, level) {
   const i = scene.layers.filter((layer) => layer <= level).length - 1;
   const { layers, rows, mask, fill, motion } = scene;
@@ -30,7 +46,7 @@ export function deformationUnit({ info: { box } }) {
 }
 
 /** The heads that a deformation has, with the columns of an anchor's record that they add to, and the unit of their
- * outputs. @param {Deformation} deformation @param {Scene} scene */
+ * outputs. @param {Deformation} deformation @param {AnchorScene} scene */
 export function headsIn({ heads }, scene) {
   const unit = deformationUnit(scene);
   return quantitiesOf(scene.widths).flatMap((quantity, i) => {
@@ -42,8 +58,8 @@ export function headsIn({ heads }, scene) {
 /**
  * Calls `put` for each attribute of the anchors.
  *
- * @param {Scene} scene @param {(values: Float32Array, width: number, columns: number[]) => void} put values: [anchors,
- * width]. columns: those of an anchor's record that take them
+ * @param {AnchorScene} scene @param {(values: Float32Array, width: number, columns: number[]) => void} put values:
+ * [anchors, width]. columns: those of an anchor's record that take them
  */
 export function eachAttribute(scene, put) {
   for (const quantity of quantitiesOf(scene.widths)) put(scene[quantity.values], quantity.outputs, columnsOf(quantity));
@@ -92,13 +108,14 @@ const EYE_TOLERANCE = 1e-5;
 /**
  * @param {Scene} scene @param {number} level the highest to show @param {number} seconds of the scene's time
  * @param {number[]} eye the camera's centre, scene units
- * @returns {State} with a time only where something moves
+ * @returns {State} with a time only where something moves, and a centre only where colours or shapes depend on it
  */
 export function stateOf(scene, level, seconds, eye) {
   const { number, motion } = levelOf(scene, level);
   const [start, end] = scene.info.timeRange;
   const t = (seconds - start) / (end - start); // clause 13.4; no number where the range is empty
-  return { scene, level: number, t: motion && t > 0 ? Math.min(t, 1) : 0, eye };
+  const sees = scene.kind === "splats" ? scene.harmonics : scene.widths.views;
+  return { scene, level: number, t: motion && t > 0 ? Math.min(t, 1) : 0, eye: sees ? eye : [0, 0, 0] };
 }
 
 /** @param {State} a @param {State} b */

@@ -2,7 +2,7 @@
 
 import { centreOf, defaultCamera, fitted } from "./camera.js";
 import { CpuEvaluator } from "./cpu.js";
-import { GpuEvaluator, SPLAT_BLOCKS } from "./evaluator.js";
+import { COLOR_BLOCK, GpuEvaluator, SPLAT_BLOCKS } from "./evaluator.js";
 import { Gpu } from "./gl.js";
 import { levelOf, sameState, stateOf } from "./level.js";
 import { Clip } from "./loader.js";
@@ -11,7 +11,7 @@ import { Painter } from "./painter.js";
 import { Remote } from "./remote.js";
 import { WORKERS } from "./workers.js";
 /** @import { Camera } from "../decode/tensors.js" */
-/** @import { Scene } from "../kinds/index.js" */
+/** @import { AnchorScene, Scene } from "../kinds/index.js" */
 /** @import { Evaluated, Splats } from "./evaluator.js" */
 /** @import { State } from "./level.js" */
 
@@ -501,7 +501,7 @@ export class Player extends Clip {
   _onCpu(gpu, scene) {
     const { evaluator } = this._options;
     const few = gpu.software && scene.anchor.length <= 3 * SOFTWARE_ANCHORS;
-    return evaluator === "cpu" || this._unfit || !gpu.floats || (few && evaluator !== "gpu");
+    return scene.kind === "splats" || evaluator === "cpu" || this._unfit || !gpu.floats || (few && evaluator !== "gpu");
   }
 
   /** @param {Gpu} gpu @param {State} state @param {Splats | null} into what may be overwritten
@@ -515,12 +515,17 @@ export class Player extends Clip {
     }
     if (onCpu) {
       this._cpu ??= new CpuEvaluator();
-      const { count, data, width, height } = await this._cpu.evaluate(state);
+      const { count, data, means, width, height } = await this._cpu.evaluate(state);
       const field = gpu.renewed(into?.field, width, height, SPLAT_BLOCKS);
-      gpu.write(field, data);
-      return { splats: { field }, means: data.slice(0, 4 * count) };
+      // another eye changes colours alone where Gaussians need no anchors
+      const { state: had, splats } = this._front ?? {};
+      const blind = scene.kind === "splats" && had?.scene === scene && had.level === level && had.t === t;
+      const shapes = blind ? splats?.shapes : {};
+      const kept = into?.field === field && into.shapes === shapes;
+      gpu.write(field, data, Math.ceil(count / width), kept ? COLOR_BLOCK : 0);
+      return { splats: { field, shapes }, means: blind ? null : means };
     }
-    this._evaluator ??= new GpuEvaluator(gpu, scene);
+    this._evaluator ??= new GpuEvaluator(gpu, /** @type {AnchorScene} */ (scene));
     return this._evaluator.evaluate(level, t, eye, into, (opacities, ...rest) =>
       this._sorter.call("list", [opacities, ...rest], [opacities.buffer]),
     );

@@ -3,7 +3,7 @@ import { test } from "node:test";
 import { isDeepStrictEqual } from "node:util";
 
 import { DecodeError, decode, decodeTensors, hashes, openStream } from "../decode/index.js";
-import { endsOf, readVector, readVectors, same } from "../testing/vectors.mjs";
+import { endsOf, readScaffold, readVector, readVectors, same } from "../testing/vectors.mjs";
 /** @import { Scene } from "../decode/index.js" */
 
 const VECTORS = readVectors();
@@ -98,7 +98,7 @@ for (const folder of new Set(VECTORS.map(({ file }) => file.split("/")[0]))) {
 }
 
 test("a scene has the arrays that kinds/ describes", () => {
-  const scene = decode(readVector("valid/layers-0-1-2"));
+  const scene = readScaffold("valid/layers-0-1-2");
   const n = scene.rows[scene.rows.length - 1];
   const { feature, slots, views } = scene.widths;
   assert.deepEqual(scene.layers, [0, 1, 2]);

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 
-import { openStream } from "../decode/index.js";
+import { decode, openStream } from "../decode/index.js";
 
 const FOLDER = new URL("../../spec/vectors/", import.meta.url);
 
@@ -39,6 +39,13 @@ export function readVectors() {
 /** One vector's bytes. @param {string} name without the ending */
 export function readVector(name) {
   return new Uint8Array(readFileSync(new URL(`${name}.pd4`, FOLDER)));
+}
+
+/** The scene of a vector that is a scaffold. @param {string} name */
+export function readScaffold(name) {
+  const scene = decode(readVector(name));
+  assert.ok(scene.kind === "scaffold");
+  return scene;
 }
 
 /** Each slice's layer with its end in a whole file. @param {Uint8Array} bytes */

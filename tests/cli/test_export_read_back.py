@@ -17,7 +17,7 @@ from pd4dgs_codec.data.view import rotation_matrix
 from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
-from pd4dgs_codec.interchange.splats import SH_C0, harmonics, unit
+from pd4dgs_codec.kinds.splats import SH_C0, harmonics, unit
 from pd4dgs_codec.scene import MIN_OPACITY, Gaussians, Scene
 
 UP, SECONDS = (0.3, -0.8, 0.5), 2.0

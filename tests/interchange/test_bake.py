@@ -17,7 +17,8 @@ from pd4dgs_codec.interchange.export import (
     eyes_of_scene,
     upright,
 )
-from pd4dgs_codec.interchange.splats import harmonics, picture, unit
+from pd4dgs_codec.interchange.splats import picture
+from pd4dgs_codec.kinds.splats import harmonics, unit
 from pd4dgs_codec.quality.frames import turned
 from pd4dgs_codec.scene import Camera, Scene
 

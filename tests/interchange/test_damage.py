@@ -14,8 +14,9 @@ from test_splats import gsplat_state, make_splats
 
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.runs import read_cameras, read_torch
-from pd4dgs_codec.interchange.splats import Splats, fourdgs_bytes, ply_bytes, read_splats, spz_bytes
+from pd4dgs_codec.interchange.splats import fourdgs_bytes, ply_bytes, read_splats, spz_bytes
 from pd4dgs_codec.interchange.teacher import PARTS, load_source, read_model
+from pd4dgs_codec.kinds.splats import Splats
 
 CASES = 150
 SPLATS = make_splats(4, 1)

@@ -11,7 +11,6 @@ from test_splats import gsplat_state, make_splats
 from pd4dgs_codec.data.files import read_ply
 from pd4dgs_codec.errors import DamageWarning, DataError
 from pd4dgs_codec.interchange.splats import (
-    Splats,
     fourdgs_bytes,
     glb_bytes,
     ply_bytes,
@@ -21,6 +20,7 @@ from pd4dgs_codec.interchange.splats import (
     spz_bytes,
 )
 from pd4dgs_codec.interchange.teacher import read_model
+from pd4dgs_codec.kinds.splats import Splats
 
 SPLATS = make_splats(60, 1)
 NAMES = properties(1)

@@ -16,18 +16,8 @@ from tiny import camera_ahead
 
 from pd4dgs_codec.data.view import rotation_matrix
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.interchange.splats import (
-    SH_C0,
-    Splats,
-    fourdgs_bytes,
-    glb_bytes,
-    harmonics,
-    picture,
-    ply_bytes,
-    quaternions,
-    spz_bytes,
-    unit,
-)
+from pd4dgs_codec.interchange.splats import fourdgs_bytes, glb_bytes, picture, ply_bytes, quaternions, spz_bytes
+from pd4dgs_codec.kinds.splats import SH_C0, Splats, harmonics, unit
 
 
 def test_harmonics_are_the_real_ones_with_the_condon_shortley_phase():

@@ -18,7 +18,7 @@ from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.info import hashes
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, dequantise
-from pd4dgs_codec.interchange.splats import harmonics
+from pd4dgs_codec.kinds.splats import harmonics
 from pd4dgs_codec.morton import morton_order
 
 SPEC = Path(__file__).parents[2] / "spec"
