@@ -5,11 +5,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from explicit import visible_splats
 from strategies import by_voxel, make_scene
 from tiny import camera_ahead
 
 from pd4dgs_codec.data.view import View, spread
-from pd4dgs_codec.draw.player import Player
+from pd4dgs_codec.draw.player import drawer
 from pd4dgs_codec.format.decoder import decode, every_prefix
 from pd4dgs_codec.format.encoder import encode, with_metadata
 from pd4dgs_codec.format.info import hashes, info, metadata_of
@@ -145,13 +146,19 @@ def test_views_held_out_are_scored_after_each_slice(scene):
 
 
 VIEWPOINTS = [(CAMERA, time) for time in (0.0, 0.3, 1.0)]
+TWICE = [both for both in VIEWPOINTS for _ in range(2)]  # half of the views decide on fills
 
 
 def over(scene, color):
     """Pictures of a scene over any colour, which are not clipped."""
-    drawn = [Player(scene).drawn(camera, time) for camera, time in VIEWPOINTS]
+    drawn = [drawer(scene).drawn(camera, time) for camera, time in VIEWPOINTS]
     change = np.float32(color) - np.float32(scene.background())
     return [image + (1 - alpha)[:, :, None] * change for image, alpha in drawn]
+
+
+def error(scene, whole):
+    """The squared error of a scene's pictures against `whole`."""
+    return sum(np.square(a - b).sum() for a, b in zip(over(scene, scene.background()), whole, strict=True))
 
 
 @pytest.mark.parametrize("level", [0, 2])
@@ -171,19 +178,23 @@ def test_the_fill_is_the_colour_behind_the_pictures(scene, level):
 
 
 def test_a_fill_brings_every_prefix_nearer_to_the_pictures_that_order_anchors(scene):
-    packed = pack(scene, SLICED, views=Views("made up", [both for both in VIEWPOINTS for _ in range(2)]))
+    packed = pack(scene, SLICED, views=Views("made up", TWICE))
     whole, left = over(plan(scene).scene, scene.info.background), list[float]()
     *prefixes, last = every_prefix(packed.data)
     for prefix in (prefix for prefix in prefixes if prefix.fills[-1]):
-        error, filled = (
-            sum(np.square(a - b).sum() for a, b in zip(over(shown, shown.background()), whole, strict=True))
-            for shown in (replace(prefix, fills=()), prefix)
-        )
-        left.append(filled / error)
+        left.append(error(prefix, whole) / error(replace(prefix, fills=()), whole))
     assert max(left) < 10 ** (-0.05 / 10) and min(left) < 0.85 and len(left) > 3 and last.fills[-1] is None
     assert info(packed.data)["layers"][0]["slices"][0]["end"] <= SLICED.slices
     rows = [row for layer in packed.json()["layers"] for row in layer["slices"]]
     assert [row["fill"] for row in rows] == [prefix.fills[-1] for prefix in (*prefixes, last)]
+
+
+def test_slices_of_splats_have_fills_too():
+    scene = visible_splats(count=200, moving=False)
+    first, *_, last = every_prefix(pack(scene, SLICED, views=Views("made up", TWICE)).data)
+    whole = over(scene, scene.background())
+    assert first.fills[-1] and last.fills == (None,)
+    assert error(first, whole) < 0.95 * error(replace(first, fills=()), whole)
 
 
 def test_anchors_that_show_nothing_are_worth_least(scene):
