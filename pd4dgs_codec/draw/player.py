@@ -80,14 +80,13 @@ class SplatPlayer(Drawer):
         super().__init__(scene)
         self.scene = scene
         self._moving = Moving(scene)
-        self._time, self._latest = -1.0, self._moving.at(0.0)
+        self._time, self._latest = 0.0, self._moving.at(0.0)
 
     def splats(self, t: float) -> tuple[Splats, np.ndarray]:
         """Returns (the visible Gaussians at normalised time t, clamped to 0..1, their anchors int64 [K])."""
         t = min(max(t, 0.0), 1.0)
         if t != self._time:
-            with np.errstate(all="ignore"):
-                self._time, self._latest = t, self._moving.at(t)
+            self._time, self._latest = t, self._moving.at(t)
         return self._latest
 
     def gaussians(self, camera: Camera, t: float) -> Gaussians:

@@ -128,7 +128,7 @@ def splats_of(tensors: Mapping[str, np.ndarray]) -> Splats:
     xyz, color = tensors["rotation"], tensors["color"]
     w = np.sqrt(np.maximum(1 - np.square(xyz).sum(axis=1, keepdims=True), 0))
     channels = np.concatenate([color.T, tensors["harmonics"].T]) if "harmonics" in tensors else color.T
-    sh = RGB.astype(color.dtype) @ channels.reshape(-1, 3, len(xyz))
+    sh = RGB.astype(color.dtype) @ channels.reshape(len(channels) // 3, 3, len(xyz))
     return Splats(
         means=np.ascontiguousarray(tensors["position"], np.float32),
         quats=_rotations(np.concatenate([w, xyz], axis=1)).astype(np.float32),
@@ -202,8 +202,7 @@ class SplatScene(LayeredScene):
     def splats(self, t: float, level: int | None = None) -> tuple[Splats, np.ndarray]:
         """Returns (the visible Gaussians at normalised time t in 0..1, their rows int64 [K]). Arguments and errors as
         of `gaussians`."""
-        with np.errstate(all="ignore"):
-            return Moving(self.at(t, level)).at(t)
+        return Moving(self.at(t, level)).at(t)
 
     def _evaluated(self, t: float, eye: np.ndarray) -> Gaussians:
         splats, rows = Moving(self).at(t)
@@ -213,6 +212,7 @@ class SplatScene(LayeredScene):
 class Moving:
     """The active Gaussians of a scene's highest level, prepared for any time."""
 
+    @np.errstate(all="ignore")
     def __init__(self, scene: SplatScene):
         rows = scene.active
         mask, tensors = scene.mask[-1][rows] * MASK_STEP, {name: x[rows] for name, x in scene.tensors.items()}
@@ -232,6 +232,7 @@ class Moving:
         self._columns = np.asfortranarray(self._rest.quats)  # products of columns take half the time
         self._tracks = {layer: own.of_rows(rows).by_columns() for layer, own in scene.tracks.items()}
 
+    @np.errstate(all="ignore")
     def at(self, t: float) -> tuple[Splats, np.ndarray]:
         """Returns (the visible Gaussians at normalised time t in 0..1, their rows int64 [K])."""
         rest, mask, added = self._rest, self._mask, total(self._tracks, t, len(self._rows))
