@@ -29,6 +29,8 @@ YCOCG = np.array([[0.25, 0.5, 0.25], [0.5, 0.0, -0.5], [-0.25, 0.5, -0.25]])
 LEAST_OPACITY, LEAST_SHARE = 1e-3, np.exp(-6)
 FINEST = 0.01  #: the share of Gaussians that would have finer steps than class 0 gives
 LONELY = 0.85  #: the share of Gaussians that have a voxel for themselves, at least
+FARTHEST = 2.0**18  #: most voxels between 0 and a position, far within the range of voxels
+KEYS = np.array([1, 1 << 21, 1 << 42])  #: of voxels, which are numbers
 DRAWN = 0.3  #: the most by which a symbol is drawn to 0, in steps
 PROBES = 4  #: random pictures of signs per view
 ROUNDS, CLOSE, SLOPE = 7, 0.15, 3.0  #: of matching a PSNR; how close, dB; and the least slope, dB for a factor of 10
@@ -265,25 +267,53 @@ class Ordered:
 def voxels(at: np.ndarray) -> tuple[float, np.ndarray]:
     """Returns (side, a power of two, of voxels that LONELY of the positions [n, 3] have for themselves; distinct voxels
     int64 [n, 3] near them)."""
-    size = 2.0 ** np.ceil(np.log2(max(float(np.ptp(at, axis=0).max(initial=0)), 1e-9)))
-    keys = np.array([1, 1 << 21, 1 << 42])
-    while np.abs(at).max(initial=0) < 1e5 * size:  # far within the range of voxels
-        if len(np.unique(np.rint(at / size).astype(np.int64) @ keys)) >= LONELY * len(at):
+    far = float(np.abs(at).max(initial=0))
+    size = 2.0 ** np.ceil(np.log2(max(float(np.ptp(at, axis=0).max(initial=0)), far / FARTHEST, 1e-9)))
+    while far < FARTHEST / 2 * size:
+        if len(np.unique(np.rint(at / size).astype(np.int64) @ KEYS)) >= LONELY * len(at):
             break
         size /= 2
-    cells, near = np.rint(at / size).astype(np.int64), 1
-    taken, first = np.unique(cells @ keys, return_index=True)
+    own = np.rint(at / size).astype(np.int64)
+    cells = own.copy()
+    taken, first = np.unique(own @ KEYS, return_index=True)
     rows = np.setdiff1d(np.arange(len(at)), first)
-    while len(rows):  # move the others to the nearest free voxels
-        around = np.stack(np.meshgrid(*[np.arange(-near, near + 1)] * 3), axis=-1).reshape(-1, 3)
-        own = np.rint(at[rows] / size).astype(np.int64)
-        order = np.argsort(np.square(around - (at[rows] / size - own)[:, None]).sum(axis=2), axis=1)
-        for choice in range(1, len(around)):
-            wanted = own + around[order[:, choice]]
-            key, one = np.unique(wanted @ keys, return_index=True)
-            one = one[~np.isin(key, taken)]
-            cells[rows[one]], taken = wanted[one], np.append(taken, wanted[one] @ keys)
-            left = np.delete(np.arange(len(rows)), one)
-            rows, own, order = rows[left], own[left], order[left]
-        near *= 2
+    around = _offsets(1)
+    order = np.argsort(np.square(around - (at[rows] / size - own[rows])[:, None]).sum(axis=2), axis=1)
+    for choice in range(len(around)):  # the nearest free voxels
+        won, taken = _first_come(own[rows] + around[order[:, choice]], taken)
+        cells[rows[won]] += around[order[won, choice]]
+        rows, order = rows[~won], order[~won]
+    _, group, count = np.unique(own[rows] @ KEYS, return_inverse=True, return_counts=True)
+    order, stride = np.argsort(group, kind="stable"), count[group]
+    tries = np.empty(len(rows), np.int64)
+    tries[order] = np.arange(len(rows)) - np.repeat(np.cumsum(count) - count, count)
+    reach = 2
+    while len(rows):  # many at one place: each begins with another voxel
+        around = _offsets(reach)
+        near = np.flatnonzero(tries < len(around))
+        if not len(near):
+            reach *= 2
+            continue
+        moved = around[tries[near]]
+        won, taken = _first_come(own[rows[near]] + moved, taken)
+        cells[rows[near[won]]] += moved[won]
+        tries[near] += stride[near]
+        left = np.ones(len(rows), bool)
+        left[near[won]] = False
+        rows, tries, stride = rows[left], tries[left], stride[left]
     return float(size), cells
+
+
+def _offsets(reach: int) -> np.ndarray:
+    """Returns int64 [(2 reach + 1)^3, 3]: voxels around 0, shell by shell, in each the nearest first."""
+    grid = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 3), axis=-1).reshape(-1, 3)
+    return grid[np.lexsort((np.square(grid).sum(axis=1), np.abs(grid).max(axis=1)))]
+
+
+def _first_come(wanted: np.ndarray, taken: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns (bool [m]: whether a row gets the voxel [m, 3] that it wants, the keys that are taken then)."""
+    keys, one = np.unique(wanted @ KEYS, return_index=True)
+    free = ~np.isin(keys, taken)
+    won = np.zeros(len(wanted), bool)
+    won[one[free]] = True
+    return won, np.append(taken, keys[free])

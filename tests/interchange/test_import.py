@@ -226,3 +226,16 @@ def test_options_that_do_not_fit(tmp_path, cli):
     ):
         result = cli("import_model", tmp_path / "x.ply", "-o", tmp_path / out, *option)
         assert result.code == 2 and message in result.err
+
+
+def test_many_gaussians_at_one_place(tmp_path, cli):
+    """They get voxels of their own, in a time that does not grow with the square of their number."""
+    splats = make_splats(5000, 0)
+    splats.means[:] = [1, 2, 3]
+    (tmp_path / "a.ply").write_bytes(ply_bytes(splats))
+    result = cli("import_model", tmp_path / "a.ply", "-o", tmp_path / "a.pd4", "--psnr", 30, "--json")
+    assert result.code == 0, result.err
+    assert result.json["psnr"]["0"] > 25
+    np.testing.assert_allclose(
+        decode((tmp_path / "a.pd4").read_bytes()).anchor, [[1, 2, 3]] * result.json["gaussians"], atol=0.5
+    )
