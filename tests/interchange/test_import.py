@@ -11,6 +11,7 @@ from test_splats import gsplat_state, make_splats
 
 from pd4dgs_codec import decode
 from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.format.info import metadata_of
 from pd4dgs_codec.interchange import imported
 from pd4dgs_codec.interchange.sampled import sampled
 from pd4dgs_codec.interchange.splats import ply_bytes
@@ -62,6 +63,8 @@ def test_still_files(tmp_path, cli):
         assert result.code == 0, result.err
         found = result.json
         assert found["psnr"]["0"] > 43 and found["bytes"] == out.stat().st_size
+        about = metadata_of(out.read_bytes())
+        assert about.title == "A" and about.quality[0] == pytest.approx(found["psnr"]["0"])
         assert found["gaussians"] + found["gaussians_left_out"] == 300
         scene = decode(out.read_bytes())
         assert scene.layers == (0,) and scene.splats(0.0)[0].degree == 2
