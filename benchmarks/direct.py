@@ -290,7 +290,7 @@ def main() -> None:
                 if source == str(half):
                     draw_beside(half, made[-2][1], args.pictures / "import.jpg")
             draw_curve(curves, args.pictures / "import-curve.png")
-            print(json.dumps(curves))
+            say(json.dumps(curves))
 
 
 if __name__ == "__main__":

@@ -169,7 +169,7 @@ def _of_size(write: Callable[[float], tuple[bytes, Report]], psnr: float, most: 
     if best is None:
         found = min(math.exp(size) for _, size in tried)
         raise EncodeError(
-            f"target size: the smallest file tried takes {found:,.0f} bytes without metadata, expected {most:,}"
+            f"target size: the smallest file tried takes {found:,.0f} bytes, expected {most:,}, less metadata"
         )
     return best
 
