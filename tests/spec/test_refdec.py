@@ -25,7 +25,13 @@ SPEC = Path(__file__).parents[2] / "spec"
 TEXT = (SPEC / "format.md").read_text(encoding="utf-8")
 SOURCE = (SPEC / "refdec.py").read_text(encoding="utf-8")
 
-CODINGS = {"ans best": {}, "ans gauss": {"priors": "gauss"}, "lzma": {"mode": "lzma"}, "slices": {"slices": 1500}}
+CODINGS = {
+    "ans best": {},
+    "ans gauss": {"priors": "gauss"},
+    "lzma": {"mode": "lzma"},
+    "slices": {"slices": 1500},
+    "fills": {"slices": 1500, "fill": lambda prefix: (prefix.level, 0, 255)},
+}
 
 
 @given(scenes(), st.sampled_from(sorted(CODINGS)))
