@@ -31,6 +31,7 @@ from pd4dgs_codec.scene import Scene
 
 GOALS = (34, 38, 42, 46)  #: dB of the curve
 GOAL, STILL_GOAL = 43, 50  #: dB of the table
+UP = (0.0, 0.0, 1.0)  #: of the sample
 FRAMES, EYES = 149, 6  #: of the sample, and viewpoints from which it is exported
 FAINT = 1e-4  #: opacity of the sample's Gaussians in frames that do not show them
 SEEDS, FPS = 3, 30.0
@@ -195,7 +196,7 @@ def others(model: Teacher, place: Path, times: Sequence[float], seconds: float) 
 
 def measured(name: str, source: str, goal: float, *, held_out: Path | None = None, peers: bool = True) -> Row:
     """One source: its file, and those of other formats. held_out: a folder with the frames between the source's."""
-    options = ("--fps", FPS / 2) if held_out else ()
+    options = ("--fps", FPS / 2, "--up", "0,0,1") if held_out else ()
     data, report = packed(source, "--psnr", goal, *options)
     scene, model = scene_of(data), read_model(source, FPS)
     top = str(max(map(int, report["psnr"])))
@@ -253,7 +254,7 @@ def draw_beside(frames: Path, data: bytes, path: Path) -> None:
     """Source and file at three instants, side by side."""
     model, scene, rows = read_model(str(frames), FPS), scene_of(data), []
     middle = model.splats(model.nearest(0.5))
-    cameras, _ = cameras_of(frames, middle.means[middle.opacities > 0.1], Options(views=20, size=(240, 240)))
+    cameras, _ = cameras_of(frames, middle.means[middle.opacities > 0.1], Options(views=20, size=(240, 240), up=UP))
     for t in (0.1, 0.5, 0.9):
         at = model.nearest(t)
         pair = [picture(splats, cameras[8], (1.0, 1.0, 1.0)) for splats in (model.splats(at), scene.splats(at)[0])]
@@ -285,7 +286,7 @@ def main() -> None:
         print(text(rows), flush=True)
         if args.pictures:
             for name, source in (("dancer", str(half)), ("bouncing bodies", "direct:bouncing_0")):
-                made = [(goal, *packed(source, "--psnr", goal)) for goal in GOALS]
+                made = [(goal, *packed(source, "--psnr", goal, "--up", "0,0,1")) for goal in GOALS]
                 curves[name] = [(len(data), report["psnr"][max(report["psnr"])]) for _, data, report in made]
                 if source == str(half):
                     draw_beside(half, made[-2][1], args.pictures / "import.jpg")
