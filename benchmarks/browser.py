@@ -8,6 +8,7 @@ import contextlib
 import io
 import os
 import shutil
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -31,6 +32,7 @@ FLAGS = [
 ]
 #: A busy machine may take long over a picture; only a hang takes this long, milliseconds.
 TIMEOUT_MS = 120_000
+POLL_MS = 50
 #: Other viewers, by the name of their harness in player/test-browser/, and what it imports of player/node_modules.
 VIEWERS = {
     "spark": ("three", "@sparkjsdev/spark"),
@@ -73,7 +75,16 @@ def call(page: Any, script: str, *args: Any) -> Any:
 
 def wait_for_level(page: Any, level: int) -> None:
     """Until the element of a page shows a level."""
-    page.wait_for_function(f"{ELEMENT}?.player?.status.level === {level}")
+    until(page, f"{ELEMENT}?.player?.status.level === {level}")
+
+
+def until(page: Any, expression: str, timeout_ms: float = TIMEOUT_MS) -> None:
+    """Until an expression holds in a page. Playwright's own wait evaluates it there, which policies of pages forbid."""
+    deadline = time.monotonic() + timeout_ms / 1000
+    while not page.evaluate(expression):
+        if time.monotonic() > deadline:
+            raise TimeoutError(expression)
+        page.wait_for_timeout(POLL_MS)
 
 
 def pixels(text: str, width: int, height: int) -> np.ndarray:

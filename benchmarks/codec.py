@@ -1,4 +1,4 @@
-"""The codec: error against run time, extreme cases, speed, other coders, exported files and batches."""
+"""The codec: error against run time, speed, other coders, exported files and batches."""
 
 from __future__ import annotations
 
@@ -73,33 +73,6 @@ def error_pictures(rows: Sequence[Row], folder: Path) -> list[str]:
     """The plots that the reports drew."""
     scenes = dict.fromkeys(row["scene"] for row in rows)
     return [f"error-{kind}-{scene}.png" for scene in scenes for kind in ("codec", "render")]
-
-
-# -- extreme cases -----------------------------------------------------------------------------------------------------
-
-
-def measure_stability(run: Run, scene: None) -> list[Row]:
-    """A row per group of `pd4dgs-bench stability`, which fails if any case does."""
-    cases = command("bench", "stability", *(("--only", "masks") if run.quick else ()))["rows"]
-    rows = []
-    for group in dict.fromkeys(case["group"] for case in cases):
-        own = [case for case in cases if case["group"] == group]
-        shares = [
-            c["error"] / c["bound"] for c in own if c["status"] == "pass" and c["bound"] and c["error"] is not None
-        ]
-        counts = {status: sum(c["status"] == status for c in own) for status in ("pass", "refused", "fail")}
-        rows.append({"group": group, "largest": max(shares, default=None)} | counts)
-    return rows
-
-
-def stability_text(rows: Sequence[Row]) -> str:
-    """Counts, and how close the worst case comes to its bound."""
-    cells = [(r["group"], r["pass"], r["refused"], r["fail"], number(r["largest"], 3)) for r in rows]
-    head = ("group", "within the bound", "refused", "failed", "largest error / bound")
-    return (
-        "`pd4dgs-bench stability` compares extreme cases with references in high precision; "
-        f"[robustness and stability](robustness.md) explains it.\n\n{table(head, cells)}"
-    )
 
 
 # -- speed -------------------------------------------------------------------------------------------------------------
@@ -263,11 +236,10 @@ def measure_export(run: Run, scene: Scene) -> list[Row]:
     """A row per kind of file, of one instant or of two frames a second."""
     file = run.packed(scene)
     rows: list[Row] = [{"scene": scene.name, "kind": "pd4, all instants and views", "bytes": file.stat().st_size}]
-    steps = ("--refine", 2, "--sh", 0) if run.quick else ()
     for kind, options in list(KINDS.items())[: 1 if run.quick else None]:
         output = file.with_name(f"exported.{kind}")
         compare = ("--compare", scene.source) if kind == "ply" else ()
-        found = command("export", file, "-o", output, "--to", kind, *options, *scene.data, *steps, *compare, "-f")
+        found = command("export", file, "-o", output, "--to", kind, *options, *scene.data, *compare, "-f")
         keys = ("frames", "gaussians", "bytes", "seconds", "cost")
         rows.append({"scene": scene.name, "kind": kind} | {key: found[key] for key in keys if key in found})
     return rows
@@ -283,7 +255,7 @@ def export_text(rows: Sequence[Row]) -> str:
         cells.append((row["scene"], row["kind"], *numbers, told))
     head = ("scene", "file", "frames", "Gaussians", "bytes", "s", "held-out mPSNR dB")
     return (
-        "`pd4dgs-export` with spherical harmonics of degree 3, refined on the training cameras. The last column "
+        "`pd4dgs-export` with spherical harmonics of degree 3, seen by the training cameras. The last column "
         f"compares the scene with exports at the instants of the held-out views.\n\n{table(head, cells)}"
     )
 
@@ -320,7 +292,6 @@ def batch_text(rows: Sequence[Row]) -> str:
 
 
 ERROR = Benchmark("error-time", "Error against run time", ONE, measure_error, error_text, error_pictures)
-STABILITY = Benchmark("stability", "Extreme cases", (), measure_stability, stability_text)
 SPEED = Benchmark("speed", "Speed", TWO, measure_speed, speed_text)
 CODERS = Benchmark("rivals", "Other coders", TWO, measure_coders, coders_text)
 EXPORT = Benchmark("export", "Exported files", ("orbit",), measure_export, export_text, measured=package("export"))

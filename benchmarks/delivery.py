@@ -19,7 +19,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from browser import ELEMENT, TIMEOUT_MS, launched
+from browser import ELEMENT, TIMEOUT_MS, launched, until
 from common import ONE, TWO, Benchmark, Row, Run, Scene, command, levels, number, package, seconds_at, table
 
 from pd4dgs_codec.bench.latency import python
@@ -164,7 +164,7 @@ def measure_player(run: Run, scene: Scene) -> list[Row]:
         with served(folder) as url:
             page = opened(browser)
             page.goto(f"{url}?bench&sizes={SIZES}")
-            page.wait_for_function("!!window.benchResult", timeout=5 * TIMEOUT_MS)
+            until(page, "!!window.benchResult", 5 * TIMEOUT_MS)
             rows += [{"what": "rate"} | row for row in page.evaluate("benchResult.rows")]
             page.context.close()
         version = f"Chromium {browser.version.split('.')[0]}"
@@ -183,7 +183,7 @@ def first_pictures(browser: Any, url: str, last: int) -> list[Row]:
     page = opened(browser)
     page.add_init_script(NOTE)
     page.goto(f"{url}?autoplay=0")
-    page.wait_for_function(f"noted.some(({{ level }}) => level === {last})")
+    until(page, f"noted.some(({{ level }}) => level === {last})")
     noted: list[Row] = page.evaluate("noted")
     page.context.close()
     return noted
@@ -233,7 +233,7 @@ def measure_paint(folder: Path, out: Path, visits: int = 5) -> list[Row]:
                     page = opened(browser)
                     page.add_init_script(NOTE)
                     page.goto(f"{url}?autoplay=0", wait_until="commit")
-                    page.wait_for_function("noted.length")
+                    until(page, "noted.length")
                     seen.append((page.evaluate(PAINTED), page.evaluate("noted[0].shown")))
                     page.context.close()
                 painted, drawn = ((median(times), min(times)) for times in zip(*seen, strict=True))
@@ -246,7 +246,7 @@ def measure_paint(folder: Path, out: Path, visits: int = 5) -> list[Row]:
                     time.sleep(max(0.0, start + seconds - time.time()))
                     shot = base64.b64decode(camera.send("Page.captureScreenshot")["data"])
                     (out / f"{out_names[rate]}-{seconds:g}s.png").write_bytes(shot)
-                page.wait_for_function(f"{ELEMENT}?.player?.status.level >= 0")
+                until(page, f"{ELEMENT}?.player?.status.level >= 0")
                 page.evaluate(f"{ELEMENT}.player.settled()")
                 page.screenshot(path=out / f"{out_names[rate]}-end.png")
                 page.context.close()

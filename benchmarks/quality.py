@@ -106,7 +106,7 @@ def monolithic_bytes(path: Path) -> int:
 
 def curve(model: Path) -> list[Row]:
     """seconds and psnr per level of the evaluations during a training."""
-    (found,) = command("bench", "train", "--from", model)["runs"]
+    (found,) = command("bench", "train", model)["runs"]
     return [{"seconds": point["seconds"], "psnr": point["psnr"]} for point in found["curve"]]
 
 

@@ -33,15 +33,17 @@ from pd4dgs_codec.batch.job import OPS, read_manifest
 from pd4dgs_codec.data import colmap
 from pd4dgs_codec.data.captures import _panoptic_points
 from pd4dgs_codec.data.dataset import load
-from pd4dgs_codec.data.files import image_info, read_image, read_npy
+from pd4dgs_codec.data.files import image_info, read_image, read_mask, read_npy
 from pd4dgs_codec.data.videos import open_video
+from pd4dgs_codec.data.view import Lens, UnreadView, read_view
 from pd4dgs_codec.errors import Pd4Error
 from pd4dgs_codec.format import canonical
 from pd4dgs_codec.format.container import read_preamble, write_chunk, write_preamble
 from pd4dgs_codec.format.header import scene_id_of
 from pd4dgs_codec.interchange import runs
-from pd4dgs_codec.interchange.splats import Splats, fourdgs_bytes, read_splats
+from pd4dgs_codec.interchange.splats import fourdgs_bytes, read_splats
 from pd4dgs_codec.interchange.teacher import read_model
+from pd4dgs_codec.kinds.splats import Splats
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.quality.frames import write_mp4
 from pd4dgs_codec.web.client import SceneClient
@@ -90,6 +92,20 @@ def blank_png(width: int, height: int) -> bytes:
     stream = io.BytesIO()
     Image.new("1", (width, height)).save(stream, "png")
     return stream.getvalue()
+
+
+def blank_tiff(width: int, height: int) -> bytes:
+    """A TIFF file of one colour, deflated, in one strip."""
+    stream = io.BytesIO()
+    Image.new("RGB", (width, height)).save(stream, "tiff", compression="tiff_adobe_deflate", tiffinfo={278: height})
+    return stream.getvalue()
+
+
+def huge_tile(side: int) -> bytes:
+    """A TIFF file of 16 x 16 pixels in a tile of side x side."""
+    tags = {256: 16, 257: 16, 258: 8, 259: 5, 262: 1, 277: 1, 322: side, 323: side, 324: 8, 325: 64}
+    rows = b"".join(struct.pack("<HHII", tag, 4, 1, value) for tag, value in tags.items())
+    return b"II*\0" + struct.pack("<IH", 8, len(tags)) + rows + bytes(64)
 
 
 def many_scans(side: int) -> bytes:
@@ -194,6 +210,13 @@ def read_picture(path: Path) -> None:
     read_image(path, image_info(path)[:2])
 
 
+def read_distorted(path: Path) -> None:
+    """A picture through a lens that distorts, at 1/64 of its size."""
+    width, height, _ = image_info(path)
+    lens = Lens(width, height, width, width, width / 2, height / 2, radial=(0.1, 0.0, 0.0))
+    read_view(UnreadView("x", 0, None, np.eye(4), lens, path), 0.0, 64, None)
+
+
 def read_film(path: Path) -> None:
     """Every frame of a video, one at a time."""
     for _ in open_video(path).pictures:
@@ -270,6 +293,10 @@ CASES: dict[str, tuple[str, Callable[[], bytes], Callable[[Path], object]]] = {
     ),
     "picture: 16 megapixels (PNG)": ("x.png", lambda: blank_png(4096, 4096), read_picture),
     "picture: 177 megapixels (PNG)": ("x.png", lambda: blank_png(16384, 10800), read_picture),
+    "picture: 16 megapixels, to undistort (PNG)": ("x.png", lambda: blank_png(4096, 4096), read_distorted),
+    "picture: 16 megapixels in one strip (TIFF)": ("x.tif", lambda: blank_tiff(4096, 4096), read_picture),
+    "picture: a tile of 716 megapixels (TIFF)": ("x.tif", lambda: huge_tile(26752), read_picture),
+    "mask: 16 megapixels (PNG)": ("x.png", lambda: blank_png(4096, 4096), lambda path: read_mask(path, (4096, 4096))),
     "picture: 16 megapixels in 100 scans (JPEG)": ("x.jpg", lambda: many_scans(4096), read_picture),
     "video: 30 blank frames of 2048 x 2048": ("x.mp4", lambda: blank_film(2048, 30), read_film),
     "library: lists in lists": ("a/index.json", lambda: b"[" * MEGABYTE, lambda path: library(path.parent.parent)),

@@ -44,7 +44,6 @@ ALL = (
     selection.BENCHMARK,
     paper.PAPER,
     paper.DIAL,
-    codec.STABILITY,
     codec.CODERS,
     codec.SPEED,
     codec.ERROR,

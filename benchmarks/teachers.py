@@ -20,7 +20,8 @@ from common import command
 from torch import Tensor, nn
 from torch.nn import functional
 
-from pd4dgs_codec.interchange.splats import SH_C0, Splats, ply_bytes, sphere
+from pd4dgs_codec.interchange.splats import ply_bytes, sphere
+from pd4dgs_codec.kinds.splats import SH_C0, Splats
 
 OPTIONS = {
     "no_dx": False, "no_ds": False, "no_dr": False, "no_do": True, "no_dshs": True, "no_grid": False, "grid_pe": 0,

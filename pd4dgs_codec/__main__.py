@@ -17,7 +17,7 @@ VERBS = {
     "eval": "measure quality, bytes and time of each level on a dataset",
     "import": "import a Scaffold-GS model",
     "export": "export a scene as Gaussians for other viewers",
-    "bench": "measure error against run time, stability and latency",
+    "bench": "measure error against run time, and latency",
     "package": "make a folder for web servers, with a page, DASH and HLS",
     "serve": "serve a folder over HTTP, with an optional rate limit",
     "view": "show a scene in the browser",

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -202,7 +202,7 @@ class SceneInfo:
     voxel_size: float  #: scene units; anchors are integer multiples of it
     box: np.ndarray  #: float32 [2, 3], lower and upper corner; the HexPlanes' normalisation box, scene units
     time_range: tuple[float, float]  #: seconds; normalised time 0 and 1
-    background: tuple[float, float, float]  #: RGB as displayed, 0..1, behind every Gaussian
+    background: tuple[float, float, float]  #: RGB as displayed, 0..1, behind every Gaussian of a complete file
     near: float
     far: float
     up: tuple[float, float, float]  #: world direction
@@ -339,41 +339,58 @@ class Grading:
     centre: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class Scene:
-    """A scene, or a prefix of one, that consists of the layers `layers`.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class LayeredScene:
+    """What scenes of all kinds have in common. A scene, or a prefix of one, consists of the layers `layers`.
 
     layers: ascending layer numbers present, starting with 0, e.g. (0,), (0, 1), (0, 2), (0, 1, 2).
     rows: rows[i] = number of anchors in the prefix that ends with layers[i].
-    anchor_q: int32 [N, 3] voxel indices; position = anchor_q * voxel_size, world, scene units.
-    feature: float32 [N, D]. scaling_log: float32 [N, 6], natural log of scene units (0..2 spread of the offsets,
-    3..5 base scale). offset: float32 [N, G, 3], in units of exp(scaling_log[:3]).
+    anchor_q: int32 [N, 3] voxel indices.
     mask: per present layer i, uint8 [rows[i]] codes (see MASK_STEP), non-decreasing from layer to layer.
-    networks: "opacity", "covariance", "color". global_deformation belongs to layer 1, local_deformation to layer 2;
-    each may be None (left out). The trunk of layer 2 reads the planes of layer 1 as well, see `motion`.
-    grading: None if all anchors have the same steps.
+    grading: None if all anchors have the same steps. fills: per present layer, the background while this layer is the
+    highest one, RGB 0..255; None for that of `info`. Without entries all are None.
     """
 
     info: SceneInfo
-    steps: Steps
     layers: tuple[int, ...]
     rows: tuple[int, ...]
     anchor_q: np.ndarray
-    feature: np.ndarray
-    scaling_log: np.ndarray
-    offset: np.ndarray
     mask: tuple[np.ndarray, ...]
-    networks: dict[str, Network]
-    global_deformation: Deformation | None = None
-    local_deformation: Deformation | None = None
     grading: Grading | None = None
+    fills: tuple[tuple[int, int, int] | None, ...] = ()
 
     @property
-    def widths(self) -> Widths:
-        """Sizes read from the arrays; a network with more inputs than the feature takes the view direction."""
-        inputs = {name: network[0][0].shape[1:] for name, network in self.networks.items() if network}
-        viewing = tuple(name for name in SCAFFOLD_NETWORKS if inputs.get(name) != self.feature.shape[1:])
-        return Widths(self.feature.shape[1], self.offset.shape[1], self.grading is not None, viewing)
+    def attributes(self) -> dict[str, np.ndarray]:
+        """Arrays float32 [N, ...] by attribute name, in coding order."""
+        raise NotImplementedError
+
+    @property
+    def row_steps(self) -> dict[str, float]:
+        """Quantisation steps by attribute name."""
+        raise NotImplementedError
+
+    def scaled(self: S, factor: float) -> S:
+        """Returns the scene with every step times `factor`, rounded to binary32."""
+        raise NotImplementedError
+
+    def of_anchors(self, rows: np.ndarray | slice) -> dict[str, Any]:
+        """Returns the fields of the anchors `rows`, without masks, as arguments of `dataclasses.replace`."""
+        raise NotImplementedError
+
+    def of_layers(self) -> dict[str, Any]:
+        """Returns the deformations without those of absent layers, as arguments of `dataclasses.replace`."""
+        raise NotImplementedError
+
+    def _evaluated(self, t: float, eye: np.ndarray) -> Gaussians:
+        """Returns the visible Gaussians of the highest level, seen from `eye` float32 [3]."""
+        raise NotImplementedError
+
+    def background(self, level: int = 2) -> tuple[float, float, float]:
+        """Returns what is behind every Gaussian at a level, RGB as displayed, 0..1: the fill of an incomplete file, or
+        the background of `info`."""
+        fill = [fill for layer, fill in zip(self.layers, self.fills, strict=False) if layer <= level][-1:]
+        red, green, blue = [code / 255 for code in fill[0]] if fill and fill[0] else self.info.background
+        return red, green, blue
 
     @property
     def level(self) -> int:
@@ -382,7 +399,7 @@ class Scene:
 
     @property
     def anchor(self) -> np.ndarray:
-        """float32 [N, 3] anchor positions, world, scene units, computed at each access."""
+        """float32 [N, 3] positions of the anchors at rest, world, scene units, computed at each access."""
         return self.anchor_at(slice(None))
 
     def anchor_at(self, rows: np.ndarray | slice) -> np.ndarray:
@@ -393,12 +410,87 @@ class Scene:
         return position
 
     @property
+    def active(self) -> np.ndarray:
+        """int64 [n]: the anchors active at the highest level, ascending."""
+        return np.flatnonzero(self.mask[-1] * MASK_STEP > MASK_THRESHOLD)
+
+    def at(self: S, t: float, level: int | None) -> S:
+        """Returns the prefix to draw at a level, None for the highest. Raises RenderError unless normalised time t is
+        from 0 to 1 and the level 0, 1 or 2."""
+        if not 0 <= t <= 1:
+            low, high = self.info.time_range
+            raise RenderError(f"time is {t:g}, expected 0 to 1, from {low:g} to {high:g} s of the scene")
+        if level not in (None, 0, 1, 2):
+            raise RenderError(f"level is {level}, expected 0, 1, 2 or None for the highest")
+        return self if level is None else self.prefix(level)
+
+    def gaussians(self, t: float, level: int | None = None, eye: Vector | None = None) -> Gaussians:
+        """Returns the visible Gaussians at normalised time t in 0..1, evaluated by numpy alone.
+
+        level: 0, 1 or 2, by default the highest; a level that the scene lacks equals the one below. eye: centre [3] of
+        the camera, world, on which colours depend, and of a scaffold opacities and sizes as far as `widths.viewing`
+        says; by default that of the file's camera, without one the middle of the box. Raises RenderError for other
+        values.
+        """
+        scene, info = self.at(t, level), self.info
+        if eye is None:
+            eye = info.box.mean(axis=0) if info.camera is None else info.camera.eye
+        centre = np.asarray(eye, np.float32)
+        if centre.shape != (3,) or not np.isfinite(centre).all():
+            raise RenderError(f"eye is {centre.tolist()}, expected 3 finite numbers")
+        with np.errstate(all="ignore"):
+            return scene._evaluated(t, centre)
+
+    def full_masks(self) -> list[np.ndarray]:
+        """Returns mask codes uint8 [N] per layer present; anchors that a layer's prefix lacks have code 0."""
+        return [np.concatenate([codes, np.zeros(self.rows[-1] - codes.size, np.uint8)]) for codes in self.mask]
+
+    def prefix(self: S, max_layer: int) -> S:
+        """Returns the layers <= max_layer, or `self` if it has no others. Raises ValueError if max_layer < 0."""
+        n = sum(layer <= max_layer for layer in self.layers)
+        if n == len(self.layers):
+            return self
+        if n == 0:
+            raise ValueError(f"max_layer must be >= 0, found {max_layer}")
+        kept: dict[str, Any] = {name: getattr(self, name)[:n] for name in ("layers", "rows", "mask", "fills")}
+        part = replace(self, **kept, **self.of_anchors(slice(self.rows[n - 1])))
+        return replace(part, **part.of_layers())
+
+
+S = TypeVar("S", bound=LayeredScene)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Scene(LayeredScene):
+    """A scene of the kind scaffold: anchors, each of which spawns G Gaussians by networks.
+
+    anchor_q: position = anchor_q * voxel_size, world, scene units.
+    feature: float32 [N, D]. scaling_log: float32 [N, 6], natural log of scene units (0..2 spread of the offsets,
+    3..5 base scale). offset: float32 [N, G, 3], in units of exp(scaling_log[:3]).
+    networks: "opacity", "covariance", "color". global_deformation belongs to layer 1, local_deformation to layer 2;
+    each may be None (left out). The trunk of layer 2 reads the planes of layer 1 as well, see `motion`.
+    """
+
+    steps: Steps
+    feature: np.ndarray
+    scaling_log: np.ndarray
+    offset: np.ndarray
+    networks: dict[str, Network]
+    global_deformation: Deformation | None = None
+    local_deformation: Deformation | None = None
+
+    @property
+    def widths(self) -> Widths:
+        """Sizes read from the arrays; a network with more inputs than the feature takes the view direction."""
+        inputs = {name: network[0][0].shape[1:] for name, network in self.networks.items() if network}
+        viewing = tuple(name for name in SCAFFOLD_NETWORKS if inputs.get(name) != self.feature.shape[1:])
+        return Widths(self.feature.shape[1], self.offset.shape[1], self.grading is not None, viewing)
+
+    @property
     def attributes(self) -> dict[str, np.ndarray]:
-        """Arrays float32 [N, ...] by attribute name."""
         return {name: getattr(self, name) for name in ATTRIBUTES}
 
     def of_anchors(self, rows: np.ndarray | slice) -> dict[str, Any]:
-        """Returns the fields of the anchors `rows`, without masks, as arguments of `dataclasses.replace`."""
         grading = None if self.grading is None else replace(self.grading, classes=self.grading.classes[rows])
         attributes = {name: values[rows] for name, values in self.attributes.items()}
         return {"anchor_q": self.anchor_q[rows], **attributes, "grading": grading}
@@ -413,88 +505,44 @@ class Scene:
         found = [one for one in (self.global_deformation, self.local_deformation)[:layer] if one is not None]
         return replace(found[-1], planes=tuple(s for one in found for s in one.planes)) if found else None
 
-    def at(self, t: float, level: int | None) -> Scene:
-        """Returns the prefix to draw at a level, None for the highest. Raises RenderError unless normalised time t is
-        from 0 to 1 and the level 0, 1 or 2."""
-        if not 0 <= t <= 1:
-            low, high = self.info.time_range
-            raise RenderError(f"time is {t:g}, expected 0 to 1, from {low:g} to {high:g} s of the scene")
-        if level not in (None, 0, 1, 2):
-            raise RenderError(f"level is {level}, expected 0, 1, 2 or None for the highest")
-        return self if level is None else self.prefix(level)
-
-    def gaussians(self, t: float, level: int | None = None, eye: Vector | None = None) -> Gaussians:
-        """Returns the visible Gaussians at normalised time t in 0..1, evaluated by numpy alone.
-
-        level: 0, 1 or 2, by default the highest; a level that the scene lacks equals the one below. eye: centre [3] of
-        the camera, world, on which colours depend, and opacities and sizes as far as `widths.viewing` says; by default
-        that of the file's camera, without one the middle of the box. Raises RenderError for other values.
-        """
-        scene, info, slots = self.at(t, level), self.info, self.widths.slots
-        if eye is None:
-            eye = info.box.mean(axis=0) if info.camera is None else info.camera.eye
-        centre = np.asarray(eye, np.float32)
-        if centre.shape != (3,) or not np.isfinite(centre).all():
-            raise RenderError(f"eye is {centre.tolist()}, expected 3 finite numbers")
-        rows = np.flatnonzero(scene.mask[-1] * MASK_STEP > MASK_THRESHOLD)
-        mask, values = scene.mask[-1][rows] * MASK_STEP, {"length": scene.anchor_at(rows)}
-        values |= {name: array[rows].reshape(len(rows), -1) for name, array in scene.attributes.items()}
-        with np.errstate(all="ignore"):
-            if motion := scene.motion(scene.level):
-                for unit, added in motion.residuals(values["length"], t, info.box).items():
-                    values[unit] = values[unit] + added
-            position, extent = values["length"], np.exp(values["scaling_log"])
-            inputs = np.concatenate([values["feature"], _unit(position - centre)], axis=1)
-            networks = [scene.networks[name] for name in SCAFFOLD_NETWORKS]
-            outputs = [_perceptron(network, inputs[:, : network[0][0].shape[1]]) for network in networks]
-            opacity = np.tanh(outputs[0])
-            seen = opacity * mask[:, None] >= np.float32(MIN_OPACITY)
-            owner, slot = np.nonzero(seen)
-            shape, color = (values.reshape(*seen.shape, -1)[seen] for values in outputs[1:])
-            offset = values["offset"].reshape(*seen.shape, 3)[seen]
-            return Gaussians(
-                means=position[owner] + offset * extent[owner, :3],
-                quats=_unit(shape[:, 3:]),
-                scales=extent[owner, 3:] / (1 + np.exp(-shape[:, :3])) * mask[owner, None],
-                opacities=opacity[seen] * mask[owner],
-                colors=1 / (1 + np.exp(-color)),
-                slots=rows[owner] * slots + slot,
-            )
-
-    def full_masks(self) -> list[np.ndarray]:
-        """Returns mask codes uint8 [N] per layer present; anchors that a layer's prefix lacks have code 0."""
-        return [np.concatenate([codes, np.zeros(self.rows[-1] - codes.size, np.uint8)]) for codes in self.mask]
-
-    def tensors(self, layer: int) -> Deformation:
-        """Returns the planes and networks of layer 0, 1 or 2. Layer 0 has no planes; a layer without a deformation has
-        neither planes nor networks."""
-        if layer == 0:
-            return Deformation((), self.networks)
-        return self.deformation(layer) or Deformation((), {})
-
-    def with_tensors(self, layer: int, tensors: Deformation | None) -> Scene:
-        """Returns the scene with these planes and networks in a layer; None removes the deformation of layer 1 or 2."""
-        if layer == 1:
-            return replace(self, global_deformation=tensors)
-        if layer == 2:
-            return replace(self, local_deformation=tensors)
-        assert tensors is not None and not tensors.planes
-        return replace(self, networks=tensors.networks)
-
-    def prefix(self, max_layer: int) -> Scene:
-        """Returns the layers <= max_layer, or `self` if it has no others. Raises ValueError if max_layer < 0."""
-        n = sum(layer <= max_layer for layer in self.layers)
-        if n == len(self.layers):
-            return self
-        if n == 0:
-            raise ValueError(f"max_layer must be >= 0, found {max_layer}")
-        rows = self.rows[n - 1]
-        return replace(
-            self,
-            layers=self.layers[:n],
-            rows=self.rows[:n],
-            mask=self.mask[:n],
-            global_deformation=self.global_deformation if 1 in self.layers[:n] else None,
-            local_deformation=self.local_deformation if 2 in self.layers[:n] else None,
-            **self.of_anchors(slice(rows)),
+    def _evaluated(self, t: float, eye: np.ndarray) -> Gaussians:
+        slots, rows = self.widths.slots, self.active
+        mask, values = self.mask[-1][rows] * MASK_STEP, {"length": self.anchor_at(rows)}
+        values |= {name: array[rows].reshape(len(rows), -1) for name, array in self.attributes.items()}
+        if motion := self.motion(self.level):
+            for unit, added in motion.residuals(values["length"], t, self.info.box).items():
+                values[unit] = values[unit] + added
+        position, extent = values["length"], np.exp(values["scaling_log"])
+        inputs = np.concatenate([values["feature"], _unit(position - eye)], axis=1)
+        networks = [self.networks[name] for name in SCAFFOLD_NETWORKS]
+        outputs = [_perceptron(network, inputs[:, : network[0][0].shape[1]]) for network in networks]
+        opacity = np.tanh(outputs[0])
+        seen = opacity * mask[:, None] >= np.float32(MIN_OPACITY)
+        owner, slot = np.nonzero(seen)
+        shape, color = (values.reshape(*seen.shape, -1)[seen] for values in outputs[1:])
+        offset = values["offset"].reshape(*seen.shape, 3)[seen]
+        return Gaussians(
+            means=position[owner] + offset * extent[owner, :3],
+            quats=_unit(shape[:, 3:]),
+            scales=extent[owner, 3:] / (1 + np.exp(-shape[:, :3])) * mask[owner, None],
+            opacities=opacity[seen] * mask[owner],
+            colors=1 / (1 + np.exp(-color)),
+            slots=rows[owner] * slots + slot,
         )
+
+    def with_deformation(self, layer: int, deformation: Deformation | None) -> Scene:
+        """Returns the scene with this deformation in layer 1 or 2."""
+        if layer == 1:
+            return replace(self, global_deformation=deformation)
+        return replace(self, local_deformation=deformation)
+
+    def of_layers(self) -> dict[str, Any]:
+        names = ("global_deformation", "local_deformation")
+        return {name: getattr(self, name) if layer in self.layers else None for layer, name in enumerate(names, 1)}
+
+    @property
+    def row_steps(self) -> dict[str, float]:
+        return self.steps.attributes
+
+    def scaled(self, factor: float) -> Scene:
+        return replace(self, steps=self.steps.scaled(factor))

@@ -7,7 +7,7 @@ import { GSPLATDATA_LARGE, GSplatContainer, GSplatFormat, PIXELFORMAT_RGBA32F } 
 import { defaultCamera, fitted } from "./render/camera.js";
 import { Playback, poseOf } from "./render/playback.js";
 /** @import { AppBase, Asset, CameraComponent, Entity, Texture } from "playcanvas" */
-/** @import { Camera } from "./decode/scene.js" */
+/** @import { Camera } from "./decode/tensors.js" */
 /** @import { Gaussians } from "./render/playback.js" */
 
 /** Textures of floats, one for each array of Gaussians. */
@@ -81,6 +81,8 @@ export class Pd4 extends Script {
   _playback = null;
   /** @type {GSplatContainer | null} */
   _container = null;
+  /** The camera whose background changes with the Gaussians. @type {CameraComponent | null} */
+  _seenThrough = null;
   /** Whether the frame shows the newest Gaussians, null: no camera has drawn them. @type {boolean | null} */
   _current = null;
   /** Called when a frame shows the newest Gaussians. */
@@ -142,9 +144,9 @@ export class Pd4 extends Script {
    * @param {Entity} entity with a camera @param {Camera} [view]
    */
   lookThrough(entity, view) {
-    const { info } = this;
+    const { info, playback } = this;
     const { camera } = entity;
-    if (!info || !camera) throw new Error("lookThrough: expected a loaded scene and an entity with a camera");
+    if (!info || !playback || !camera) throw new Error("lookThrough: expected a loaded scene and an entity with a camera");
     const seen = view ?? defaultCamera(info);
     const world = this.entity.getWorldTransform();
     const pose = new Mat4().mul2(world, new Mat4().set(poseOf(seen)));
@@ -153,7 +155,8 @@ export class Pd4 extends Script {
     entity.setEulerAngles(pose.getEulerAngles());
     camera.nearClip = Math.max(info.near, 1e-6) * scale;
     camera.farClip = info.far * scale;
-    camera.clearColor = new Color(...info.background);
+    this._seenThrough = camera;
+    camera.clearColor = new Color(playback.fill);
     const { width, height } = this.app.graphicsDevice;
     camera.fov = (360 / Math.PI) * Math.atan(height / 2 / fitted(seen, width, height).K[4]);
   }
@@ -201,6 +204,7 @@ export class Pd4 extends Script {
     }
     if (count) container.aabb.setMinMax(low, high);
     container.update(count);
+    if (this._seenThrough) this._seenThrough.clearColor = new Color(gaussians.fill);
     this.app.renderNextFrame = true;
     return new Promise((resolve) => (this._seen = resolve));
   }

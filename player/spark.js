@@ -3,7 +3,7 @@
 
 import { defaultCamera, fitted, unit } from "./render/camera.js";
 import { Playback, poseOf } from "./render/playback.js";
-/** @import { Camera } from "./decode/scene.js" */
+/** @import { Camera } from "./decode/tensors.js" */
 /** @import { Gaussians, PlaybackOptions } from "./render/playback.js" */
 
 /**
@@ -49,6 +49,7 @@ export class Pd4Splats extends Playback {
     this._splats = new spark.ExtSplats();
     /** A SplatMesh of Spark. */
     this.mesh = new spark.SplatMesh({ extSplats: this._splats });
+    this._background = new THREE.Color();
     this._lastFrame = performance.now();
   }
 
@@ -57,9 +58,9 @@ export class Pd4Splats extends Playback {
     return this._sceneThere().info;
   }
 
-  /** The colour behind the scene, for `scene.background`. */
+  /** The colour behind the Gaussians, for `scene.background`: one object, which changes with them. */
   get background() {
-    return new this._three.Color().setRGB(...this.info.background, this._three.SRGBColorSpace);
+    return this._background.setRGB(...this.fill, this._three.SRGBColorSpace);
   }
 
   /**
@@ -107,8 +108,9 @@ export class Pd4Splats extends Playback {
   }
 
   /** @param {Gaussians} gaussians */
-  _fillMesh({ count, means, scales, quaternions, colors }) {
+  _fillMesh({ count, means, scales, quaternions, colors, fill }) {
     const { Vector3, Quaternion, Color } = this._three;
+    this._background.setRGB(...fill, this._three.SRGBColorSpace);
     const [centre, size, quaternion, color] = [new Vector3(), new Vector3(), new Quaternion(), new Color()];
     const splats = this._splats;
     const [before] = splats.extArrays;

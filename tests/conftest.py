@@ -32,7 +32,8 @@ ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT / name) for name in ("tools", "spec", "benchmarks")]
 
 #: Rooms that need the extra `train`; without it their tests are not even collected.
-NEED_TRAIN = ["batch", "bench", "benchmarks", "cli", "data", "interchange", "model", "draw", "quality", "train"]
+NEED_TRAIN = ["batch", "bench", "benchmarks", "cli", "data", "interchange", "model", "draw", "quality"]
+NEED_TRAIN += ["stability", "train"]
 NEED_FEW_KERNELS = ["entropy", "spec"]
 collect_ignore = [] if find_spec("torch") and find_spec("numba") else NEED_TRAIN
 

@@ -10,14 +10,17 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import cache
+from typing import Any
 
 import numpy as np
 from hypothesis import strategies as st
 
 from pd4dgs_codec import encode
+from pd4dgs_codec.entropy.channels import ChannelReader, ChannelWriter, split
+from pd4dgs_codec.entropy.fitting import Fitted
 from pd4dgs_codec.entropy.priors import norm_cdf28_of_each, tables_of_each
 from pd4dgs_codec.format.info import info as info_of
-from pd4dgs_codec.format.quantise import NO_CLASSES, Grid, attribute_rows, dequantise
+from pd4dgs_codec.format.quantise import NO_CLASSES, Rows, RowTable, dequantise
 from pd4dgs_codec.scene import (
     DEFAULT_WIDTHS,
     INSTANTS,
@@ -128,18 +131,19 @@ def make_scene(
     codes = np.sort(rng.choice(np.array([0, 0, 3, 4, 77, 255], np.uint8), (n, len(layers))), axis=1)
     values = [symbols(rng, (n, *shape), kind) for shape in widths.attributes.values()]
     k = np.concatenate([x.reshape(n, math.prod(x.shape[1:])).T for x in values])
-    centre, classes, grading = np.zeros(widths.channels, np.int32), NO_CLASSES, None
+    centre, classes, grading = None, NO_CLASSES, None
     if widths.graded:
         classes = rng.integers(0, MAX_CLASS + 1, n).astype(np.int32)
+        centre = np.zeros(widths.channels, np.int32)
         if kind == "huge":
             k = k // (1 << classes)
         else:
             centre = rng.integers(-3, 4, widths.channels).astype(np.int32)
-    grid = Grid(steps.attributes, widths, centre)
+    pairs = zip(widths.attributes.values(), steps.attributes.values(), strict=True)
+    table = RowTable(tuple(Rows(i, math.prod(shape), step) for i, (shape, step) in enumerate(pairs)), centre)
     if widths.graded:
-        rows = attribute_rows(centre, widths)
-        values_of_centre = np.concatenate([dequantise(m, steps.attributes[name]) for name, m in rows])
-        grading = Grading(classes.astype(np.uint8), values_of_centre)
+        grading = Grading(classes.astype(np.uint8), table.centre_values)
+    rows = zip(widths.attributes.items(), table.dequantise(table.values(k, classes)), strict=True)
     networks = {
         name: network(rng, (widths.inputs[name], *hidden, outputs), steps.weights_scaffold, kind)
         for name, outputs in widths.networks.items()
@@ -155,7 +159,7 @@ def make_scene(
         layers=layers,
         rows=(n,) * len(layers),
         anchor_q=cells,
-        **grid.dequantise(k, classes),
+        **{name: x.reshape(n, *shape) for (name, shape), x in rows},
         grading=grading,
         mask=tuple(codes.T.copy()),
         networks=networks,
@@ -256,6 +260,21 @@ def assert_same_symbols(found: Sequence[np.ndarray], expected: Sequence[np.ndarr
     for a, b in zip(found, expected, strict=True):
         assert a.dtype == np.int32
         np.testing.assert_array_equal(a, b)
+
+
+def coded(channels: Sequence[np.ndarray], known: list[Fitted] | None = None, **options: Any) -> tuple[bytes, bytes]:
+    """(codes, stream) of channels in one batch. known: the prior list. options: of ChannelWriter."""
+    writer = ChannelWriter(**options)
+    writer.write(channels, [] if known is None else known)
+    return writer.finish()[:2]
+
+
+def decoded(codes: bytes, stream: bytes, counts: Sequence[int]) -> list[np.ndarray]:
+    """The channels of these lengths, the inverse of `coded`."""
+    reader = ChannelReader(codes, stream, sum(counts))
+    symbols = reader.read(counts, [])
+    reader.finish()
+    return split(symbols, counts)
 
 
 def slice_ends(data: bytes) -> list[int]:

@@ -38,7 +38,7 @@ ALLOWED = read_map()
 #: These may import every room but `cli`: what the package measures of itself, its commands, its entry points.
 ABOVE_ALL = {"bench", "cli", "__init__", "__main__"}
 #: Rooms that a decoder is made of, and the libraries that they may use.
-DECODER = ("errors", "scene", "entropy", "format", "web")
+DECODER = ("errors", "scene", "entropy", "format", "kinds", "web")
 LIBRARIES = {"numpy", "constriction", "msgpack", "zstandard"}
 
 
@@ -103,9 +103,12 @@ def test_no_two_modules_need_each_other():
         pytest.fail(f"a circle of imports: {' -> '.join(error.args[1])}")
 
 
-def test_planes_are_used_by_the_deformation_alone():
-    users = {name for name in MODULES if "pd4dgs_codec.format.planes" in imports()[name]}
-    assert users == {"pd4dgs_codec.format.deformation"}
+def test_what_codes_tensors_knows_no_kinds():
+    """Modules of `format` that know kinds make scenes, and nothing below them does."""
+    kinds = {name for name in MODULES if room_of(name) == "kinds"}
+    scenes = {f"pd4dgs_codec.format.{name}" for name in ("check", "decoder", "encoder", "info", "plan")}
+    knowing = {name for name in MODULES if room_of(name) == "format" and imports()[name] & (kinds | scenes)}
+    assert knowing == scenes and not any(imports()[name] & scenes for name in kinds)
 
 
 @pytest.mark.parametrize("room", DECODER)
@@ -139,4 +142,4 @@ def test_decoding_needs_no_torch():
     data = small_file()
     done = subprocess.run([sys.executable, "-c", SCRIPT], input=data, capture_output=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr.decode()
-    assert done.stdout.decode().split() == ["(0,", "1,", "2)", str(len(pd4dgs_codec.decode(data).anchor_q)), "3.0"]
+    assert done.stdout.decode().split() == ["(0,", "1,", "2)", str(len(pd4dgs_codec.decode(data).anchor_q)), "4.0"]

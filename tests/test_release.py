@@ -87,5 +87,8 @@ def test_the_npm_package_has_all_that_it_exports(tmp_path):
 def test_the_wheel_gets_every_package_and_what_the_page_needs():
     listed = set(re.findall(r'^    "(pd4dgs_codec[\w.]*)",$', text("pyproject.toml"), flags=re.MULTILINE))
     rooms = {str(p.parent.relative_to(ROOT)).replace("/", ".") for p in (ROOT / "pd4dgs_codec").rglob("__init__.py")}
-    player = {".".join(["pd4dgs_codec", "player", *Path(part).with_suffix("").parts]) for part in ("decode", "render")}
+    player = {
+        ".".join(["pd4dgs_codec", "player", *Path(part).with_suffix("").parts])
+        for part in ("decode", "kinds", "render")
+    }
     assert listed == rooms | player | {"pd4dgs_codec.player", "pd4dgs_codec.samples"}

@@ -1,13 +1,29 @@
 """The rate of a scene as the trainer computes it, which that of its file must equal."""
 
+import math
+
 import numpy as np
 import torch
 
 from pd4dgs_codec.entropy.fitting import entropy_bits
-from pd4dgs_codec.format.deformation import decorrelate
+from pd4dgs_codec.format.payload import Residuals
 from pd4dgs_codec.format.plan import plan
-from pd4dgs_codec.format.quantise import classes_of
-from pd4dgs_codec.model.rate import channel_moments, rate_bits
+from pd4dgs_codec.model.rate import MAX_BITS, MIN_SIGMA_RATIO, MIN_VARIANCE
+
+
+def moments(x):
+    """Mean and standard deviation of each column of x [n, c]."""
+    mu = x.mean(0)
+    return mu, ((x - mu).square().mean(0) + MIN_VARIANCE).sqrt()
+
+
+def plain_bits(a, mu, sigma, step):
+    """R(a) in the shape of a: the plain form of what `rate.row_bits` sums, precise in float64. The clip passes
+    gradients."""
+    sigma, d = sigma.clamp(min=step * MIN_SIGMA_RATIO), (a - mu).abs()
+    near, far = (torch.special.log_ndtr((side - d) / sigma) for side in (step / 2, -step / 2))
+    bits = -(near + torch.log1p(-torch.exp(far - near))) / math.log(2)
+    return bits + (bits.detach().clamp(max=MAX_BITS) - bits.detach())
 
 
 def train_rate_bits(scene):
@@ -22,16 +38,16 @@ def train_rate_bits(scene):
     result = []
     for i, symbols in enumerate(found.symbols.layers):
         own = slice(rows[i], rows[i + 1])
-        classes = np.zeros(rows[-1], np.int32) if planned.grading is None else classes_of(planned)
+        classes = np.zeros(rows[-1], np.int32) if planned.grading is None else planned.grading.classes
         attributes = 0.0 if planned.grading is None else entropy_bits(classes[own])
         for c in np.unique(classes[own]).tolist():
             for name, rows_of in planned.attributes.items():
                 values = torch.from_numpy(rows_of[own][classes[own] == c]).double().flatten(1)
                 step = planned.steps.attributes[name] * 2.0**c
-                attributes += float(rate_bits(values, *channel_moments(values), step).sum())
-        coded = decorrelate(symbols.tensors, symbols.kind)
-        row = {"layer": float(symbols.kind.layer), "attributes": attributes}
-        row |= {"planes": gaussian_bits(coded.plane_channels), "weights": gaussian_bits(coded.weights)}
+                attributes += float(plain_bits(values, *moments(values), step).sum())
+        planes = [channel.ravel() for plane in Residuals.of(symbols.tensors).planes for channel in plane]
+        row = {"layer": float(symbols.layer), "attributes": attributes, "planes": gaussian_bits(planes)}
+        row["weights"] = gaussian_bits([array.ravel() for array in symbols.tensors.weights])
         result.append(row)
     return result
 
@@ -41,7 +57,7 @@ def gaussian_bits(channels):
     total = 0.0
     for channel in channels:
         if channel.size:
-            mu, sigma = channel_moments(torch.from_numpy(channel.astype(np.float64)))
+            mu, sigma = moments(torch.from_numpy(channel.astype(np.float64)))
             symbols, counts = (torch.from_numpy(x) for x in np.unique(channel, return_counts=True))
-            total += float((rate_bits(symbols.double(), mu, sigma, 1.0) * counts).sum())
+            total += float((plain_bits(symbols.double(), mu, sigma, 1.0) * counts).sum())
     return total

@@ -26,24 +26,24 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from fuzzing import ROOT
 from fuzzing.check import (
-    ROOT,
+    DECODED,
+    Answer,
     Decoder,
     Finding,
     JavaScript,
     check_memory,
     check_package,
     compare,
-    python_decoder,
     reference_decoder,
 )
 from fuzzing.legal import Seed, seeds
 from fuzzing.mutate import make_case
 
-#: The package's first. They are made in the process that asks them.
-DECODERS: dict[str, Callable[[], Decoder]] = {
-    "python": lambda: python_decoder, "refdec": lambda: reference_decoder, "javascript": JavaScript
-}  # fmt: skip
+#: Those beside the package's. They are made in the process that asks them.
+DECODERS: dict[str, Callable[[], Decoder]] = {"refdec": lambda: reference_decoder, "javascript": JavaScript}
+NAMES = ("python", *DECODERS)
 COMPARED = {"refdec": 10, "javascript": 2}  #: every so many inputs, and every legal one
 MEASURED = 25  #: every so many inputs the peak memory is traced, which takes twice the time
 STUCK_SECONDS = 300.0  #: of wall time on one input, on a busy machine; then the process is ended
@@ -89,9 +89,12 @@ def examine(files: Sequence[Seed], run: int, index: int, decoders: dict[str, Dec
     figures = Figures(inputs=1, legal=legal, sealed=case.sealed and not legal)
     asked = {n: d for n, d in decoders.items() if every or legal or index % COMPARED.get(n, 1) == 0}
     try:
-        figures.outcomes[check_package(case, random.Random(~index))] += 1
-        figures.compared.update(set(asked) - {"python"})
-        if difference := compare(case.data, asked, case.meaning):
+        own = check_package(case, random.Random(~index))
+        figures.outcomes[own.name if own.scene in ("", DECODED) else f"{own.name}, the scene {own.scene}"] += 1
+        answers = {"the writer": Answer(DECODED, case.meaning)} if legal else {}
+        answers |= {"python": own} | {n: answer for n, d in asked.items() if (answer := d(case.data)) is not None}
+        figures.compared.update(set(answers) & set(asked))
+        if difference := compare(answers):
             figures.differences[difference] += 1
         if index % MEASURED == 0:
             figures.memory = check_memory(case.data)
@@ -147,14 +150,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     p.add_argument("--inputs", type=int, default=20_000, help="number of inputs (default: 20000)")
     p.add_argument("--seed", type=int, default=0, help="seed of the run (default: 0)")
     p.add_argument(
-        "--decoders", default=",".join(DECODERS), help="decoders to compare, of python,refdec,javascript (default: all)"
+        "--decoders", default=",".join(NAMES), help="decoders to compare, of python,refdec,javascript (default: all)"
     )
     p.add_argument("--input", type=int, metavar="I", help="examine input I alone, in this process")
     p.add_argument("--out", type=Path, default=ROOT / "out" / "fuzz", help="folder for findings (default: out/fuzz)")
     args = p.parse_args(argv)
     names = args.decoders.split(",")
-    if unknown := set(names) - set(DECODERS):
-        p.error(f"--decoders: expected some of {', '.join(DECODERS)}, found {', '.join(sorted(unknown))}")
+    if unknown := set(names) - set(NAMES):
+        p.error(f"--decoders: expected some of {', '.join(NAMES)}, found {', '.join(sorted(unknown))}")
     files, figures = seeds(args.files), Figures()
     if args.input is None:
         parts = run_safely(files, args.seed, range(args.inputs), names)

@@ -3,8 +3,8 @@
     python tools/make_vectors.py           # (re)writes spec/vectors/
     python tools/make_vectors.py --check   # one line per difference, and exit code 1 if there is any
 
-`tools/vectors/table.txt` says what each vector holds; the bytes are the same on every machine. Vectors that the package
-decodes to anything else than the manifest says are not written.
+`tools/vectors/table.txt` says what each vector holds; the bytes are the same on every machine. Vectors that the
+reference decoder decodes to anything else than what their writer put in are not written.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from vectors.blocks import Vector
+from vectors.blocks import MAJOR, Vector
 from vectors.cases import vectors
 
-from pd4dgs_codec.errors import DecodeError
-from pd4dgs_codec.format.container import MAJOR, read_preamble
-from pd4dgs_codec.format.header import layers_of, unpack_header
-from pd4dgs_codec.format.info import hashes
+ROOT = Path(__file__).resolve().parents[1]
+sys.path.append(str(ROOT / "spec"))  # one file that can be carried alone, in no package
 
-VECTORS = Path(__file__).resolve().parents[1] / "spec" / "vectors"
+import refdec  # noqa: E402
+
+VECTORS = ROOT / "spec" / "vectors"
 MANIFEST, SUFFIX = "manifest.json", ".pd4"
 
 
@@ -42,12 +42,14 @@ def entry(vector: Vector) -> dict[str, Any]:
         row["error"], row["clause"] = vector.error, vector.clauses[0]
         row |= {key: value for key, value in (("chunk", vector.chunk), ("offset", vector.offset)) if value is not None}
         row["prefix"] = vector.layers[-1]["layer"] if vector.layers else None
+    if vector.scene is not None:
+        row["scene"] = vector.scene
     try:
-        header = unpack_header(read_preamble(vector.data).header)
-        mode, listed = header.mode, layers_of(header.chunks)
-    except DecodeError:
-        mode, listed = "ans", []
-    row["ans_only"] = "same" if mode == "ans" else "UnsupportedFeature"
+        header, _, _ = refdec.read_preamble(vector.data)
+        mode, listed = header[2], [kind for kind, _ in header[1] if kind < 3]
+    except refdec.Fault:
+        mode, listed = 0, []
+    row["ans_only"] = "UnsupportedFeature" if mode else "same"
     if len(listed) > len(set(listed)):
         row["slices"] = vector.slices
     return {**row, "layers": vector.layers}
@@ -61,16 +63,16 @@ def files(found: list[Vector]) -> dict[str, bytes]:
 
 
 def wrong_outcomes(found: list[Vector]) -> Iterator[str]:
-    """One line per vector that the package does not decode as its table says."""
+    """One line per vector that the reference decoder does not decode as its table says."""
     names = [v.name for v in found]
     yield from (f"{name}: two vectors have this name" for name in sorted(set(names)) if names.count(name) > 1)
     for vector in found:
         try:
-            outcome: Any = hashes(vector.data)
-        except DecodeError as error:
-            outcome = type(error).__name__
+            outcome: Any = refdec.hashes(vector.data)
+        except refdec.Fault as fault:
+            outcome = fault.name
         if outcome != (vector.error or vector.layers):
-            yield f"{vector.name}: the package gives {outcome}, expected {vector.error or vector.layers}"
+            yield f"{vector.name}: the reference decoder gives {outcome}, expected {vector.error or vector.layers}"
 
 
 def differences(wanted: dict[str, bytes], folder: Path) -> Iterator[str]:

@@ -1,1 +1,1 @@
-"""Measurements of `pd4dgs-bench`: codec, renderer, trainer, latency, stability."""
+"""Measurements of `pd4dgs-bench`: codec, renderer, trainer, latency."""

@@ -41,12 +41,12 @@ def summary(seconds: Sequence[float]) -> dict[str, Any]:
     return {"median": median, "low": low, "high": high, "repeats": len(seconds)}
 
 
-def spread(found: dict[str, Any] | None) -> str:
+def quartiles(found: dict[str, Any] | None) -> str:
     """Formats a `summary`: "0.123 (0.120..0.130)", only the median of a single run, or "-" for None."""
     if found is None:
         return "-"
-    quartiles = f" ({found['low']:.3g}..{found['high']:.3g})" if found["repeats"] > 1 else ""
-    return f"{found['median']:.3g}{quartiles}"
+    around = f" ({found['low']:.3g}..{found['high']:.3g})" if found["repeats"] > 1 else ""
+    return f"{found['median']:.3g}{around}"
 
 
 def clock(work: Callable[[], T], repeats: int, budget: float = BUDGET) -> tuple[T, list[float]]:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pd4dgs_codec.bench.report import Panel, clock, markdown, optional, spread, summary
+from pd4dgs_codec.bench.report import Panel, clock, markdown, optional, quartiles, summary
 from pd4dgs_codec.errors import DataError, RenderError
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
@@ -83,7 +83,7 @@ def codec_table(points: Sequence[Point]) -> str:
     """Formats a row per point."""
     rows = [
         (optional(p["step_scale"], "g"), p["mode"], optional(p["effort"], "d"), f"{p['bytes']:,}")
-        + (_psnr(p["error"]), spread(p["encode"]), spread(p["decode"]))
+        + (_psnr(p["error"]), quartiles(p["encode"]), quartiles(p["decode"]))
         for p in points
     ]
     return markdown(("steps x", "mode", "effort", "bytes", "PSNR dB", "encode s", "decode s"), rows)
@@ -115,18 +115,18 @@ def view(level: Level, frame: Frame) -> View:
     import torch
 
     from pd4dgs_codec.draw.gaussians import near_plane
-    from pd4dgs_codec.draw.player import Player
+    from pd4dgs_codec.draw.player import Drawer
 
     model, camera = level.model, frame.camera
     gaussians: Any
-    if isinstance(model, Player):
+    if isinstance(model, Drawer):
         gaussians = model.gaussians(camera, frame.time)
     else:
         with torch.no_grad():
             gaussians = model.gaussians(level.level, frame.time, camera)
     names = ("means", "quats", "scales", "opacities", "colors")
     splats = {name: torch.as_tensor(np.ascontiguousarray(getattr(gaussians, name))) for name in names}
-    return {**splats, "camera": camera, "background": model.info.background, "near_plane": near_plane(model.info)}
+    return {**splats, "camera": camera, "background": level.background, "near_plane": near_plane(model.info)}
 
 
 def render_points(views: Sequence[View], names: Sequence[str], repeats: int, step: Step = lambda: None) -> list[Point]:
@@ -188,7 +188,7 @@ def _without_gsplat() -> str | None:
 
 def render_table(points: Sequence[Point]) -> str:
     """Formats a row per rasteriser."""
-    rows = [(p["name"], p["missing"] or spread(p["milliseconds"]), optional(p["rmse"], ".2g")) for p in points]
+    rows = [(p["name"], p["missing"] or quartiles(p["milliseconds"]), optional(p["rmse"], ".2g")) for p in points]
     return markdown(("rasteriser", "ms per image", "RMSE"), rows)
 
 
@@ -203,15 +203,9 @@ def render_panels(points: Sequence[Point]) -> list[Panel]:
 # -- trainer -----------------------------------------------------------------------------------------------------------
 
 
-def run_of(name: str, curve: Sequence[Point], anchors: int) -> Point:
-    """Describes a training run by its evaluations (dicts with seconds of wall time so far and psnr per level in dB).
-    rmse: of the highest level."""
-    points = [{"seconds": p["seconds"], "psnr": p["psnr"], "rmse": 10 ** (-p["psnr"][-1] / 20)} for p in curve]
-    return {"name": name, "curve": points, "anchors": anchors}
-
-
 def recorded_runs(paths: Sequence[str]) -> list[Point]:
-    """Reads the runs that checkpoints record. A run has the name of its file, or its path where names are equal. Raises
+    """Reads the runs that checkpoints record: name (that of the file, or its path where names are equal), anchors and
+    curve, the run's evaluations: seconds of wall time so far, psnr per level in dB, rmse of the highest level. Raises
     DataError for a run that was never evaluated, or whose record is broken."""
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.train.loop import read_curve
@@ -224,8 +218,10 @@ def recorded_runs(paths: Sequence[str]) -> list[Point]:
         shown = path if names.count(name) > 1 else name
         try:
             preset = json.loads(training.get("config", "{}")).get("preset", "")
-            curve = read_curve(training.get("curve", "[]"))
-            runs.append(run_of(f"{shown} ({preset})" if preset else shown, curve, len(model.anchor_q)))
+            curve = [
+                {"seconds": p["seconds"], "psnr": p["psnr"], "rmse": 10 ** (-p["psnr"][-1] / 20)}
+                for p in read_curve(training.get("curve", "[]"))
+            ]
         except Exception as error:  # a broken record can raise any exception
             reason = f"{type(error).__name__}: {error}"
             raise DataError(f"{path}: its curve of quality cannot be read: {reason}") from None
@@ -233,6 +229,8 @@ def recorded_runs(paths: Sequence[str]) -> list[Point]:
             raise DataError(
                 f"{path}: found no curve of quality, expected the checkpoint of a run with at least one evaluation"
             )
+        name = f"{shown} ({preset})" if preset else shown
+        runs.append({"name": name, "curve": curve, "anchors": len(model.anchor_q)})
     return runs
 
 

@@ -1,4 +1,4 @@
-"""`pd4dgs-bench`: error against run time of codec, renderer and trainer; numerical stability; latency."""
+"""`pd4dgs-bench`: error against run time of codec, renderer and trainer; latency."""
 
 from __future__ import annotations
 
@@ -11,26 +11,23 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pd4dgs_codec.cli import common, options
-from pd4dgs_codec.cli.common import FAILED, OK, STDIO, Console, UsageError, is_pd4, progress_bar, read_bytes, say
-from pd4dgs_codec.errors import DataError, DecodeError, TrainError
+from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError, is_pd4, progress_bar, read_bytes
+from pd4dgs_codec.errors import DataError, DecodeError
 from pd4dgs_codec.format.options import MODES
-from pd4dgs_codec.io import temporary_folder
 
 if TYPE_CHECKING:
     from pd4dgs_codec.bench.report import Panel
-    from pd4dgs_codec.bench.runtime import Point
     from pd4dgs_codec.quality.frames import Frame
     from pd4dgs_codec.scene import SceneInfo
 
 
 class Outcome(NamedTuple):
-    """The results of a report: JSON, Markdown, the plot with the label of its error axis, and a line per failure."""
+    """The results of a report: JSON, Markdown, the plot and the label of its error axis."""
 
     result: dict[str, Any]
     text: str
     panels: Sequence[Panel] = ()
     error: str = ""
-    failures: Sequence[str] = ()
 
 
 #: Why an option is refused for a file that is not rendered.
@@ -59,9 +56,7 @@ def _frames(args: argparse.Namespace, info: SceneInfo) -> list[Frame]:
     if args.data is None:
         return own_frames(info, args.views, downscale=args.downscale)
     dataset = common.read_dataset(args.data, args, info)
-    views = dataset.test or dataset.train
-    count = min(args.views, len(views))
-    return dataset_frames([views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)])
+    return dataset_frames(dataset.test or dataset.train, args.views)
 
 
 # -- codec -------------------------------------------------------------------------------------------------------------
@@ -169,70 +164,23 @@ def _render(args: argparse.Namespace) -> Outcome:
 
 # -- train -------------------------------------------------------------------------------------------------------------
 
-TRAIN = f"""\
-Trains each preset for the same time and measures six held-out views about twelve times during training. --from reports
-finished runs from their checkpoints instead.
-
-{options.SOURCES}
+TRAIN = """\
+Reports the held-out quality of finished runs against their training time, which their checkpoints hold.
 
 examples:
-  pd4dgs-bench train synthetic:local --presets tiny small --seconds 120 --plot train.png > train.md
-  pd4dgs-bench train --from out/tiny.pt out/small.pt --plot train.png"""
-#: Options that are fields of TrainConfig.
-TRAIN_FIELDS = ("downscale", "holdout", "seed", "iterations")
+  pd4dgs-train synthetic:local -o tiny.pt --preset tiny --max-seconds 120
+  pd4dgs-bench train tiny.pt small.pt --plot train.png > train.md"""
 
 
 def _train_options(p: options.Parser) -> None:
-    presets, add = ("tiny", "small", "paper"), p.add_argument
-    add("source", nargs="?", metavar="SOURCE", help="dataset to train on, see below")
-    add("--presets", nargs="+", choices=presets, metavar="PRESET", help="model sizes (default: tiny small)")
-    what = "training time of each preset in seconds (default: 120)"
-    add("--seconds", type=options.positive_float, metavar="S", help=what)
-    what = "training steps of each preset, instead of --seconds"
-    add("--iterations", type=options.positive_int, metavar="N", help=what)
-    options.add_reading(p, unset=options.READING)
-    add("--seed", type=options.seed, metavar="N", help="random seed (default: 0)")
-    add("--from", dest="runs", nargs="+", metavar="FILE", help="report the runs of these checkpoints")
+    p.add_argument("inputs", nargs="+", metavar="FILE", help="checkpoints of pd4dgs-train")
 
 
 def _train(args: argparse.Namespace) -> Outcome:
-    if args.runs and (args.source or options.given(args, "presets", "seconds", *TRAIN_FIELDS)):
-        raise UsageError("--from reports finished runs, expected no SOURCE and no training options")
-    if not args.runs and not args.source:
-        raise UsageError("found no SOURCE, expected a dataset to train on or --from FILE")
-    if args.seconds and args.iterations:
-        raise UsageError("found --seconds and --iterations, expected one of them")
-    from pd4dgs_codec.bench import report, runtime
-
-    machine = None if args.runs else report.machine()  # the machine of existing runs is unknown
-    runs = runtime.recorded_runs(args.runs) if args.runs else _trained(args)
-    text = "\n\n".join([runtime.train_table(runs), *([report.machine_line(machine)] if machine else [])])
-    result = {"source": args.source, "machine": machine, "runs": runs}
-    return Outcome(result, text, runtime.train_panels(runs), "RMSE of the highest level")
-
-
-def _trained(args: argparse.Namespace) -> list[Point]:
     from pd4dgs_codec.bench import runtime
-    from pd4dgs_codec.interchange.teacher import load_source
-    from pd4dgs_codec.train.config import TrainConfig
-    from pd4dgs_codec.train.loop import Trainer
 
-    limit = None if args.iterations else args.seconds or 120.0
-    runs = []
-    for preset in dict.fromkeys(args.presets or ("tiny", "small")):
-        config = TrainConfig(preset=preset, source=args.source, max_seconds=limit, **options.given(args, *TRAIN_FIELDS))
-        trainer = Trainer(config, load_source(args.source, downscale=config.downscale, holdout=config.holdout))
-        say(f"training {preset} on {len(trainer.dataset.train)} views")
-        if not trainer.dataset.test:
-            say(common.NONE_HELD_OUT)
-        with temporary_folder() as folder:
-            trainer.run(folder / "model.pt", progress=common.TrainingProgress())
-        if trainer.interrupted:
-            raise TrainError(f"interrupted while training {preset}; nothing was written")
-        if not trainer.curve:
-            raise TrainError(f"{preset}: the run ended before its first evaluation; expected a higher limit")
-        runs.append(runtime.run_of(preset, trainer.curve, len(trainer.model.anchor_q)))
-    return runs
+    runs = runtime.recorded_runs(args.inputs)
+    return Outcome({"runs": runs}, runtime.train_table(runs), runtime.train_panels(runs), "RMSE of the highest level")
 
 
 # -- latency -----------------------------------------------------------------------------------------------------------
@@ -285,46 +233,6 @@ def _with_camera(name: str) -> bytes:
     return data
 
 
-# -- stability ---------------------------------------------------------------------------------------------------------
-
-STABILITY = """\
-Runs stiff and extreme cases through each numerical component. A case passes if its error is within its bound, and is
-refused if invalid input raised the documented error. References come from mpmath or float64. The exit code is 1 if any
-case fails.
-
-groups: rate, fitting, quantiser, masks, hexplane, deformation, rasteriser, training
-
-examples:
-  pd4dgs-bench stability > table.md
-  pd4dgs-bench stability --only rasteriser
-  pd4dgs-bench stability --only needle --json
-  pd4dgs-bench stability --json rows.json > table.md"""
-
-
-def _stability_options(p: options.Parser) -> None:
-    p.add_argument("--only", metavar="NAME", help="run the group NAME, or the cases with NAME in their name")
-
-
-def _stability(args: argparse.Namespace) -> Outcome:
-    from pd4dgs_codec.bench import stability
-
-    stability.mpmath()
-    cases = stability.chosen(args.only)
-    if not cases:
-        raise UsageError(f"--only: found {args.only!r}, expected a group or a part of a case's name")
-    rows = []
-    with progress_bar(len(cases), "cases", "stability") as step:
-        for case in cases:
-            rows.append(stability.run_case(*case))
-            step()
-    failures = [
-        "fail: {group}: {case}: {got}, error {error}, bound {bound}".format(**row)
-        for row in rows
-        if row["status"] == stability.FAIL
-    ]
-    return Outcome({"rows": rows, "counts": stability.counts(rows)}, stability.text(rows), failures=failures)
-
-
 # -- the command -------------------------------------------------------------------------------------------------------
 
 
@@ -342,12 +250,9 @@ class Report(NamedTuple):
 REPORTS = {
     "codec": Report("FILE", "Measure the codec's error against bytes and time.", CODEC, _codec_options, _codec),
     "render": Report("FILE", "Measure the rasterisers' error against time.", RENDER, _render_options, _render),
-    "train": Report("[SOURCE]", "Measure held-out error against training time.", TRAIN, _train_options, _train),
+    "train": Report("FILE...", "Measure held-out error against training time.", TRAIN, _train_options, _train),
     "latency": Report(
         "FILE...", "Measure the time to the image of each level.", LATENCY, _latency_options, _latency, False
-    ),
-    "stability": Report(
-        "", "Test numerical stability in stiff and extreme cases.", STABILITY, _stability_options, _stability, False
     ),
 }
 
@@ -366,7 +271,7 @@ def parser(name: str | None = None) -> options.Parser:
     lines = [f"  {name:<11} {report.summary}" for name, report in REPORTS.items()]
     examples = [f"  pd4dgs-bench {name} --help" for name in REPORTS]
     details = "\n".join(["REPORT is one of", *lines, "", "examples:", *examples])
-    summary = "Measure error against run time, numerical stability and latency."
+    summary = "Measure error against run time, and latency."
     p = options.Parser("bench", "REPORT", summary, details)
     p.add_argument("report", metavar="REPORT", choices=tuple(REPORTS), help="report to make, see below")
     p.add_common()
@@ -385,7 +290,7 @@ def _misplaced(args: argparse.Namespace, console: Console) -> int:
 
 
 def _report(execute: Callable[[argparse.Namespace], Outcome], args: argparse.Namespace, console: Console) -> int:
-    """Checks the outputs, makes the report and writes it. Returns FAILED if one of its rows failed."""
+    """Checks the outputs, makes the report and writes it."""
     from pd4dgs_codec.io import finite, whole_file
 
     console.json = args.json == STDIO
@@ -402,7 +307,5 @@ def _report(execute: Callable[[argparse.Namespace], Outcome], args: argparse.Nam
     if args.json not in (None, STDIO):
         text = json.dumps(finite(found.result), indent=1) + "\n"
         common.write_bytes(args.json, text.encode(), args.overwrite)
-    for line in found.failures:
-        say(line)
     console.result(found.result, found.text, on_stdout=True)
-    return FAILED if found.failures else OK
+    return OK

@@ -25,7 +25,7 @@ from pd4dgs_codec.threads import configure
 
 if TYPE_CHECKING:
     from pd4dgs_codec.data.view import Dataset
-    from pd4dgs_codec.scene import Scene, SceneInfo, Viewpoint
+    from pd4dgs_codec.scene import LayeredScene, Scene, SceneInfo, Viewpoint
     from pd4dgs_codec.train.loop import Trainer
 
 #: A last garbage collection at exit took a quarter of the time of a cold start's first picture.
@@ -34,7 +34,6 @@ atexit.register(gc.freeze)
 OK, FAILED, USAGE, PARTIAL = 0, 1, 2, 3
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  #: errors of a full disk
 STDIO = "-"
-NONE_HELD_OUT = "no held-out views: measuring on the training views"
 #: Least time between two lines if stderr is not a terminal.
 LINE_SECONDS = 10.0
 EXTRAS = {"ray": "cluster", "submitit": "cluster"}  #: extra of each module that the extra `train` does not install
@@ -256,7 +255,7 @@ def checkpoint_scene(path: str, data: bytes) -> tuple[Scene, list[Viewpoint], st
     return to_scene(model), training.get("viewpoints", []), str(training.get("place", ""))
 
 
-def write_checkpoint(path: str, scene: Scene, overwrite: bool) -> None:
+def write_checkpoint(path: str, scene: LayeredScene, overwrite: bool) -> None:
     """Writes a scene as a checkpoint, whole or not at all."""
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.model.model import from_scene

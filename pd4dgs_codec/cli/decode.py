@@ -12,12 +12,13 @@ from pd4dgs_codec.cli import common, options
 from pd4dgs_codec.cli.common import OK, PARTIAL, STDIO, Console, UsageError, number, say, shown_name, table
 
 if TYPE_CHECKING:
-    from pd4dgs_codec.scene import Scene
+    from pd4dgs_codec.kinds import AnyScene
 
 DETAILS = """\
 Without -o, pd4dgs-decode only checks the file and prints a summary.
-A .npz output holds anchor, feature, scaling_log, offset, mask_L, mlp.*, planes.* and meta_*.
-A .pt output is a checkpoint for encode, render and eval.
+A .npz output holds anchor, mask_L, meta_*, of a scaffold feature, scaling_log, offset, mlp.* and planes.*, and of
+splats offset, color, opacity, scale, rotation, harmonics, window and tracks.*.
+A .pt output is a checkpoint for encode, render and eval; splats have none.
 From a URL (http, https), only the requested layers are fetched; interrupted transfers resume.
 --max-layer is another name of --level.
 
@@ -88,7 +89,7 @@ def _output_kind(args: argparse.Namespace) -> str | None:
     return kind
 
 
-def _summary(scene: Scene, data: bytes, complete: bool, seconds: float, args: argparse.Namespace) -> dict[str, Any]:
+def _summary(scene: AnyScene, data: bytes, complete: bool, seconds: float, args: argparse.Namespace) -> dict[str, Any]:
     from pd4dgs_codec.format.info import info
 
     described = {row["layer"]: row for row in info(data)["layers"]}
@@ -108,8 +109,8 @@ def _summary(scene: Scene, data: bytes, complete: bool, seconds: float, args: ar
         "complete": complete,
         "seconds": round(seconds, 4),
         "anchors": len(scene.anchor_q),
-        "global_deformation": scene.global_deformation is not None,
-        "local_deformation": scene.local_deformation is not None,
+        "global_deformation": scene.deformation(1) is not None,
+        "local_deformation": scene.deformation(2) is not None,
         "layers": rows,
         "absent": [layer for layer in wanted if layer not in described],
     }

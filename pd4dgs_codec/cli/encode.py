@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
@@ -14,8 +15,9 @@ from pd4dgs_codec.format.options import CHOICES, DEFAULTS, EncodeOptions
 
 if TYPE_CHECKING:
     from pd4dgs_codec.format.metadata import Metadata
+    from pd4dgs_codec.kinds import AnyScene
     from pd4dgs_codec.quality.packing import Views
-    from pd4dgs_codec.scene import Scene, SceneInfo, Viewpoint
+    from pd4dgs_codec.scene import SceneInfo, Viewpoint
 
 DETAILS = f"""\
 A .pd4 file holds layer 0 (the scene at one instant), layer 1 (its motion) and layer 2 (motion finer in time) in this
@@ -127,11 +129,12 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
     size = f"{len(scene.anchor_q)} anchors, layers {list(scene.layers)}"
     console.detail(f"{shown_name(args.input)}: {size}, steps {scene.steps}")
     from pd4dgs_codec.quality.packing import Views, pack
+    from pd4dgs_codec.scene import Scene
 
     views = _views(args, scene.info, console)
     if views is None and viewpoints:
         views = Views.remembered(viewpoints)
-    elif views is None and scene.info.camera and (args.slices or args.target_size):
+    elif views is None and isinstance(scene, Scene) and scene.info.camera and (args.slices or args.target_size):
         say(f"{shown_name(args.input)} holds no training cameras: its own camera measures; --data SOURCE gives others")
     packed = pack(
         scene,
@@ -151,7 +154,7 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
 main = common.command(parser, _encode)
 
 
-def _load(args: argparse.Namespace) -> tuple[Scene, list[Viewpoint], Metadata | None]:
+def _load(args: argparse.Namespace) -> tuple[AnyScene, list[Viewpoint], Metadata | None]:
     """Reads (scene, training cameras and times, metadata) from a checkpoint or a `.pd4` file, which has no cameras."""
     data = common.read_bytes(args.input)
     if common.is_pd4(data):
@@ -166,10 +169,13 @@ def _load(args: argparse.Namespace) -> tuple[Scene, list[Viewpoint], Metadata | 
 
 def _metadata(args: argparse.Namespace, had: Metadata | None, place: str = "") -> Metadata | None:
     """Returns the metadata `had` of the file without what was measured on it, and with the fields replaced that were
-    given as options. The source also says where the scene's 0 lies in the coordinates of its data, if not at theirs."""
-    if had:
-        had = replace(had, quality={}, slices=())
+    given as options. The source also says where the scene's 0 lies in the coordinates of its data, if not at theirs;
+    it still does once replaced."""
     given = options.given(args, "title", "source", "licence")
+    if had:
+        found = re.search(r"0 is \S+, \S+, \S+ of the data", had.source)  # as Dataset.place
+        place = found[0] if found and "source" in given else ""
+        had = replace(had, quality={}, slices=())
     if place:
         given["source"] = "; ".join(filter(None, [given.get("source"), place]))
     if not given:
@@ -226,7 +232,8 @@ def _slice_lines(result: dict[str, Any]) -> list[str]:
     ]
     if over := [row["layer"] for row, own in zip(result["layers"], sizes, strict=True) if own[0] > about["size"]]:
         lines.append(f"first slices of layers {over} exceed {about['size']:,} bytes: networks and planes stay whole")
-    seen = f" on {about['pictures']} views: {about['cameras']}" if about["pictures"] else ": the file has no camera"
+    seen = f" on {about['pictures']} views: {about['cameras']}" if about["pictures"] else ""
+    seen = ": the file has no camera" if about["order"].startswith("gate") else seen
     lines.append(f"anchors ordered by {about['order']}{seen}")
     if "psnr" in about:
         lines.append(f"mPSNR after each slice: {', '.join(f'{db:.2f}' for db in about['psnr'])} dB on held-out views")

@@ -48,7 +48,7 @@ def _evaluate(args: argparse.Namespace, console: Console) -> int:
     dataset = common.read_dataset(args.source, args, levels[-1].model.info)
     console.detail(f"{args.source}: {len(dataset.train)} training views, {len(dataset.test)} held out")
     if not dataset.test:
-        say(common.NONE_HELD_OUT)
+        say("no held-out views: measuring on the training views")
     distances = (*(PERCEPTUAL if args.perceptual else ()), *([VGG] if args.protocol == "3dgs" else []))
     perceptual = load_perceptual(distances) if distances else None
     for name, why in (perceptual.absent if perceptual else {}).items():

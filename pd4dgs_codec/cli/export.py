@@ -18,16 +18,16 @@ if TYPE_CHECKING:
     import numpy as np
 
     from pd4dgs_codec.data.view import View
-    from pd4dgs_codec.draw.player import Player
-    from pd4dgs_codec.interchange.export import Export, Eyes
-    from pd4dgs_codec.interchange.splats import Splats
+    from pd4dgs_codec.draw.player import Drawer
+    from pd4dgs_codec.interchange.export import Eyes
+    from pd4dgs_codec.kinds.splats import Splats
     from pd4dgs_codec.scene import SceneInfo
 
 DETAILS = f"""\
-View-dependent colours become spherical harmonics, and view-dependent opacities and sizes become means over many
-viewpoints; both are then refined against renderings of the scene. If only colours are view-dependent (pd4dgs-info
---json), only the harmonics are approximate, and refinement is off by default. Viewpoints are the training cameras of
---data, or else lie around the point that the file's camera looks at. --compare measures the loss of quality.
+Splats are exported as they are, with harmonics of at most the degree of --sh. In a scene with networks, view-dependent
+colours become spherical harmonics, and view-dependent opacities and sizes become means over many viewpoints. If only
+colours are view-dependent (pd4dgs-info --json), only the harmonics are approximate. Viewpoints are the training cameras
+of --data, or else lie around the point that the file's camera looks at. --compare measures the loss of quality.
 
   ply       one PLY file in the layout of 3D Gaussian Splatting
   ply-seq   a folder of such files, one per frame
@@ -48,7 +48,7 @@ SEQUENCES = ("ply-seq", "4dgs")
 KINDS = ("ply", "ply-seq", "spz", "glb", "4dgs")
 FILES = ".ply, .spz, .glb or .4dgs"
 LIBRARIES = {"spz": "gaussforge", "4dgs": "fourdgs"}
-FPS, STEPS, MAX_FRAMES = 30.0, 300, 100_000
+FPS, MAX_FRAMES = 30.0, 100_000
 SCALE = options.checked(float, lambda x: 1e-6 <= x <= 1e6, "a number from 1e-6 to 1e6")
 
 
@@ -65,8 +65,6 @@ def parser() -> options.Parser:
     options.add_level(p, "export")
     what = "degree of the spherical harmonics (default: 3)"
     p.add_argument("--sh", type=int, choices=(0, 1, 2, 3), default=3, help=what)
-    what = f"refinement steps; later frames take a quarter (default: {STEPS} or 0, see below)"
-    p.add_argument("--refine", type=options.count, metavar="N", help=what)
     what = "factor on all lengths; enlarge small scenes for the fixed-point positions of SPZ (default: 1)"
     p.add_argument("--scale", type=SCALE, default=1.0, metavar="X", help=what)
     p.add_argument("--data", metavar="SOURCE", help="use the training cameras of this dataset as viewpoints")
@@ -84,26 +82,22 @@ def _export(args: argparse.Namespace, console: Console) -> int:
         _check_folder(args.output, args.overwrite)
     else:
         common.check_output(args.output, args.overwrite)
-    from pd4dgs_codec.draw.player import Player
+    from pd4dgs_codec.draw.player import drawer
     from pd4dgs_codec.format.decoder import decode
-    from pd4dgs_codec.interchange.export import Export, cost
+    from pd4dgs_codec.interchange.export import cost
     from pd4dgs_codec.interchange.splats import EXTRA
 
     if args.to in LIBRARIES:
         required(LIBRARIES[args.to], EXTRA, f"{args.to} files")
-    player = Player(decode(common.read_bytes(args.input), max_layer=args.level))
-    if args.refine is None:
-        args.refine = 0 if player.shapes_are_blind else STEPS
-    views = _compared(args, player)
-    export = Export(player, _eyes(args, player), args.sh, args.refine)
+    player = drawer(decode(common.read_bytes(args.input), max_layer=args.level))
+    views, eyes = _compared(args, player), _eyes(args, player)
     start = time.perf_counter()
     result = {"input": args.input, "output": args.output, "to": args.to, "level": player.level, "sh": args.sh}
-    result["refine"] = args.refine
-    result |= _write_sequence(args, export) if args.to in SEQUENCES else _write_still(args, export)
+    result |= (_write_sequence if args.to in SEQUENCES else _write_still)(args, player, eyes)
     result["seconds"] = time.perf_counter() - start
     if views:
         with progress_bar(len(views), "views", "comparing") as step:
-            result["cost"] = cost(export, views, step)
+            result["cost"] = cost(player, eyes, args.sh, views, step)
     console.result(result, _text(result))
     return OK
 
@@ -134,15 +128,21 @@ def _check_folder(path: str, overwrite: bool) -> None:
         raise DataError(f"{path}: contains PLY files already; --overwrite removes them")
 
 
-def _eyes(args: argparse.Namespace, player: Player) -> Eyes:
+def _eyes(args: argparse.Namespace, player: Drawer) -> Eyes | None:
+    """The viewpoints from which a scaffold is baked, None for splats, of which the degree of --sh is the highest."""
+    from pd4dgs_codec.draw.player import Player
     from pd4dgs_codec.interchange.export import eyes_of_cameras, eyes_of_scene
 
+    if not isinstance(player, Player):
+        if args.data is not None:
+            raise UsageError(f"--data has no effect: {args.input} holds splats, which are exported as they are")
+        return None
     if args.data is None:
         return eyes_of_scene(player)
     return eyes_of_cameras([view.camera for view in common.read_dataset(args.data, args, player.info).train])
 
 
-def _compared(args: argparse.Namespace, player: Player) -> Sequence[View]:
+def _compared(args: argparse.Namespace, player: Drawer) -> Sequence[View]:
     """The held-out views of --compare, empty without it. Raises DataError if it has none."""
     if args.compare is None:
         return ()
@@ -152,29 +152,32 @@ def _compared(args: argparse.Namespace, player: Player) -> Sequence[View]:
     return views
 
 
-def _write_still(args: argparse.Namespace, export: Export) -> dict[str, Any]:
+def _write_still(args: argparse.Namespace, player: Drawer, eyes: Eyes | None) -> dict[str, Any]:
     """Writes the Gaussians of one time."""
     import numpy as np
 
-    from pd4dgs_codec.interchange.export import UNTURNED, upright
-    from pd4dgs_codec.interchange.splats import SPZ_STEP, glb_bytes, ply_bytes, spz_bytes
+    from pd4dgs_codec.interchange.export import UNTURNED, exported, upright
+    from pd4dgs_codec.interchange.splats import SPZ_SCALE, SPZ_STEP, glb_bytes, ply_bytes, spz_bytes
 
-    turn = upright(export.player.info.up) if args.to in ("glb", "spz") else UNTURNED
-    with progress_bar(args.refine, "steps", "refining") as step:
-        splats, _ = export.splats(args.time, turn, step=step)
-    splats = _scaled(splats, args)
-    if args.to == "spz" and (size := float(np.median(splats.scales.max(axis=1)))) < 4 * SPZ_STEP:
+    turn = upright(player.info.up) if args.to in ("glb", "spz") else UNTURNED
+    splats, _ = exported(player, args.time, eyes, args.sh, turn)
+    _check_some(len(splats.means), args)
+    splats, sizes = splats.scaled(args.scale), args.scale * splats.scales.max(axis=1)
+    if args.to == "spz" and (size := float(np.median(sizes))) < 4 * SPZ_STEP:
         what = f"half of the Gaussians are smaller than {size:.2g} units, and SPZ rounds positions to {SPZ_STEP:.2g}"
         say(f"pd4dgs-export: warning: {what}; --scale enlarges the scene")
+    if args.to == "spz" and (count := np.count_nonzero(sizes > SPZ_SCALE)):
+        what = f"{count:,} Gaussians are larger than {SPZ_SCALE:.0f} units, to which SPZ shrinks them"
+        say(f"pd4dgs-export: warning: {what}; --scale below 1 keeps their size")
     data = {"ply": ply_bytes, "spz": spz_bytes, "glb": glb_bytes}[args.to](splats)
     common.write_bytes(args.output, data, args.overwrite)
     return {"frames": 1, "gaussians": len(splats.means), "bytes": len(data), "time": args.time}
 
 
-def _scaled(splats: Splats, args: argparse.Namespace) -> Splats:
-    if not len(splats.means):
-        raise DataError(f"{args.input}: has no visible Gaussians at this level and time, expected some")
-    return splats.scaled(args.scale)
+def _check_some(count: int, args: argparse.Namespace) -> None:
+    if not count:
+        when = "any time" if args.to in SEQUENCES else "this time"
+        raise DataError(f"{args.input}: has no visible Gaussians at this level and {when}, expected some")
 
 
 def frame_times(info: SceneInfo, fps: float) -> list[float]:
@@ -188,32 +191,29 @@ def frame_times(info: SceneInfo, fps: float) -> list[float]:
     return [i / fps for i in range(count)]
 
 
-def _write_sequence(args: argparse.Namespace, export: Export) -> dict[str, Any]:
+def _write_sequence(args: argparse.Namespace, player: Drawer, eyes: Eyes | None) -> dict[str, Any]:
     """Writes frames over the whole time range."""
+    from pd4dgs_codec.interchange.export import exported
     from pd4dgs_codec.interchange.splats import fourdgs_bytes
 
-    info, fps = export.player.info, args.fps
-    seconds = info.time_range[1] - info.time_range[0]
-    starts = frame_times(info, fps)
+    start, stop = player.info.time_range
+    starts = frame_times(player.info, args.fps)
+
+    def frames(step: Callable[[], None]) -> Iterator[tuple[float, Splats, np.ndarray]]:
+        for seconds in starts:
+            t = min(seconds / (stop - start), 1.0) if stop > start else 0.0
+            splats, slots = exported(player, t, eyes, args.sh)
+            yield seconds, splats.scaled(args.scale), slots
+            step()
+
     with progress_bar(len(starts), "frames", "exporting") as step:
-        frames = _frames(args, export, [min(s / seconds, 1.0) if seconds else 0.0 for s in starts], step)
-        if args.to == "4dgs":
-            kept = [(s, splats, slots) for s, (splats, slots) in zip(starts, frames, strict=True)]
-            data = fourdgs_bytes(kept, starts[-1] + 1 / fps)
-            common.write_bytes(args.output, data, args.overwrite)
-            return {"frames": len(starts), "gaussians": max(len(g.means) for _, g, _ in kept), "bytes": len(data)}
-        return _write_folder(args, len(starts), (splats for splats, _ in frames))
-
-
-def _frames(
-    args: argparse.Namespace, export: Export, times: list[float], step: Callable[[], None]
-) -> Iterator[tuple[Splats, np.ndarray]]:
-    """Yields (Gaussians, slots) at normalised times."""
-    learnt = None
-    for t in times:
-        splats, learnt = export.splats(t, before=learnt)
-        yield _scaled(splats, args), learnt.slots
-        step()
+        if args.to == "ply-seq":
+            return _write_folder(args, len(starts), (splats for _, splats, _ in frames(step)))
+        kept = list(frames(step))
+        _check_some(most := max(len(slots) for _, _, slots in kept), args)
+        data = fourdgs_bytes(kept, starts[-1] + 1 / args.fps)
+        common.write_bytes(args.output, data, args.overwrite)
+        return {"frames": len(starts), "gaussians": most, "bytes": len(data)}
 
 
 def _write_folder(args: argparse.Namespace, count: int, frames: Iterator[Splats]) -> dict[str, Any]:
@@ -226,6 +226,7 @@ def _write_folder(args: argparse.Namespace, count: int, frames: Iterator[Splats]
             data = ply_bytes(splats)
             temporary.write_bytes(data)
             most, total = max(most, len(splats.means)), total + len(data)
+        _check_some(most, args)
     for other in set(folder.glob("*.ply")) - {Path(name) for name in names}:
         other.unlink()
     return {"frames": count, "gaussians": most, "bytes": total}

@@ -1,44 +1,111 @@
-"""`pd4dgs-import`: another trainer's checkpoint -> a checkpoint of ours."""
+"""`pd4dgs-import`: another program's model -> a `.pd4` file, or a checkpoint where training is meant."""
+
+from __future__ import annotations
 
 import argparse
-from pathlib import Path
+import math
+from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.cli import options
-from pd4dgs_codec.cli.common import OK, Console, check_output, command, write_checkpoint
+from pd4dgs_codec.cli import common, options
+from pd4dgs_codec.cli.common import OK, Console, UsageError, number, progress_bar, say, table
+
+if TYPE_CHECKING:
+    from pd4dgs_codec.interchange.imported import Imported
 
 DETAILS = """\
-FOLDER is a Scaffold-GS checkpoint: a run or its point_cloud/iteration_N, with point_cloud.ply and either
-opacity_mlp.pt, cov_mlp.pt and color_mlp.pt or checkpoints.pth.
-The model becomes layer 0, a static scene, without loss; encoding quantises it as usual.
-Models with features that layer 0 does not support (distance inputs, a feature bank) are refused.
-Runs of 4DGaussians and Deformable-3DGS cannot be imported; pd4dgs-train teacher:FOLDER trains on their renderings.
-Code in the files is never executed.
+SOURCE is found by its content:
+  a PLY, compressed PLY, SPZ or .splat file, or a checkpoint of gsplat: a static scene
+  a folder of PLY, SPZ or .splat files, one per frame; whether rows keep their Gaussians is found out, and
+    Gaussians without a counterpart in the frames beside get a window in time
+  a run of 4DGaussians or Deformable-3DGS, or one of its point_cloud/iteration_N
+  a PLY file of SpacetimeGaussians (lite), a .4dgs file
+  module:function, a Python function from time 0..1 to Gaussians
+Its Gaussians and their motion are packed as they are, without training. pd4dgs-train teacher:SOURCE learns a neural
+scene from its renderings instead: fewer bytes at low quality, in minutes. Code in files is never executed.
+
+--psnr D asks for D dB against the source's renderings; --quality Q means 32 + Q / 5 dB. Quality is measured from the
+cameras of a cameras.json beside the source, else from cameras on a dome around it.
+
+-o model.pt imports a run of Scaffold-GS as a checkpoint: layer 0 without loss, which pd4dgs-encode packs.
 
 examples:
-  pd4dgs-import output/garden -o garden.pt
-  pd4dgs-import output/garden/point_cloud/iteration_30000 -o garden.pt --appearance 0
-  pd4dgs-encode garden.pt -o garden.pd4"""
+  pd4dgs-import capture.ply -o scene.pd4
+  pd4dgs-import frames/ -o scene.pd4 --fps 30 --target-size 400k --slices 50k
+  pd4dgs-import output/lego -o lego.pd4 --psnr 42
+  pd4dgs-import output/garden -o garden.pt --appearance 0"""
+
+#: dB of quality 0, and of each further point.
+LOWEST_DB, POINT_DB = 32.0, 0.2
+QUALITY = 50.0
+#: Options of .pd4 files, and of checkpoints.
+PACKING = (
+    "psnr", "quality", "target_size", "slices", "fps", "seconds", "background", "up", "title", "source", "licence"
+)  # fmt: skip
+SCAFFOLD = ("appearance", "voxel_size")
 
 
 def parser() -> options.Parser:
-    p = options.Parser("import", "FOLDER -o model.pt", "Import a Scaffold-GS model.", DETAILS)
-    p.add_argument("input", metavar="FOLDER", help="Scaffold-GS checkpoint")
-    p.add_argument("-o", "--output", required=True, type=options.named, metavar="model.pt", help="checkpoint to write")
+    p = options.Parser("import", "SOURCE -o FILE.pd4", "Pack a model of another program.", DETAILS)
+    add = p.add_argument
+    add("input", metavar="SOURCE", help="file, folder or module:function, see below")
+    what = "file to write; a checkpoint if it ends in .pt"
+    add("-o", "--output", required=True, type=options.named, metavar="FILE.pd4", help=what)
+    goal = p.add_mutually_exclusive_group()
+    add = goal.add_argument
+    what = f"0 (small files) to 100 (default: {QUALITY:g})"
+    add("--quality", type=options.checked(float, lambda q: 0 <= q <= 100, "0 to 100"), metavar="Q", help=what)
+    add("--target-size", type=options.size, metavar="SIZE", help="most bytes of the file, such as 400k")
+    db = options.checked(float, lambda d: 10 <= d <= 80, "10 to 80")
+    add("--psnr", type=db, metavar="D", help="dB against the source's renderings")
+    add = p.add_argument
+    add("--slices", type=options.size, metavar="SIZE", help="cut layers into slices, the first of at most SIZE bytes")
+    rate = p.add_mutually_exclusive_group()
+    rate.add_argument("--fps", type=options.fps, metavar="F", help="frames per second of a folder (default: 30)")
+    what = "duration, from the first instant to the last"
+    rate.add_argument("--seconds", type=options.positive_float, metavar="S", help=what)
+    options.add_background(p, "that of the run, else black")
+    what = "up direction (default: of the cameras, else 0,-1,0)"
+    add("--up", type=_direction, metavar="X,Y,Z", help=what)
+    about = p.add_argument_group("metadata", "shown by pd4dgs-info")
+    for name, what in (("title", "title of the scene"), ("source", "origin of the scene"), ("licence", "terms of use")):
+        about.add_argument(f"--{name}", type=options.line, metavar="TEXT", help=what)
+    scaffold = p.add_argument_group("Scaffold-GS, with -o model.pt")
     what = "appearance embedding to use, if colours depend on one"
-    p.add_argument("--appearance", type=options.count, metavar="I", help=what)
+    scaffold.add_argument("--appearance", type=options.count, metavar="I", help=what)
     what = "voxel size of the anchor grid in scene units (default: from cfg_args or the anchors)"
-    p.add_argument("--voxel-size", type=options.positive_float, metavar="V", help=what)
-    p.add_argument("--iteration", type=options.count, metavar="N", help="iteration to read (default: the last)")
+    scaffold.add_argument("--voxel-size", type=options.positive_float, metavar="V", help=what)
     p.add_common()
     return p
 
 
+def _direction(text: str) -> tuple[float, ...]:
+    """Reads three numbers that are not all 0."""
+
+    def numbers(text: str) -> tuple[float, ...]:
+        return tuple(map(float, text.split(",")))
+
+    return options.checked(numbers, lambda v: len(v) == 3 and 0 < math.hypot(*v) < math.inf, "X,Y,Z")(text)
+
+
 def _import(args: argparse.Namespace, console: Console) -> int:
-    check_output(args.output, args.overwrite)
+    to_checkpoint = args.output.lower().endswith(".pt")
+    for name in PACKING if to_checkpoint else SCAFFOLD:
+        if getattr(args, name) is not None:
+            needed = "a .pd4 file" if to_checkpoint else "-o model.pt"
+            raise UsageError(f"--{name.replace('_', '-')} needs {needed}")
+    common.check_other_file(args.input, args.output)
+    common.check_output(args.output, args.overwrite)
+    return _checkpoint(args, console) if to_checkpoint else _pack(args, console)
+
+
+def _checkpoint(args: argparse.Namespace, console: Console) -> int:
+    """Imports a run of Scaffold-GS."""
+    from pathlib import Path
+
     from pd4dgs_codec.interchange.scaffold_gs import read_scaffold_gs
 
-    scene = read_scaffold_gs(Path(args.input), args.appearance, args.voxel_size, args.iteration)
-    write_checkpoint(args.output, scene, args.overwrite)
+    scene = read_scaffold_gs(Path(args.input), args.appearance, args.voxel_size)
+    common.write_checkpoint(args.output, scene, args.overwrite)
     result = {
         "input": args.input,
         "output": args.output,
@@ -52,4 +119,42 @@ def _import(args: argparse.Namespace, console: Console) -> int:
     return OK
 
 
-main = command(parser, _import)
+def _pack(args: argparse.Namespace, console: Console) -> int:
+    """Packs explicit Gaussians."""
+    from pd4dgs_codec.format.metadata import Metadata
+    from pd4dgs_codec.interchange.imported import import_model
+
+    quality = QUALITY if args.quality is None else args.quality
+    made = import_model(
+        args.input,
+        psnr=args.psnr or LOWEST_DB + POINT_DB * quality,
+        most_bytes=args.target_size,
+        slices=args.slices,
+        fps=args.fps or 30.0,
+        seconds=args.seconds,
+        background=args.background,
+        up=args.up,
+        metadata=Metadata(**options.given(args, "title", "source", "licence")),
+        tell=lambda text: None if args.json else say(text),
+        progress=lambda what, total: progress_bar(total, "steps", what),
+    )
+    common.write_bytes(args.output, made.data, args.overwrite)
+    result = {"input": args.input, "output": args.output, **made.json()}
+    console.result(result, _text(args.output, made))
+    return OK
+
+
+def _text(name: str, made: Imported) -> str:
+    rows = []
+    for layer in made.report.layers:
+        parts = [f"{part.name} {part.payload_bits / 8:,.0f}" for part in layer.streams]
+        rows.append((layer.layer, number(layer.bytes, 0), number(made.psnr.get(layer.layer)), ", ".join(parts)))
+    found: list[Any] = [table(("level", "bytes", "dB", "bytes of its parts"), rows)]
+    if made.left_out:
+        found.append(f"left out: {made.left_out:,} Gaussians that no view sees")
+    size = f"{len(made.data):,} bytes, {len(made.data) / made.gaussians:.2f} a Gaussian"
+    found.append(f"{name}: {size}; dB against the source from {made.views} other cameras and instants")
+    return "\n".join(found)
+
+
+main = common.command(parser, _import)

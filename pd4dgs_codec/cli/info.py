@@ -1,16 +1,15 @@
 """`pd4dgs-info`: what a `.pd4` file holds."""
 
 import argparse
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pd4dgs_codec.cli import options
 from pd4dgs_codec.cli.common import OK, Console, command, number, read_prefix, shown_name, table
-from pd4dgs_codec.errors import DataError
 
 DETAILS = """\
 The time to the first frame is 8 * (bytes to the end of the first slice) / rate, without latency.
 From a URL (http, https), only the header is fetched, unless --check, --bytes or --hashes needs the whole file.
-Error bounds are the largest differences between decoded and original values, as declared by the encoder.
 
 examples:
   pd4dgs-info scene.pd4
@@ -18,16 +17,18 @@ examples:
   pd4dgs-info scene.pd4 --check --at 500k,2M,50M --json
   pd4dgs-info http://127.0.0.1:8000/scene.pd4"""
 
-#: Shown per layer with -v: quantisation steps, planes as [channels, x, y, z, t], widths of the networks' layers,
-#: the normalised time of a key instant.
-DETAIL_KEYS = ("steps", "planes", "networks", "key_instant")
+#: Shown per layer with -v: quantisation steps; planes as [channels, x, y, z, t], widths of the networks' layers and the
+#: normalised time of a key instant, or the numbers of instants and of bases by head; of an unknown kind the tensors of
+#: `Tables.json`.
+DETAIL_KEYS = ("steps", "planes", "networks", "key_instant", "instants", "heads", "kind", "grid_step", "grids",
+               "chain_step", "chains")  # fmt: skip
 
 
 def parser() -> options.Parser:
     p = options.Parser("info", "FILE", "Show the header and layers of a .pd4 file.", DETAILS)
     options.add_file(p, "FILE", ".pd4 file or URL; - reads stdin")
     p.add_argument("--check", action="store_true", help="decode the whole file and check every checksum and rule")
-    p.add_argument("--bytes", action="store_true", help="show the bytes of each section and layer")
+    p.add_argument("--bytes", action="store_true", help="show the bytes of each part of each layer")
     what = "show SHA-256 of the integers and float32 tensors of each layer"
     p.add_argument("--hashes", action="store_true", help=what)
     what = "link rates in bits per second for the time to the first frame (default: 2M,10M,50M)"
@@ -40,17 +41,18 @@ def _info(args: argparse.Namespace, console: Console) -> int:
     options.choose_file(args, "FILE")
     whole = args.check or args.bytes or args.hashes
     data, total = read_prefix(args.input, console, max_bytes=None if whole else 0)
-    from pd4dgs_codec.format.decoder import read_layers
     from pd4dgs_codec.format.info import hashes, info
+    from pd4dgs_codec.format.reader import read_layers
 
     result = {"input": args.input, **info(data), "available": total}
     end = result["layers"][0]["slices"][0]["end"]
     result["first_frame_seconds"] = {name: 8 * end / rate for name, rate in args.at.items()}
     result["left_out"] = _left_out(result["layers"])
+    if args.bytes or args.check:
+        _, layers = read_layers(data)
     if args.bytes:
-        result["parts"] = _parts(result)
+        result["parts"] = _parts(result, [layer.bits for layer in layers])
     if args.check:
-        read_layers(data)
         result["checked"] = True
     if args.hashes:
         result["hashes"] = hashes(data)
@@ -64,16 +66,13 @@ def _info(args: argparse.Namespace, console: Console) -> int:
 main = command(parser, _info)
 
 
-def _parts(result: dict[str, Any]) -> list[dict[str, Any]]:
-    """Returns the bytes of each kind of section by layer, and of all other parts. The header counts as part of layer 0;
-    other chunks belong to no layer."""
+def _parts(result: dict[str, Any], bits: Sequence[Mapping[str, int]]) -> list[dict[str, Any]]:
+    """Returns the bytes of each group of channels by layer, and of all other parts. The header counts as part of layer
+    0; other chunks belong to no layer. bits: by group, of each layer."""
     layers = result["layers"]
-    missing = [row["layer"] for row in layers if "sections" not in row]
-    if missing:
-        raise DataError(f"{result['input']}: layer {missing[0]} is truncated, expected a complete file for --bytes")
-    names = dict.fromkeys(name for row in layers for name in row["sections"])
-    parts = [{"part": name, "layers": [row["sections"].get(name, 0) for row in layers]} for name in names]
-    frames = [row["bytes"] - sum(row["sections"].values()) for row in layers]
+    parts: list[dict[str, Any]]
+    parts = [{"part": name, "layers": [round(own[name] / 8) for own in bits]} for name in bits[0]]
+    frames = [row["bytes"] - sum(part["layers"][i] for part in parts) for i, row in enumerate(layers)]
     frames[0] += result["header_bytes"]
     parts.append({"part": "header, frames, parameters", "layers": frames})
     for row in parts:
@@ -89,25 +88,25 @@ def _parts_table(result: dict[str, Any]) -> str:
     rows = []
     for row in result["parts"]:
         sizes = [number(size, 0) for size in (*row["layers"], row["bytes"])]
-        rows.append((row["part"].replace("_", " "), *sizes, f"{100 * row['bytes'] / result['bytes']:.1f} %"))
+        rows.append((row["part"], *sizes, f"{100 * row['bytes'] / result['bytes']:.1f} %"))
     return table(heads, rows)
 
 
 def _left_out(layers: list[dict[str, Any]]) -> list[dict[str, str]]:
-    """Lists layers, deformations and residual heads of the format that this file does not have."""
-    from pd4dgs_codec.format.registry import LAYER_KINDS
+    """Lists layers, deformations and residual heads of known kinds that this file does not have."""
+    from pd4dgs_codec.kinds import NAMES
     from pd4dgs_codec.scene import HEADS
 
     why = "without visible effect, or above --layers"
     rows = {row["layer"]: row for row in layers}
     missing = []
-    for kind in LAYER_KINDS[1:]:
-        row = rows.get(kind.layer)
+    for layer, name in enumerate(NAMES[1:], 1):
+        row = rows.get(layer)
         if row is None:
-            missing.append(f"layer {kind.layer}")
+            missing.append(f"layer {layer}")
         elif "networks" in row:  # known only if the whole chunk is present
-            gone = [f"{kind.name} head {head}" for head in HEADS if head not in row["networks"]]
-            missing += [kind.name] if len(gone) == len(HEADS) else gone
+            gone = [f"{name} head {head}" for head in HEADS if head not in row["networks"]]
+            missing += [name] if len(gone) == len(HEADS) else gone
     return [{"what": what, "why": why} for what in missing]
 
 
@@ -140,11 +139,12 @@ def _text(result: dict[str, Any]) -> str:
     rest = result["available"] - result["bytes"]
     cut = f", truncated to {result['available']:,}" if rest < 0 else f", {rest:,} more behind its end" if rest else ""
     low, high = result["time_range"]
+    what = f"splats with harmonics of degree {result['degree']}" if "degree" in result else "anchors"
     left_out = result["left_out"]
     lines = [
         f"{shown_name(result['input'])}: .pd4 format {result['format_version']}, {result['bytes']:,} bytes{cut}",
         f"mode {result['mode']}, header {result['header_bytes']} bytes, "
-        f"{number(result['anchors'], 0)} anchors on a grid of {result['voxel_size']:.6g} scene units, "
+        f"{number(result['anchors'], 0)} {what} on a grid of {result['voxel_size']:.6g} scene units, "
         f"time {low:g} to {high:g} s",
         table(
             ("layer", "offset", "bytes", "prefix", "new anchors"),
@@ -156,7 +156,6 @@ def _text(result: dict[str, Any]) -> str:
         *_slice_lines(result),
         *_about_lines(result["metadata"]),
         *([f"left out: {', '.join(row['what'] for row in left_out)} ({left_out[0]['why']})"] if left_out else []),
-        "error bounds: " + ", ".join(f"{what} {bound:.4g}" for what, bound in result["error_bounds"].items()),
         "first frame: " + ", ".join(f"{s:.2f} s at {rate}bps" for rate, s in result["first_frame_seconds"].items()),
     ]
     if "parts" in result:

@@ -16,7 +16,7 @@ from pd4dgs_codec.io import check_new, temporary_folder, whole_files
 if TYPE_CHECKING:
     import numpy as np
 
-    from pd4dgs_codec.scene import Scene
+    from pd4dgs_codec.kinds import AnyScene
     from pd4dgs_codec.web.manifests import Video
     from pd4dgs_codec.web.page import Still
 
@@ -127,7 +127,7 @@ def _write(args: argparse.Namespace, files: dict[str, bytes]) -> list[dict[str, 
     return [{"name": name, "bytes": len(content)} for name, content in files.items()]
 
 
-def _render(scene: Scene, fps: float) -> Video:
+def _render(scene: AnyScene, fps: float) -> Video:
     from PIL import Image
 
     from pd4dgs_codec.quality.frames import check_mp4, own_frames, write_mp4
@@ -160,7 +160,7 @@ def _render(scene: Scene, fps: float) -> Video:
         return Video(path.read_bytes(), *size, fps, poster.getvalue())
 
 
-def _still(scene: Scene) -> Still:
+def _still(scene: AnyScene) -> Still:
     """The scene as the player shows it first, seen by its own camera, and what lies around that picture."""
     from dataclasses import replace
 
@@ -184,7 +184,7 @@ def _still(scene: Scene) -> Still:
         Image.fromarray(to_uint8(picture)).save(file, "webp", quality=quality, method=6)
         if file.tell() <= STILL_BYTES:
             break
-    red, green, blue = to_uint8(np.array(scene.info.background))
+    red, green, blue = to_uint8(np.array(scene.background()))
     return Still(file.getvalue(), STILL_REACH, camera.width / camera.height, f"rgb({red},{green},{blue})")
 
 

@@ -148,8 +148,7 @@ def _frames(args: argparse.Namespace, level: Level) -> list[Frame]:
     views = dataset.test if args.split == "test" else dataset.train
     if not views:
         raise DataError(f"{args.data}: has no held-out views; expected --split train or another --holdout")
-    count = min(args.frames or len(views), len(views))
-    return dataset_frames([views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)])
+    return dataset_frames(views, args.frames)
 
 
 def _pictures(

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import functools
+import importlib
 import io
 import json
 import os
@@ -270,8 +273,8 @@ def check_pixels(count: int, files: Iterable[Path], where: str) -> None:
         raise DataError(f"{where}: {count:,} pixels, expected {held:,} at most for files of this size")
 
 
-def _open(path: Path) -> Picture:
-    """Opens a picture without decoding its pixels. Raises DataError."""
+def _open(path: Path, *, header_only: bool = False) -> Picture:
+    """Opens a picture without decoding its pixels. header_only: they will not be decoded. Raises DataError."""
     from PIL import Image  # of the extra `train`
 
     try:
@@ -291,16 +294,25 @@ def _open(path: Path) -> Picture:
         refused.callback(picture.close)
         check_pixels(picture.width * picture.height, [path], str(path))
         check_pixels(tile, [path], f"{path}: a tile")
-        scans = path.read_bytes().count(SCAN) if picture.format in ("JPEG", "MPO") else 0
-        if scans > MAX_SCANS:
+        jpeg = picture.format in ("JPEG", "MPO") and not header_only
+        if jpeg and (scans := path.read_bytes().count(SCAN)) > MAX_SCANS:
             raise DataError(f"{path}: {scans:,} scans, expected {MAX_SCANS} at most in a JPEG")
         refused.pop_all()
+    if picture.format == "TIFF":
+        _silence_libtiff()
     return picture
+
+
+@functools.cache
+def _silence_libtiff() -> None:
+    """Stops libtiff from printing what is wrong with a picture, which Pillow also raises."""
+    with contextlib.suppress(AttributeError, OSError):  # some builds of Pillow do not show the libraries they contain
+        ctypes.CDLL(importlib.import_module("PIL._imaging").__file__).TIFFSetErrorHandler(None)
 
 
 def image_info(path: Path, *, upright: bool = False) -> tuple[int, int, bool]:
     """Width, height and whether there is an alpha channel, from the file's header. upright: turned as EXIF says."""
-    with _open(path) as image:
+    with _open(path, header_only=True) as image:
         swapped = upright and _turn(image) in SWAPS
         return (*(image.size[::-1] if swapped else image.size), _has_alpha(image))
 

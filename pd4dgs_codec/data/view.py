@@ -31,6 +31,8 @@ from pd4dgs_codec.data.files import (
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.scene import Camera
 
+T = TypeVar("T")
+
 #: Frames per second of pictures that have numbers and no times.
 FPS = 30.0
 #: Largest |R Rᵀ - I| of a rotation, and | |q| - 1 | of a quaternion: files round to 3 or more decimals.
@@ -159,7 +161,7 @@ class Dataset:
         for view in self.train:
             digest.update(view.viewmat.tobytes() + view.K.tobytes())
             digest.update(repr((view.width, view.height, float(view.time))).encode())
-        for view in self.train[:: -(-len(self.train) // SAMPLED)]:
+        for view in thinned(self.train, SAMPLED):
             step = max(1, min(view.width, view.height) // PER_SIDE)
             digest.update(view.image[::step, ::step].tobytes())
         return digest.hexdigest()[:16]
@@ -224,6 +226,11 @@ def spread(views: Sequence[View], most: int) -> list[View]:
         allowed = np.where(far >= 0, uses[cameras], np.inf)
         picked.append(int(np.argmax(np.where(allowed == allowed.min(), far, -1))))
     return [views[i] for i in picked]
+
+
+def thinned(items: Sequence[T], most: int) -> Sequence[T]:
+    """Every k-th item from the first on, so that there are at most `most`."""
+    return items[:: max(1, -(-len(items) // most))]
 
 
 # -- lenses and poses --------------------------------------------------------------------------------------------------
@@ -413,7 +420,6 @@ def read_view(frame: UnreadView, time: float, downscale: int, under: Color | Non
 
 # -- datasets ----------------------------------------------------------------------------------------------------------
 
-T = TypeVar("T")
 Posed = TypeVar("Posed", UnreadView, View)
 
 
@@ -453,14 +459,16 @@ def posed_dataset(
     frames are numbers of frames. If frames have no times, the last number in the name of their picture is theirs, or
     the place of the name among all names.
     """
-    train, test = list(map(fitted, present(folder, train))), list(map(fitted, present(folder, test, needed=False)))
+    train, test = present(folder, train), present(folder, test, needed=False)
+    infos = {frame.image: image_info(frame.image) for frame in (*train, *test)}
+    train, test = ([fitted(frame, infos[frame.image][:2]) for frame in split] for split in (train, test))
     frames, under = [*train, *test], (background or WHITE) if composite else None
     files = {frame.image for frame in frames}
     if len(frames) > USES * len(files):
         raise DataError(f"{folder}: {len(frames)} frames of {len(files)} pictures, expected at most {USES} per picture")
     check_pixels(sum(frame.lens.width * frame.lens.height for frame in frames), files, str(folder))
     frames, shape = geometry(frames, points, depth, box)
-    alpha = composite and any(image_info(frame.image)[2] for frame in train)
+    alpha = composite and any(infos[frame.image][2] for frame in train)
     if untimed := [frame.name for frame in frames if frame.time is None]:
         if len(untimed) < len(frames):
             origin = replace(origin, notes=(*origin.notes, counted("no time counts, as frames have none", untimed)))
@@ -496,9 +504,10 @@ def present(folder: Path, frames: Sequence[UnreadView], *, needed: bool = True) 
     return found
 
 
-def fitted(frame: UnreadView) -> UnreadView:
-    """The frame with the lens scaled to the size of its picture, if the two clearly differ in size and not in shape."""
-    lens, size = frame.lens, image_info(frame.image)[:2]
+def fitted(frame: UnreadView, size: tuple[int, int]) -> UnreadView:
+    """The frame with the lens scaled to the size (width, height) of its picture, if the two clearly differ in size and
+    not in shape."""
+    lens = frame.lens
     x, y = size[0] / lens.width, size[1] / lens.height
     if abs(x - 1) < RESIZED or not same_shape((lens.width, lens.height), size):
         return frame

@@ -22,6 +22,8 @@ from pd4dgs_codec.draw.gaussians import (
 from pd4dgs_codec.draw.hexplane import Field
 from pd4dgs_codec.draw.rasteriser import draw
 from pd4dgs_codec.draw.simd import LANES
+from pd4dgs_codec.kinds import AnyScene
+from pd4dgs_codec.kinds.splats import Moving, Splats, SplatScene
 from pd4dgs_codec.scene import (
     MASK_STEP,
     MASK_THRESHOLD,
@@ -40,8 +42,59 @@ from pd4dgs_codec.scene import (
 )
 
 
-class Player:
-    """Draws the highest level of a decoded scene. Not thread-safe.
+class Drawer:
+    """Draws the highest level of a decoded scene of any kind. Not thread-safe."""
+
+    def __init__(self, scene: AnyScene):
+        self.info, self.level, self.background = scene.info, scene.level, scene.background()
+        self.active = scene.active  #: int64 [n]: the anchors active at this level, ascending
+
+    def gaussians(self, camera: Camera, t: float) -> Gaussians:
+        """Returns the Gaussians that the camera may see at normalised time t in 0..1."""
+        raise NotImplementedError
+
+    def picture(self, camera: Camera, t: float) -> np.ndarray:
+        """Draws float32 [H, W, 3] in 0..1 at normalised time t in 0..1. Raises RenderError unless t is finite."""
+        check_time(t)
+        g = self.gaussians(camera, t)
+        finite = np.isfinite(g.colors).all(axis=1)  # a colour that overflowed hides its Gaussian
+        opacities, colors = np.where(finite, g.opacities, np.float32(0)), np.nan_to_num(g.colors)
+        near = near_plane(self.info)
+        image, _ = draw(g.means, g.quats, g.scales, opacities, colors, camera, self.background, near_plane=near)
+        picture: np.ndarray = np.clip(image, 0, 1)
+        return picture
+
+
+def drawer(scene: AnyScene) -> Drawer:
+    """Returns what draws a scene of this kind."""
+    return SplatPlayer(scene) if isinstance(scene, SplatScene) else Player(scene)
+
+
+class SplatPlayer(Drawer):
+    """Draws splats. The Gaussians without their colours are kept until the time changes."""
+
+    def __init__(self, scene: SplatScene):
+        super().__init__(scene)
+        self.scene = scene
+        self._moving = Moving(scene)
+        self._time, self._latest = -1.0, self._moving.at(0.0)
+
+    def splats(self, t: float) -> tuple[Splats, np.ndarray]:
+        """Returns (the visible Gaussians at normalised time t, clamped to 0..1, their anchors int64 [K])."""
+        t = min(max(t, 0.0), 1.0)
+        if t != self._time:
+            with np.errstate(all="ignore"):
+                self._time, self._latest = t, self._moving.at(t)
+        return self._latest
+
+    def gaussians(self, camera: Camera, t: float) -> Gaussians:
+        splats, rows = self.splats(t)
+        with np.errstate(all="ignore"):
+            return splats.seen_from(camera.eye, rows)
+
+
+class Player(Drawer):
+    """Draws a scaffold. Not thread-safe.
 
     Results that do not depend on the eye are kept until the time changes: the anchors' residuals and, if opacity and
     covariance do not take the view direction, the Gaussians without colours (from the second view on). Further views at
@@ -49,7 +102,7 @@ class Player:
     """
 
     def __init__(self, scene: Scene):
-        self.info, self.level = scene.info, scene.level
+        super().__init__(scene)
         codes = scene.mask[-1]
         self._mask = codes.astype(np.float32) * MASK_STEP
         self._anchor = np.ascontiguousarray(scene.anchor[: len(codes)], np.float32)
@@ -75,28 +128,11 @@ class Player:
         self._slots, self._grown = np.zeros(0, np.int64), np.zeros((0, GAUSSIAN_WIDTH), np.float32)  # with colours of 0
 
     @property
-    def active(self) -> np.ndarray:
-        """int64 [n]: the anchors active at this level, ascending."""
-        return np.flatnonzero(self._mask > MASK_THRESHOLD)
-
-    @property
     def positions(self) -> np.ndarray:
         """float32 [N, 3]: positions of all anchors, undeformed, world."""
         return self._anchor
 
-    def picture(self, camera: Camera, t: float) -> np.ndarray:
-        """Draws float32 [H, W, 3] in 0..1 at normalised time t in 0..1. Raises RenderError unless t is finite."""
-        check_time(t)
-        g = self.gaussians(camera, t)
-        finite = np.isfinite(g.colors).all(axis=1)  # a colour that overflowed hides its Gaussian
-        opacities, colors = np.where(finite, g.opacities, np.float32(0)), np.nan_to_num(g.colors)
-        near = near_plane(self.info)
-        image, _ = draw(g.means, g.quats, g.scales, opacities, colors, camera, self.info.background, near_plane=near)
-        picture: np.ndarray = np.clip(image, 0, 1)
-        return picture
-
     def gaussians(self, camera: Camera, t: float) -> Gaussians:
-        """Returns the Gaussians that the camera may see at normalised time t in 0..1."""
         viewmat = np.asarray(camera.viewmat, np.float32)
         with np.errstate(all="ignore"):
             near = in_view(camera, viewmat, self._anchor, self._radius, self.info.near)

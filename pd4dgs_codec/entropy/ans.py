@@ -51,10 +51,11 @@ def models_of_each(cums: np.ndarray, sizes: np.ndarray) -> list[Model | None]:
     return [Model(frequencies[at : at + n], perfect=False) if n > 1 else None for at, n in pairs]
 
 
-def ans_encode(channels: Sequence[np.ndarray], cums: Sequence[np.ndarray]) -> bytes:
+def ans_encode(channels: Sequence[np.ndarray], cums: Sequence[np.ndarray], sizes: list[int] | None = None) -> bytes:
     """Encodes channels (int, 1-D, symbols 0 .. n - 1) in order, each under its own table cum [n + 1].
 
-    A channel whose table has one symbol costs nothing. Raises EncodeError for a bad symbol, Malformed for a bad table.
+    A channel whose table has one symbol costs nothing. sizes: gets the bits of the last channel, of the last two, and
+    so on. Raises EncodeError for a bad symbol, Malformed for a bad table.
     """
     if len(channels) != len(cums):
         raise EncodeError(f"{len(channels)} channels need as many frequency tables, found {len(cums)}")
@@ -62,15 +63,17 @@ def ans_encode(channels: Sequence[np.ndarray], cums: Sequence[np.ndarray]) -> by
     for index in range(len(channels) - 1, -1, -1):  # a stack: last in, first out
         symbols, cum = np.asarray(channels[index]), np.asarray(cums[index], dtype=np.int64)
         model = model_of(cum)
-        if symbols.size == 0:
-            continue
-        if symbols.ndim != 1 or symbols.dtype.kind not in "iu":
-            raise EncodeError(f"channel {index}: expected a 1-D integer array, found {symbols.dtype} {symbols.shape}")
-        low, high = int(symbols.min()), int(symbols.max())
-        if low < 0 or high > len(cum) - 2:
-            raise EncodeError(f"channel {index}: symbols {low}..{high} outside the table's 0..{len(cum) - 2}")
-        if model is not None:
-            coder.encode_reverse(np.ascontiguousarray(symbols, dtype=np.int32), model)
+        if symbols.size:
+            if symbols.ndim != 1 or symbols.dtype.kind not in "iu":
+                found = f"{symbols.dtype} {symbols.shape}"
+                raise EncodeError(f"channel {index}: expected a 1-D integer array, found {found}")
+            low, high = int(symbols.min()), int(symbols.max())
+            if low < 0 or high > len(cum) - 2:
+                raise EncodeError(f"channel {index}: symbols {low}..{high} outside the table's 0..{len(cum) - 2}")
+            if model is not None:
+                coder.encode_reverse(np.ascontiguousarray(symbols, dtype=np.int32), model)
+        if sizes is not None:
+            sizes.append(coder.num_valid_bits())
     words: np.ndarray = coder.get_compressed()
     return words[::-1].astype(_U32).tobytes()
 
@@ -94,6 +97,12 @@ class AnsDecoder:
             return np.zeros(count, dtype=np.int32)
         symbols: np.ndarray = self._coder.decode(model, count)
         return symbols
+
+    @property
+    def left(self) -> int:
+        """Number of bits not taken yet."""
+        bits: int = self._coder.num_valid_bits()
+        return bits
 
     def finish(self) -> None:
         """Raises Malformed unless exactly the stream's symbols have been taken: state 0 and no words left.

@@ -1,17 +1,16 @@
-"""Entropy coding of channels: int32 symbols <-> one self-contained payload.
+"""Entropy coding of channels: int32 symbols <-> the codes and the ANS stream of a slice.
 
-A payload begins with a record per non-empty channel: a varint token (family << 1 | has_exceptions), the parameters of a
-new prior if the family is below 8, and the exceptions, if any: their number, and for each the gap to the previous
-position and the distance outside the window. Family 8 + i stands for the prior defined i definitions before the latest;
-definitions of earlier payloads count if the caller passes them on.
-The ANS words of each channel's symbols follow.
+The *codes* have a record per non-empty channel: a varint token (family << 1 | has_exceptions), the parameters of a new
+prior if the family is below 8, and the exceptions, if any: their number, and for each the gap to the previous position
+and the distance outside the window. Family 8 + i stands for the prior defined i definitions before the latest of the
+channel's prior list. The stream holds the symbols of all channels. Both are written and read in batches of channels.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import accumulate
+from itertools import pairwise
 
 import numpy as np
 
@@ -30,17 +29,6 @@ from pd4dgs_codec.entropy.priors import (
 )
 from pd4dgs_codec.entropy.varint import VARINT_MAX, ByteReader, put_varint
 from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
-
-
-@dataclass(frozen=True)
-class CodedChannels:
-    payload: bytes
-    rate_bits: float  #: the sum of R(a), which does not depend on the priors
-
-    @property
-    def payload_bits(self) -> int:
-        """Bits of symbols, prior parameters and exceptions."""
-        return 8 * len(self.payload)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,30 +52,50 @@ def check_channels(channels: Sequence[np.ndarray]) -> list[np.ndarray]:
     return checked
 
 
-def encode_channels(
-    channels: Sequence[np.ndarray], *, priors: str = "best", effort: int = 5, known: list[Fitted] | None = None
-) -> CodedChannels:
-    """Encodes int32 channels (1-D, any lengths, |k| <= 2**24) into one payload.
+class ChannelWriter:
+    """Codes the channels of a slice, batch by batch in the order of decoding.
 
-    priors: "gauss" allows only const and gauss, the model of R(a). "best" allows every prior.
-    effort: 1..9, time spent on fitting. known: priors of earlier payloads, in order; a decoder must have them too. The
-    new ones are appended. Raises EncodeError.
+    priors: "gauss" allows only const and gauss, the model of R(a). "best" allows every prior. effort: 1..9, time spent
+    on fitting. later: whether earlier slices of the layer have defined priors. Raises EncodeError.
     """
-    if priors not in PRIORS or effort not in EFFORTS:
-        raise EncodeError(f"expected priors best or gauss and effort 1..9, found {priors!r} and {effort}")
-    arrays = check_channels(channels)
-    histograms = [histogram(a) for a in arrays if len(a)]
-    fit: Fit = (lambda h: fit_best(h, effort)) if priors == "best" and effort > 1 else fit_gauss
-    known = [] if known is None else known
-    plan = plan_priors(histograms, fit, effort > 2, known)
-    out, symbols, cums = bytearray(), list[np.ndarray](), list[np.ndarray]()
-    for array, fitted in zip(filter(len, arrays), plan, strict=True):
-        window = fitted.prior.window
-        inside, exceptions = _split(array, window)
-        _write_channel(out, fitted, exceptions, known)
-        symbols.append(inside - window.kmin)
-        cums.append(fitted.prior.cum)
-    return CodedChannels(bytes(out) + ans_encode(symbols, cums), sum(h.rate_bits for h in histograms))
+
+    def __init__(self, priors: str = "best", effort: int = 5, later: bool = False):
+        if priors not in PRIORS or effort not in EFFORTS:
+            raise EncodeError(f"expected priors best or gauss and effort 1..9, found {priors!r} and {effort}")
+        self.codes = bytearray()
+        self._ends = [(0, 0)]  # of the batches so far: channels and bytes of codes
+        self._fit: Fit = (lambda h: fit_best(h, effort)) if priors == "best" and effort > 1 else fit_gauss
+        self._share = effort > 2
+        self._spare = MORE_ENTRIES if later else FREE_ENTRIES  # window entries beyond the symbols of the batches
+        self._symbols, self._cums = list[np.ndarray](), list[np.ndarray]()
+
+    def write(self, channels: Sequence[np.ndarray], known: list[Fitted], counted: int | None = None) -> float:
+        """Codes channels int [any], |k| <= 2**24, as the next batch. Returns the sum of R(a).
+
+        known: the prior list, to which new priors are appended. counted: symbols for which the windows may have an
+        entry each, by default all; of further entries a batch uses at most half of what is left.
+        """
+        arrays = [array for array in check_channels(channels) if len(array)]
+        histograms, first = [histogram(a) for a in arrays], len(known)
+        counted = sum(map(len, arrays)) if counted is None else counted
+        plan = plan_priors(histograms, self._fit, self._share, known, counted + self._spare // 2)
+        for array, fitted in zip(arrays, plan, strict=True):
+            window = fitted.prior.window
+            inside, exceptions = _split(array, window)
+            _write_channel(self.codes, fitted, exceptions, known)
+            self._symbols.append(inside - window.kmin)
+            self._cums.append(fitted.prior.cum)
+        self._spare -= max(sum(fitted.prior.window.n for fitted in known[first:]) - counted, 0)
+        self._ends.append((len(self._symbols), len(self.codes)))
+        return sum(h.rate_bits for h in histograms)
+
+    def finish(self) -> tuple[bytes, bytes, list[int]]:
+        """Returns (codes, ANS stream, bits of each batch in both, but for the stream's rounding to words)."""
+        sizes = list[int]()
+        stream = ans_encode(self._symbols, self._cums, sizes)
+        left = [*sizes[::-1], 0]  # of each channel and those behind it
+        bits = [left[a] - left[b] + 8 * (end - start) for (a, start), (b, end) in pairwise(self._ends)]
+        return bytes(self.codes), stream, bits
 
 
 def _split(array: np.ndarray, window: Window) -> tuple[np.ndarray, _Exceptions]:
@@ -135,48 +143,57 @@ def _read_exceptions(reader: ByteReader, count: int, window: Window) -> _Excepti
     return _Exceptions(np.array(positions, dtype=np.int64), np.array(values, dtype=np.int64))
 
 
-def decode_channels(
-    payload: bytes | memoryview, counts: Sequence[int], known: list[Prior] | None = None
-) -> list[np.ndarray]:
-    """Inverse of encode_channels: one int32 [count] array per count; see `decode_joined`."""
-    symbols = decode_joined(payload, counts, known)
-    ends = accumulate(counts)
-    return [symbols[end - count : end] for count, end in zip(counts, ends, strict=True)]
+class ChannelReader:
+    """Decodes the channels of a slice, batch by batch: the inverse of ChannelWriter.
 
-
-def decode_joined(payload: bytes | memoryview, counts: Sequence[int], known: list[Prior] | None = None) -> np.ndarray:
-    """Decodes the channels of a payload into one array, int32 [sum of counts].
-
-    known: priors of earlier payloads, in order; this payload's definitions are appended. The caller has checked the
-    counts against its limits. Raises Malformed (cut, trailing or corrupt bytes), LimitExceeded, or UnsupportedFeature
-    (a prior outside the registry).
+    symbols: number of symbols that the slice declares. later: whether it is a later slice of its layer. The caller has
+    checked the numbers of symbols against its limits. Raises Malformed (cut, trailing or corrupt bytes), LimitExceeded,
+    or UnsupportedFeature (a prior outside the registry).
     """
-    for index, count in enumerate(counts):
-        if not 0 <= count <= MAX_COUNT:
-            raise LimitExceeded(f"channel {index}: {count} symbols, limit {MAX_COUNT}")
-    reader = ByteReader(payload)
-    defined = [] if known is None else known
-    first, heads, found = len(defined), list[_Head](), 0
-    most = sum(counts) + (MORE_ENTRIES if defined else FREE_ENTRIES)
-    for count in filter(None, counts):
-        before = len(defined)
-        head = _read_channel(reader, count, defined)
-        if len(defined) > before:
-            found += defined[-1].window.n
-            if found > most:
-                raise LimitExceeded(f"tables of {found} entries in one section, limit {most}")
-        elif heads and head[0] == heads[-1][0] and (longer := _joined(heads[-1], head)):
-            heads[-1] = longer
-            continue
-        heads.append(head)
-    stream = AnsDecoder(reader.rest())
-    make_models(defined[first:])
-    symbols, end = np.empty(sum(counts), np.int32), 0
-    for index, count, exceptions in heads:
-        end += count
-        _take_channel(stream, defined[index], exceptions, symbols[end - count : end])
-    stream.finish()
-    return symbols
+
+    def __init__(self, codes: bytes | memoryview, stream: bytes | memoryview, symbols: int, later: bool = False):
+        self.codes = ByteReader(codes)
+        self._stream = AnsDecoder(stream)
+        self._entries = self._most = symbols + (MORE_ENTRIES if later else FREE_ENTRIES)
+
+    def read(self, counts: Sequence[int], known: list[Prior]) -> np.ndarray:
+        """Decodes channels of these lengths into one array, int32 [sum of counts]. known: the prior list, to which new
+        priors are appended."""
+        first, heads = len(known), list[_Head]()
+        for count in filter(None, counts):
+            before = len(known)
+            head = _read_channel(self.codes, count, known)
+            if len(known) > before:
+                self._entries -= known[-1].window.n
+                if self._entries < 0:
+                    found = self._most - self._entries
+                    raise LimitExceeded(f"tables of {found} entries in one slice, limit {self._most}")
+            elif heads and head[0] == heads[-1][0] and (longer := _joined(heads[-1], head)):
+                heads[-1] = longer
+                continue
+            heads.append(head)
+        make_models(known[first:])
+        symbols, end = np.empty(sum(counts), np.int32), 0
+        for index, count, exceptions in heads:
+            end += count
+            _take_channel(self._stream, known[index], exceptions, symbols[end - count : end])
+        return symbols
+
+    @property
+    def bits(self) -> int:
+        """Bits read from codes and stream, up to a constant; the difference of two values is what lies between."""
+        return 8 * self.codes.offset - self._stream.left
+
+    def finish(self) -> None:
+        """Raises Malformed unless all codes and exactly the stream's symbols have been read."""
+        if self.codes.remaining:
+            raise Malformed(f"{self.codes.remaining} bytes of codes behind the last channel", offset=self.codes.offset)
+        self._stream.finish()
+
+
+def split(symbols: np.ndarray, counts: Sequence[int]) -> list[np.ndarray]:
+    """Returns the parts of these lengths of an array [sum of counts]."""
+    return np.split(symbols, np.cumsum(counts)[:-1]) if len(counts) else []
 
 
 #: (index of a channel's prior, number of its symbols, its exceptions).

@@ -18,10 +18,8 @@ import numpy as np
 
 from pd4dgs_codec.entropy.priors import (
     BIT,
-    FREE_ENTRIES,
     K_MAX,
     MAX_WINDOW,
-    MORE_ENTRIES,
     Const,
     Gauss,
     Mixture,
@@ -31,6 +29,7 @@ from pd4dgs_codec.entropy.priors import (
 )
 
 BLOCK = 256  #: channels planned together; keeps the cost matrix small
+NEAR = 48  #: latest priors whose tokens take one byte, even behind a few new ones
 WIDE = 1024  #: most distinct symbols of a channel that takes part in sharing; beyond, a prior's few bytes do not matter
 
 
@@ -78,12 +77,13 @@ class Histogram:
 @dataclass(frozen=True, eq=False)
 class Fitted:
     """A prior and its costs in 2^-20 bits. costs: int64 [n], of its table's entries. price: of its description.
-    own: of the symbols that it was fitted to."""
+    own: of the symbols that it was fitted to. token: of each use, beyond one byte."""
 
     prior: Prior
     costs: np.ndarray
     price: int
     own: int
+    token: int = 0
 
 
 def histogram(symbols: np.ndarray, times: np.ndarray | None = None) -> Histogram:
@@ -104,7 +104,8 @@ def pool(histograms: Sequence[Histogram]) -> Histogram:
 
 
 def costs_of(histograms: Sequence[Histogram], priors: Sequence[Fitted]) -> np.ndarray:
-    """Cost of coding each histogram's symbols under each prior, int64 [histograms, priors]; see `cost_matrix`."""
+    """Cost of coding each histogram's symbols under each prior, int64 [histograms, priors]; see `cost_matrix`. Tokens
+    count as far as they take more than a byte."""
     windows = [p.prior.window for p in priors]
     first = np.cumsum([0, *(len(p.costs) for p in priors[:-1])])
     shapes = np.array([(w.kmin, w.n, at) for w, at in zip(windows, first.tolist(), strict=True)], np.int64)
@@ -115,6 +116,7 @@ def costs_of(histograms: Sequence[Histogram], priors: Sequence[Fitted]) -> np.nd
         shapes,
         np.concatenate([p.costs for p in priors]),
     )
+    matrix += np.array([p.token for p in priors])
     return matrix
 
 
@@ -198,11 +200,15 @@ def _fullest_window(h: Histogram) -> Window:
 Fit = Callable[[Histogram], Fitted]
 
 
-def plan_priors(histograms: Sequence[Histogram], fit: Fit, share: bool, known: Sequence[Fitted]) -> list[Fitted]:
+def plan_priors(
+    histograms: Sequence[Histogram], fit: Fit, share: bool, known: Sequence[Fitted], room: int
+) -> list[Fitted]:
     """Returns the prior of each channel; channels that share one get the same object. share: whether channels may share
-    new priors. known: priors that were described earlier, at no cost now."""
+    new priors. known: priors that were described earlier, at no cost now. room: most entries of all new tables, at
+    least one per channel."""
     plan = [fit(h) for h in histograms]
-    free = [replace(fitted, price=0) for fitted in known]
+    far = len(known) - NEAR
+    free = [replace(fitted, price=0, token=8 * BIT * (i < far)) for i, fitted in enumerate(known)]
     if free and plan:
         plan = [
             own if own.own + own.price < costs[best] else free[best]
@@ -215,24 +221,28 @@ def plan_priors(histograms: Sequence[Histogram], fit: Fit, share: bool, known: S
         shared = _shared([histograms[c] for c in block], [plan[c] for c in block], free)
         for c, prior in zip(block, shared, strict=True):
             plan[c] = prior
-    return _within_limit(histograms, plan, free, fit)
+    return _within(room, histograms, plan, free, fit)
 
 
-def _within_limit(histograms: Sequence[Histogram], plan: list[Fitted], free: list[Fitted], fit: Fit) -> list[Fitted]:
-    """Returns the plan, changed if its tables have more entries than a section may define: then one prior for all their
-    channels replaces the widest new priors, or known priors do if there is no room for one."""
+def _within(
+    room: int, histograms: Sequence[Histogram], plan: list[Fitted], free: list[Fitted], fit: Fit
+) -> list[Fitted]:
+    """Returns the plan, changed if its new tables have more than `room` entries: then one prior for all their channels
+    replaces the widest new ones, or known priors and constants do if there is no room for one."""
     known = {id(p.prior) for p in free}
     distinct = {id(p.prior): p for p in plan if id(p.prior) not in known}.values()
     ordered = sorted(distinct, key=lambda p: p.prior.window.n)
     ends = np.cumsum([p.prior.window.n for p in ordered])
-    left = sum(int(h.counts.sum()) for h in histograms) + (MORE_ENTRIES if free else FREE_ENTRIES)
-    if not ordered or ends[-1] <= left:
+    if not ordered or ends[-1] <= room:
         return plan
-    kept = known | {id(p.prior) for p, end in zip(ordered, ends, strict=True) if end <= left - MAX_WINDOW}
+    kept = known | {id(p.prior) for p, end in zip(ordered, ends, strict=True) if end <= room - MAX_WINDOW}
     rest = [c for c, p in enumerate(plan) if id(p.prior) not in kept]
-    if free and left < MAX_WINDOW:
-        nearest = costs_of([histograms[c] for c in rest], free).argmin(axis=1)
-        replaced = dict(zip(rest, [free[i] for i in nearest], strict=True))
+    if room < MAX_WINDOW:
+        replaced = {}
+        for c in rest:
+            mode = int(histograms[c].counts.argmax())
+            candidates = [*free, _const(histograms[c], mode)]
+            replaced[c] = candidates[int(costs_of([histograms[c]], candidates)[0].argmin())]
     else:
         replaced = dict.fromkeys(rest, fit(pool([histograms[c] for c in rest])))
     return [replaced.get(c, p) for c, p in enumerate(plan)]

@@ -1,8 +1,8 @@
 """Mode lzma: channels coded by LZMA2 instead of ANS, in the byte layout that LZMA2 codes best.
 
-A payload has one byte of flags (bit 0: the bytes of wide numbers lie in separate planes), a varint (zigzag(base) << 2 |
-log2(width)) per non-empty channel, and one raw LZMA2 stream of the channels in order, each as little-endian signed
-integers k - base of the narrowest width in bytes.
+The codes have a varint (zigzag(base) << 2 | log2(width)) per non-empty channel. The stream is one raw LZMA2 stream of
+the channels in order, each as little-endian signed integers k - base of the narrowest width in bytes, and all bytes of
+lowest weight before those of the next.
 """
 
 import itertools
@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from pd4dgs_codec.entropy.ans import MAX_COUNT
+from pd4dgs_codec.entropy import EFFORTS
 from pd4dgs_codec.entropy.channels import check_channels
 from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
@@ -23,26 +23,21 @@ _SAMPLE = 1 << 19  #: bytes on which the search compares settings
 _SIGNED: list[np.dtype] = [np.dtype("<i1"), np.dtype("<i2"), np.dtype("<i4")]
 
 
-def encode_channels_lzma(channels: Sequence[np.ndarray], *, effort: int = 5) -> bytes:
-    """Encodes int32 channels (1-D, |k| <= 2**24). effort: 1..9, settings to try. Raises EncodeError."""
-    head, numbers = bytearray(), list[np.ndarray]()
+def encode_channels_lzma(channels: Sequence[np.ndarray], effort: int = 5) -> tuple[bytes, bytes]:
+    """Encodes int32 channels (1-D, |k| <= 2**24): (codes, stream), both empty without symbols. effort: 1..9, settings
+    to try. Raises EncodeError."""
+    codes, numbers = bytearray(), list[np.ndarray]()
     for array in check_channels(channels):
         if len(array):
             base, log_width = _narrowest(int(array.min()), int(array.max()))
-            put_varint(head, (2 * base if base >= 0 else -2 * base - 1) << 2 | log_width)
+            put_varint(codes, (2 * base if base >= 0 else -2 * base - 1) << 2 | log_width)
             numbers.append((array - base).astype(_SIGNED[log_width]))
-    return _compress(bytes(head), numbers, effort)
+    return bytes(codes), _compress(numbers, effort) if numbers else b""
 
 
-def decode_channels_lzma(payload: bytes | memoryview, counts: Sequence[int]) -> list[np.ndarray]:
+def decode_channels_lzma(codes: bytes | memoryview, stream: bytes, counts: Sequence[int]) -> list[np.ndarray]:
     """Inverse of encode_channels_lzma: one int32 [count] array per count. Raises Malformed or LimitExceeded."""
-    for index, count in enumerate(counts):
-        if not 0 <= count <= MAX_COUNT:
-            raise LimitExceeded(f"array {index}: {count} numbers, limit {MAX_COUNT}")
-    reader = ByteReader(payload)
-    flags = reader.byte("the layout's flags")
-    if flags > 1:
-        raise Malformed(f"the layout's flags is {flags:#04x}, bits 1..7 are reserved", offset=0)
+    reader = ByteReader(codes)
     bases, dtypes = list[int](), list[np.dtype]()
     for count in counts:
         code = reader.varint(8 * K_MAX + 3, "a channel's base and width") if count else 0
@@ -50,8 +45,10 @@ def decode_channels_lzma(payload: bytes | memoryview, counts: Sequence[int]) -> 
             raise Malformed("a channel of 8-byte symbols, expected 1, 2 or 4", offset=reader.offset)
         bases.append(-((code >> 2) + 1) // 2 if code & 4 else code >> 3)
         dtypes.append(_SIGNED[code & 3])
+    if reader.remaining:
+        raise Malformed(f"{reader.remaining} bytes of codes behind the last channel", offset=reader.offset)
     arrays = []
-    for base, numbers in zip(bases, _decompress(reader, dtypes, counts, bool(flags)), strict=True):
+    for base, numbers in zip(bases, _decompress(stream, dtypes, counts), strict=True):
         symbols = numbers.astype(np.int64) + base
         if len(symbols) and int(np.abs(symbols).max()) > K_MAX:
             raise Malformed(f"symbols {symbols.min()}..{symbols.max()}, limit |k| <= {K_MAX}")
@@ -67,12 +64,6 @@ def _narrowest(low: int, high: int) -> tuple[int, int]:
         if high - low < 2 * limit:
             return min(low + limit, K_MAX), log_width
     return 0, 2
-
-
-def _layout(numbers: Sequence[np.ndarray], planar: bool) -> bytes:
-    if not planar:
-        return b"".join(n.tobytes() for n in numbers)
-    return b"".join(n.view(np.uint8).reshape(-1, n.itemsize).T.tobytes() for n in numbers)
 
 
 def _filters(size: int, lc: int, lp: int, pb: int) -> list[dict[str, int]]:
@@ -104,36 +95,30 @@ def _sample(data: bytes) -> bytes:
     return b"".join(data[(len(data) - piece) * i // 7 & ~3 :][:piece] for i in range(8))
 
 
-def _compress(head: bytes, numbers: Sequence[np.ndarray], effort: int) -> bytes:
-    if not 1 <= effort <= 9:
+def _compress(numbers: Sequence[np.ndarray], effort: int) -> bytes:
+    if effort not in EFFORTS:
         raise EncodeError(f"effort is {effort}, expected 1..9")
-    layouts = {False: _layout(numbers, False)}
-    if len(layouts[False]) > MAX_RAW:
-        raise EncodeError(f"LZMA: {len(layouts[False])} bytes uncompressed, limit {MAX_RAW}")
-    if effort >= 4 and any(n.itemsize > 1 for n in numbers):
-        layouts[True] = _layout(numbers, True)
-    trials = [(planar, setting) for planar in layouts for setting in _settings(effort)]
-    if len(trials) > 1:
-        samples = {planar: _sample(data) for planar, data in layouts.items()}
-        trials.sort(key=lambda trial: len(_packed(samples[trial[0]], trial[1])))
-    planar, setting = trials[0]
-    return bytes([planar]) + head + _packed(layouts[planar], setting)
+    data = b"".join(n.view(np.uint8).reshape(-1, n.itemsize).T.tobytes() for n in numbers)
+    if len(data) > MAX_RAW:
+        raise EncodeError(f"LZMA: {len(data)} bytes uncompressed, limit {MAX_RAW}")
+    settings = _settings(effort)
+    if len(settings) > 1:
+        sample = _sample(data)
+        settings.sort(key=lambda setting: len(_packed(sample, setting)))
+    return _packed(data, settings[0])
 
 
-def _decompress(
-    reader: ByteReader, dtypes: Sequence[np.dtype], counts: Sequence[int], planar: bool
-) -> list[np.ndarray]:
+def _decompress(stream: bytes, dtypes: Sequence[np.dtype], counts: Sequence[int]) -> list[np.ndarray]:
     size = sum(count * dtype.itemsize for count, dtype in zip(counts, dtypes, strict=True))
     if size > MAX_RAW:
         raise LimitExceeded(f"LZMA: {size} bytes uncompressed, limit {MAX_RAW}")
-    data = _inflate(bytes(reader.rest()), size)
-    arrays, at = [], 0
+    if not size and stream:
+        raise Malformed(f"LZMA: a stream of {len(stream)} bytes without symbols, expected none")
+    data, arrays, at = _inflate(stream, size) if size else b"", [], 0
     for count, dtype in zip(counts, dtypes, strict=True):
         part = np.frombuffer(data, dtype=np.uint8, count=count * dtype.itemsize, offset=at)
         at += part.size
-        if planar:
-            part = np.ascontiguousarray(part.reshape(dtype.itemsize, count).T)
-        arrays.append(part.reshape(-1).view(dtype))
+        arrays.append(np.ascontiguousarray(part.reshape(dtype.itemsize, count).T).reshape(-1).view(dtype))
     return arrays
 
 

@@ -1,12 +1,11 @@
-"""Anchor positions (voxel cells, int32 [N, 3]) <-> payload bytes, lossless, in Morton order: a breadth-first octree.
+"""Anchor positions (voxel cells, int32 [N, 3]) <-> codes and channels, lossless, in Morton order: an octree by levels.
 
-Payload (clause 10 of the format; the decoder knows N)
-    Empty for N = 0. Else three zigzag varints, the minimum of the cells along x, y, z, and u8 R, the bit length of the
-    largest cell - minimum. The octree has one node of side 2**R; at level = R .. 1 every node is replaced by its
-    occupied children, in Morton order. A level of fewer than N nodes states two varints: the number of nodes with one
-    child, and the sum of (children - 2) over its other nodes. After the last such level come six varints, the numbers
-    of nodes with 2 .. 7 children. These give the length of every channel. The rest is one section of coded channels
-    (`channels`).
+Codes before the channels (clause 10; the decoder knows N)
+    Three zigzag varints, the minimum of the cells along x, y, z, and u8 R, the bit length of the largest cell -
+    minimum. The octree has one node of side 2**R; at level = R .. 1 every node is replaced by its occupied children, in
+    Morton order. A level of fewer than N nodes states two varints: the number of nodes with one child, and the sum of
+    (children - 2) over its other nodes. After the last such level come six varints, the numbers of nodes with 2 .. 7
+    children. These give the length of every channel.
 
 Channels
     Per level, three channels: the number of children less one, of the nodes whose parent has one child and of the other
@@ -19,14 +18,12 @@ Every table is static, so a level is one vectorised step.
 import numpy as np
 
 from pd4dgs_codec.entropy.ans import MAX_COUNT
-from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
+from pd4dgs_codec.entropy.channels import ChannelReader, ChannelWriter, split
 from pd4dgs_codec.entropy.fitting import Fitted
 from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
 from pd4dgs_codec.errors import EncodeError, Malformed
 from pd4dgs_codec.morton import AXIS_BITS, MAX_VOXEL, join_bits, morton_codes
-
-LEAST_EFFORT = 3  #: below it, channels share no priors, and at 1 have only Gaussians: 4 to 13 % more bytes
 
 _CHILDREN = np.array([value.bit_count() for value in range(256)])  # by occupancy byte
 _PATTERNS = [np.flatnonzero(_CHILDREN == k) for k in range(9)]  #: bytes with k children, ascending
@@ -38,20 +35,16 @@ _CHILD = np.argsort((np.arange(256)[:, None] >> np.arange(8) & 1) == 0, axis=1, 
 _CODED = range(2, 8)  # numbers of children with more than one pattern; nodes with one child have channels of their own
 
 
-def encode_positions(cells: np.ndarray, effort: int = 5, known: list[Fitted] | None = None) -> bytes:
-    """Encodes cells int32 [N, 3] (voxels), which must be distinct and in Morton order (`morton_order`).
-
-    effort: 1..9, time spent on fitting tables; at least LEAST_EFFORT is used. known: priors of earlier payloads, to
-    which new ones are appended. Raises EncodeError as position_channels does.
-    """
+def encode_positions(cells: np.ndarray, writer: ChannelWriter, known: list[Fitted]) -> None:
+    """Codes cells int32 [N, 3] (voxels), which must be distinct and in Morton order (`morton_order`), as a batch.
+    known: the prior list. Raises EncodeError as position_channels does."""
     head, channels = position_channels(cells)
-    if not head:
-        return b""
-    return head + encode_channels(channels, effort=max(effort, LEAST_EFFORT), known=known).payload
+    writer.codes += head
+    writer.write(channels, known, cells.size)
 
 
 def position_channels(cells: np.ndarray) -> tuple[bytes, list[np.ndarray]]:
-    """Returns (bytes before the section of coded channels, channels), both empty without cells.
+    """Returns (codes before the channels, channels), both empty without cells.
 
     Raises EncodeError unless the cells are distinct, in Morton order and within -2**20 .. 2**20.
     """
@@ -103,17 +96,12 @@ def _occupancies(codes: np.ndarray, depth: int) -> list[np.ndarray]:
     return levels[::-1]
 
 
-def decode_positions(payload: bytes | memoryview, count: int, known: list[Prior] | None = None) -> np.ndarray:
-    """Decodes cells int32 [count, 3], in Morton order. Memory is O(count), whatever the bytes say.
-
-    known: priors of earlier payloads, to which this payload's are appended.
-    Raises Malformed, LimitExceeded or UnsupportedFeature for a payload that encode_positions could not write.
-    """
-    if count <= 0:
-        if count or len(payload):
-            raise Malformed(f"positions: {len(payload)} bytes for {count} cells, expected 0 bytes for 0 cells")
+def decode_positions(channels: ChannelReader, count: int, known: list[Prior]) -> np.ndarray:
+    """Decodes cells int32 [count, 3], in Morton order. Memory is O(count), whatever the bytes say. known: the prior
+    list. Raises Malformed, LimitExceeded or UnsupportedFeature for codes that encode_positions could not write."""
+    if not count:
         return np.zeros((0, 3), dtype=np.int32)
-    reader = ByteReader(payload)
+    reader = channels.codes
     low = [reader.zigzag(MAX_VOXEL, "the smallest cell") for _ in range(3)]
     depth = reader.byte("the octree's depth", AXIS_BITS)
     nodes, single = _read_counts(reader, depth, count)
@@ -125,8 +113,8 @@ def decode_positions(payload: bytes | memoryview, count: int, known: list[Prior]
     for have, alone in zip(nodes, single, strict=True):
         lengths += [only, have - only, alone] if have < count else [alone]
         only = alone
-    channels = decode_channels(reader.rest(), [*lengths, *sizes], known)
-    codes = _grow(channels, nodes, single, sizes, count)
+    found = split(channels.read([*lengths, *sizes], known), [*lengths, *sizes])
+    codes = _grow(found, nodes, single, sizes, count)
     offsets = np.stack([join_bits(codes >> axis) for axis in range(3)], axis=1)
     if offsets.min(axis=0).any() or int(offsets.max()).bit_length() != depth:
         raise Malformed("positions: the minimum or the depth does not fit the cells")

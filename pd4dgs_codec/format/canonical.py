@@ -225,3 +225,10 @@ def as_list(value: object, where: str, count: int | None = None) -> list[Any]:
     if count is not None and len(value) != count:
         raise Malformed(f"{where}: {len(value)} entries, expected {count}")
     return value
+
+
+def as_long(value: object, where: str, most: int, least: int = 1) -> list[Any]:
+    """Returns `value` as a list of least..most entries. Raises LimitExceeded for more, Malformed for anything else."""
+    entries = as_list(value, where)
+    as_integer(len(entries), most, f"{where}: number of entries", least)
+    return entries

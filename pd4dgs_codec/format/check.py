@@ -1,31 +1,38 @@
-"""Encoder: checks a scene before it is written, and the quantisation errors of its symbols.
+"""Checks a scene before it is written, and the quantisation errors of its symbols."""
 
-By clause 11.5 and rounding half to even, |x - x_hat| <= Q/2 plus half a unit in the last place of x_hat, because the
-product k Q is rounded to binary32. Voxel indices and mask codes are integers and decode exactly. The header declares
-one bound per field of Steps (clause 5.4). An anchor of step class c has 2^c times the steps and the bounds.
-"""
-
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
-from pd4dgs_codec.errors import EncodeError
-from pd4dgs_codec.format.deformation import arrays_of, check_tensors
+from pd4dgs_codec import kinds
+from pd4dgs_codec.errors import DecodeError, EncodeError
 from pd4dgs_codec.format.header import MAX_CAMERA_SIDE, info_fault
+from pd4dgs_codec.format.plan import SceneSymbols
 from pd4dgs_codec.format.quantise import all_finite, dequantise, expect, expect_array, is_step, magnitude, row_blocks
-from pd4dgs_codec.format.registry import LAYER_KINDS
-from pd4dgs_codec.format.symbols import SceneSymbols
+from pd4dgs_codec.format.tables import Tensors
+from pd4dgs_codec.kinds import AnyScene
+from pd4dgs_codec.kinds.tracks import Tracks
 from pd4dgs_codec.morton import MAX_VOXEL
-from pd4dgs_codec.scene import MASK_MIN_CODE, MAX_CLASS, MAX_FEATURE, MAX_SLOTS, Scene, SceneInfo
+from pd4dgs_codec.scene import (
+    INSTANTS,
+    MASK_MIN_CODE,
+    MAX_CLASS,
+    MAX_FEATURE,
+    MAX_SLOTS,
+    PLANES,
+    SCAFFOLD_NETWORKS,
+    TRUNK,
+    Deformation,
+    Scene,
+    SceneInfo,
+)
 
-#: Extra share of Q: |x| / Q <= 2^23 in binary64 is off by at most 2^-30, which may round a tie the other way.
-_TIES = 2.0**-29
 
-
-def check_scene(scene: Scene) -> None:
-    """Raises EncodeError unless `scene` has the shapes, dtypes and ranges that scene.Scene documents."""
+def check_scene(scene: AnyScene) -> None:
+    """Raises EncodeError unless `scene` has the shapes, dtypes and ranges that its class documents."""
     layers, rows = scene.layers, scene.rows
     expect(layers[:1] == (0,) and set(layers) <= {0, 1, 2}, f"layers {layers}, expected 0 first and only 0, 1, 2")
     expect(all(a < b for a, b in pairwise(layers)), f"layers {layers}, expected ascending numbers")
@@ -38,6 +45,29 @@ def check_scene(scene: Scene) -> None:
     size = scene.info.voxel_size
     finite = not is_step(size) or all_finite(scene.anchor_q, size)
     expect(finite, f"anchor_q: a position is infinite at voxel size {size:g}, expected finite positions")
+    if isinstance(scene, Scene):
+        _check_widths(scene)
+    width = 0
+    for name, values in scene.attributes.items():
+        expect_array(name, values, np.float32, (n, *values.shape[1:]))
+        width += math.prod(values.shape[1:])
+    if scene.grading is not None:
+        expect_array("step classes", scene.grading.classes, np.uint8, (n,))
+        largest = int(scene.grading.classes.max(initial=0))
+        expect(largest <= MAX_CLASS, f"step classes: {largest}, expected at most {MAX_CLASS}")
+        expect_array("centre of the attributes", scene.grading.centre, np.float32, (width,))
+    _check_masks(scene)
+    check_info(scene.info)
+    for name, step in (vars(scene.steps) if isinstance(scene, Scene) else scene.steps).items():
+        expect(is_step(step), f"step of {name}: {step!r}, expected a positive normal binary32 value")
+    for fill in scene.fills:
+        valid = fill is None or (len(fill) == 3 and all(type(c) is int and 0 <= c <= 255 for c in fill))
+        expect(valid, f"fill {fill}, expected None or three integers 0..255")
+    expect(len(scene.fills) in (0, len(layers)), f"{len(scene.fills)} fills, expected none or one per layer {layers}")
+    _check_tensors(scene)
+
+
+def _check_widths(scene: Scene) -> None:
     for name, axes in (("feature", 2), ("offset", 3)):
         found = scene.attributes[name].shape
         expect(len(found) == axes, f"{name}: an array of {len(found)} axes, expected {axes}")
@@ -45,24 +75,68 @@ def check_scene(scene: Scene) -> None:
     for what, width, limit in (("feature width", widths.feature, MAX_FEATURE), ("slots", widths.slots, MAX_SLOTS)):
         expect(1 <= width <= limit, f"{what}: {width}, expected 1..{limit}")
     for name, shape in widths.attributes.items():
-        expect_array(name, scene.attributes[name], np.float32, (n, *shape))
-    if scene.grading is not None:
-        expect_array("step classes", scene.grading.classes, np.uint8, (n,))
-        largest = int(scene.grading.classes.max(initial=0))
-        expect(largest <= MAX_CLASS, f"step classes: {largest}, expected at most {MAX_CLASS}")
-        expect_array("centre of the attributes", scene.grading.centre, np.float32, (widths.channels,))
-    _check_masks(scene)
-    check_info(scene.info)
-    for name, step in vars(scene.steps).items():
-        expect(is_step(step), f"step of {name}: {step!r}, expected a positive normal binary32 value")
-    for kind in LAYER_KINDS:
-        if kind.layer == 0 or scene.deformation(kind.layer) is not None:
-            expect(kind.layer in layers, f"{kind.name} is given, but layer {kind.layer} is not among {layers}")
-            below = scene.global_deformation if kind.layer == 2 else None
-            check_tensors(scene.tensors(kind.layer), kind, widths, below)
+        expect_array(name, scene.attributes[name], np.float32, (scene.rows[-1], *shape))
 
 
-def _check_masks(scene: Scene) -> None:
+def _check_tensors(scene: AnyScene) -> None:
+    """Checks the grids, chains and layer rows of all layers, and then the rules of the kinds."""
+    found = dict[int, Tensors]()
+    for layer in range(3):
+        given, own = scene.deformation(layer), kinds.layer_name(scene, layer)
+        if layer and given is None:
+            continue
+        expect(layer in scene.layers, f"{own} is given, but layer {layer} is not among {scene.layers}")
+        if isinstance(given, Tracks):
+            _check_tracks(given, own, scene.rows[-1])
+        elif isinstance(scene, Scene):
+            _check_deformation(given or Deformation((), scene.networks), layer)
+        tensors = kinds.tensors_of(scene, layer)
+        names = [f"{own} {name}" for name in kinds.array_names(layer, tensors.tables)]
+        shapes = tensors.tables.planes + tensors.tables.weights
+        for name, array, shape in zip(names, tensors.arrays, shapes, strict=True):
+            expect_array(name, array, np.float32, shape)
+        valued = isinstance(given, Tracks)  # the instants have rules of their own
+        found[layer] = tensors.quantised(names.__getitem__) if valued else Tensors(tensors.tables)
+        try:
+            kinds.check(kinds.kind_of(scene), kinds.row_table(scene), found)
+        except DecodeError as error:
+            raise EncodeError(f"{own}: {error}") from None
+
+
+def _check_deformation(given: Deformation, layer: int) -> None:
+    own = kinds.NAMES[layer]
+    known, required = (kinds.hexplane.CHAINS, (TRUNK,)) if layer else (SCAFFOLD_NETWORKS, SCAFFOLD_NETWORKS)
+    unknown = [name for name in given.networks if name not in known]
+    expect(not unknown, f"{own}: networks {unknown}, expected some of {list(known)}")
+    missing = [name for name in required if name not in given.networks]
+    expect(not missing, f"{own} networks {missing} are missing")
+    for name, network in given.networks.items():
+        axes = [(weight.ndim, bias.ndim) for weight, bias in network]
+        expect(set(axes) == {(2, 1)}, f"{own} network {name}: no layers, or other axes than of weight and bias")
+    for s, planes in enumerate(given.planes):
+        expect(set(planes) == {p for p, _, _ in PLANES}, f"{own} scale {s}: planes {sorted(planes)}, expected six")
+        flat = [name for name, plane in planes.items() if plane.ndim != 3 or not plane.size]
+        expect(not flat, f"{own} scale {s}: planes {flat} are empty or do not have 3 axes")
+    key = given.key
+    valid = key is None or (type(key) is int and 0 <= key <= INSTANTS)
+    expect(valid, f"{own}: key instant {key!r}, expected None or an integer 0..{INSTANTS}")
+
+
+def _check_tracks(given: Tracks, own: str, rows: int) -> None:
+    count = len(given.instants)
+    expect_array(f"{own} instants", given.instants, np.float32, (count,))
+    unknown = [name for name in given.heads if name not in kinds.tracks.HEADS]
+    expect(not unknown, f"{own}: heads {unknown}, expected some of {list(kinds.tracks.HEADS)}")
+    for name, head in given.heads.items():
+        number = len(head.bases)
+        expect(number > 0, f"{own}: no bases of {name}, expected some, or no such head")
+        expect_array(f"{own} bases of {name}", head.bases, np.float32, (number, kinds.tracks.HEADS[name], count))
+        most = min(len(head.coefficients), rows)
+        expect_array(f"{own} coefficients of {name}", head.coefficients, np.float32, (most, number))
+        expect(is_step(head.step), f"{own} step of {name}: {head.step!r}, expected a positive normal binary32 value")
+
+
+def _check_masks(scene: AnyScene) -> None:
     for layer, rows, codes in zip(scene.layers, scene.rows, scene.mask, strict=True):
         expect_array(f"mask of layer {layer}", codes, np.uint8, (rows,))
         odd = (codes > 0) & (codes < MASK_MIN_CODE)
@@ -96,11 +170,15 @@ def check_info(info: SceneInfo) -> None:
 
 # -- errors ------------------------------------------------------------------------------------------------------------
 
+#: Extra share of Q: |x| / Q <= 2^23 in binary64 is off by at most 2^-30, which may round a tie the other way.
+_TIES = 2.0**-29
+
 
 @dataclass(frozen=True)
-class ErrorBound:
-    """Errors of all tensors that share a step, in the unit of the values, divided by 2^c in step class c. what: the
-    field of Steps. step: Q. bound: the error that the header declares. largest: the largest error."""
+class Errors:
+    """Errors of all values that share a step, in the unit of the values, divided by 2^c in step class c. what: the
+    field of Steps, or the tensor of splats or of their tracks. step: Q. bound: of rounding, for the largest value.
+    largest: the largest error."""
 
     what: str
     step: float
@@ -108,64 +186,39 @@ class ErrorBound:
     largest: float
 
 
-def rounding_bounds(symbols: SceneSymbols) -> dict[str, float]:
-    """Returns the largest error of rounding to the nearest symbol, rounded up to binary32, by field of Steps that the
-    symbols use. The symbol farthest from 0 has the largest bound."""
-    # They hold in every step class c: an error is at most 2^c Q/2 plus half a unit in the last place, and 2^c times the
-    # bound is no less.
-    farthest: dict[str, int] = {}
-    for layer in symbols.layers:
-        found = list(symbols.grid.farthest(layer.attributes, layer.classes).items())
-        found += [(what, magnitude(k)) for what, _, k in arrays_of(layer.tensors, layer.kind)]
-        for what, k in found:
-            farthest[what] = max(farthest.get(what, 0), k)
-    steps = vars(symbols.steps)
-    return {
-        what: _rounded_up(float(_bounds(dequantise(np.array([k]), steps[what]), steps[what])[0]))
-        for what, k in farthest.items()
-    }
-
-
-def verify_errors(given: Scene, symbols: SceneSymbols, declared: Mapping[str, float]) -> list[ErrorBound]:
-    """Returns the errors for each entry of `declared`, the bounds in the header.
-
-    given: the planned scene that was quantised. Raises EncodeError naming the field if the error of a dequantised value
-    exceeds the declared bound or the bound of rounding.
-    """
-    steps, largest = vars(symbols.steps), dict.fromkeys(declared, 0.0)
-    for what, x, restored, spacing in _pairs(given, symbols):
+def verify_errors(given: AnyScene, symbols: SceneSymbols) -> list[Errors]:
+    """Returns the errors by step. given: the planned scene that was quantised. Raises EncodeError naming the step if a
+    value is farther from its dequantised one than rounding explains: half a step, and half a unit in the last place
+    because the product v Q is rounded to binary32."""
+    found = dict[str, Errors]()
+    for what, step, x, restored, spacing in _pairs(given, symbols):
+        bounds = (0.5 + _TIES) * step + 0.5 * np.spacing(np.abs(restored)).astype(np.float64) / spacing
         errors = np.abs(x.astype(np.float64) - restored) / spacing
-        bounds = np.minimum(_bounds(np.abs(restored), steps[what]), declared[what])
         if not (errors <= bounds).all():
             place = np.unravel_index(int((errors - bounds).argmax()), errors.shape)
-            row = f"{what}: {x[place]} is decoded as {restored[place]} at step {steps[what]:g}"
+            row = f"{what}: {x[place]} is decoded as {restored[place]} at step {step:g}"
             raise EncodeError(f"verification: {row}, expected an error of at most {bounds[place]:.9g}")
-        largest[what] = max(largest[what], float(errors.max(initial=0.0)))
-    return [ErrorBound(what, steps[what], bound, largest[what]) for what, bound in declared.items()]
+        before = found.get(what, Errors(what, step, 0.0, 0.0))
+        worst = [max(a, float(b.max(initial=0.0))) for a, b in ((before.bound, bounds), (before.largest, errors))]
+        found[what] = Errors(what, step, *worst)
+    return list(found.values())
 
 
-def _pairs(given: Scene, symbols: SceneSymbols) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray | float]]:
-    """Yields (field of Steps, values given, values dequantised, 2^(step class) of each)."""
+def _pairs(
+    given: AnyScene, symbols: SceneSymbols
+) -> Iterator[tuple[str, float, np.ndarray, np.ndarray, np.ndarray | float]]:
+    """Yields (what has the step, the step, values given, values dequantised, 2^(step class) of each)."""
     first = 0
-    for layer in symbols.layers:
-        for rows in row_blocks(len(layer.anchor_q)):
-            own, classes = slice(first + rows.start, first + rows.stop), layer.classes[rows]
-            for name, x in symbols.grid.dequantise(layer.attributes[:, rows], classes).items():
-                spacing = 2.0 ** classes.reshape(-1, *(1,) * (x.ndim - 1)) if classes.size else 1.0
-                yield name, given.attributes[name][own], x, spacing
-        first += len(layer.anchor_q)
-        both = (arrays_of(given.tensors(layer.kind.layer), layer.kind), arrays_of(layer.tensors, layer.kind))
-        for (what, _, x), (*_, k) in zip(*both, strict=True):
-            yield what, x, dequantise(k, layer.steps[what]), 1.0
-
-
-def _bounds(magnitudes: np.ndarray, step: float) -> np.ndarray:
-    """Returns the error bounds float64 of dequantised values of these float32 magnitudes."""
-    last_place: np.ndarray = np.spacing(magnitudes).astype(np.float64)
-    return (0.5 + _TIES) * step + 0.5 * last_place
-
-
-def _rounded_up(value: float) -> float:
-    """Returns the least binary32 value that is not below `value`."""
-    nearest = np.float32(value)
-    return float(nearest if nearest >= value else np.nextafter(nearest, np.float32(np.inf)))
+    for part in symbols.layers:
+        for at in row_blocks(len(part.codes)):
+            own, classes = slice(first + at.start, first + at.stop), part.classes[at]
+            spacing = 2.0 ** classes[:, None] if classes.size else 1.0
+            restored = zip(part.table.tensors, part.table.dequantise(part.rows[:, at]), strict=True)
+            for (name, x), (tensor, y) in zip(given.attributes.items(), restored, strict=True):
+                yield name, tensor.step, x[own].reshape(y.shape), y, spacing
+        first += len(part.codes)
+        layer, tensors = part.layer, kinds.tensors_of(given, part.layer)
+        names = kinds.step_names(layer) if isinstance(given, Scene) else (kinds.layer_name(given, layer),)
+        fields = [names[0]] * len(tensors.planes) + [names[-1]] * len(tensors.weights)
+        for what, step, x, k in zip(fields, tensors.tables.steps, tensors.arrays, part.tensors.arrays, strict=True):
+            yield what, step, x, dequantise(k, step), 1.0

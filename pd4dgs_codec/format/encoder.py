@@ -11,7 +11,7 @@ import numpy as np
 
 from pd4dgs_codec.entropy.fitting import Fitted
 from pd4dgs_codec.errors import DecodeError, EncodeError, LimitExceeded
-from pd4dgs_codec.format.check import ErrorBound, check_scene, rounding_bounds, verify_errors
+from pd4dgs_codec.format.check import Errors, check_scene, verify_errors
 from pd4dgs_codec.format.container import (
     CHUNK_OVERHEAD,
     FLAG_ANCILLARY,
@@ -21,16 +21,16 @@ from pd4dgs_codec.format.container import (
     write_chunk,
     write_preamble,
 )
-from pd4dgs_codec.format.decoder import read_layers
 from pd4dgs_codec.format.header import DIGEST_SIZE, Header, pack_header, payload_digest, scene_id_of, unpack_header
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.format.metadata import CHUNK_TYPE, Metadata, write_metadata
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
-from pd4dgs_codec.format.payload import Past, StreamReport, write_layer
-from pd4dgs_codec.format.plan import LeftOut, plan
+from pd4dgs_codec.format.payload import Past, StreamReport, write_slice
+from pd4dgs_codec.format.plan import LeftOut, SceneSymbols, plan
+from pd4dgs_codec.format.reader import read_layers
 from pd4dgs_codec.format.registry import MAX_CHUNKS
-from pd4dgs_codec.format.symbols import LayerSymbols, SceneSymbols, sliced
-from pd4dgs_codec.scene import Scene
+from pd4dgs_codec.format.symbols import LayerSymbols, sliced
+from pd4dgs_codec.kinds import AnyScene, utility_of
 from pd4dgs_codec.threads import one_blas_thread
 
 LATER = 2 / 3  #: size of the slices behind the first one of layer 0, of that one's
@@ -59,8 +59,7 @@ class SliceReport:
 @dataclass(frozen=True)
 class LayerReport:
     """The report of a layer. bytes: of its chunks. payload_bits, rate_bits: sums over attributes, planes and weights.
-    In mode lzma one stream codes these and the masks, and payload_bits counts all of it. streams: every coded section,
-    summed over the slices."""
+    In mode lzma payload_bits counts all channels. streams: every group of channels, summed over the slices."""
 
     layer: int
     bytes: int
@@ -76,8 +75,7 @@ class LayerReport:
 @dataclass(frozen=True)
 class Report:
     """The report of an encode. left_out: rows {what, why, lossless, bytes} with the estimated bytes of each part left
-    out. errors: declared and largest errors by field of Steps, empty if not verified. metadata_bytes: of the metadata
-    chunk, 0 without one."""
+    out. errors: by field of Steps, empty if not verified. metadata_bytes: of the metadata chunk, 0 without one."""
 
     mode: str
     bytes: int
@@ -85,7 +83,7 @@ class Report:
     seconds: float
     layers: list[LayerReport]
     left_out: list[dict[str, Any]]
-    errors: list[ErrorBound]
+    errors: list[Errors]
     metadata_bytes: int
 
     def added_bytes(self) -> dict[int, int]:
@@ -103,26 +101,26 @@ class Report:
         return asdict(self)
 
 
-def encode(scene: Scene, options: EncodeOptions = DEFAULTS, **changes: Any) -> bytes:
+def encode(scene: AnyScene, options: EncodeOptions = DEFAULTS, **changes: Any) -> bytes:
     """Returns the bytes of a `.pd4` file. Options, changes and errors as in encode_with_report."""
     return encode_with_report(scene, options, **changes)[0]
 
 
 @one_blas_thread()
 def encode_with_report(
-    scene: Scene,
+    scene: AnyScene,
     options: EncodeOptions = DEFAULTS,
     *,
     left_out: Sequence[LeftOut] = (),
     metadata: Metadata | None = None,
-    utility: Callable[[Scene], np.ndarray] | None = None,
+    utility: Callable[[AnyScene], np.ndarray] | None = None,
     **changes: Any,
 ) -> tuple[bytes, Report]:
     """Encodes a scene; returns (bytes of the file, report).
 
     left_out: parts that the caller has removed from the scene, added to the report. metadata: stored in the file.
     utility: function of the decoded scene, float [N], the gain in image quality by each anchor. It orders the anchors
-    of sliced layers; by_size if None. changes: fields of EncodeOptions that replace those of `options`.
+    of sliced layers; `kinds.utility_of` if None. changes: fields of EncodeOptions that replace those of `options`.
     Raises EncodeError.
     """
     started = time.perf_counter()
@@ -130,11 +128,10 @@ def encode_with_report(
     check_scene(scene)
     planned = plan(scene, options)
     symbols, omitted = planned.symbols, planned.left_out
-    bounds = rounding_bounds(symbols)
-    errors = verify_errors(planned.scene, symbols, bounds) if options.verify else []
+    errors = verify_errors(planned.scene, symbols) if options.verify else []
     del planned  # as large as the scene
-    written = _write_layers(symbols, bounds, options, utility or by_size)
-    data, about_bytes = _container(symbols, bounds, options.mode, written), 0
+    written = _write_layers(symbols, options, utility or utility_of)
+    data, about_bytes = _container(symbols, options.mode, written), 0
     if metadata is not None:
         data, about_bytes = with_metadata(data, metadata)
     reports = [_layer_report(layer, slices) for layer, slices in zip(symbols.layers, written, strict=True)]
@@ -143,17 +140,9 @@ def encode_with_report(
     _check_file(data, fingerprints)
     kept = sum(r.anchors for r in reports)
     kept_bits = sum(r.position_bits + s.payload_bits for r in reports for s in r.streams if s.name == "attributes")
-    rows = [item.row(scene.steps, options, kept, kept_bits) for item in (*left_out, *omitted)]
+    rows = [item.row(options, kept, kept_bits) for item in (*left_out, *omitted)]
     seconds = round(time.perf_counter() - started, 4)
     return data, Report(options.mode, len(data), options.verify, seconds, reports, rows, errors, about_bytes)
-
-
-def by_size(scene: Scene) -> np.ndarray:
-    """Estimates each anchor's utility without views, float32 [N]: its mask code in the highest layer times the largest
-    area, relative to other anchors, that its Gaussians may cover."""
-    scales = np.sort(scene.scaling_log[:, 3:], axis=1)[:, 1:].sum(axis=1)
-    utility: np.ndarray = scene.mask[-1] * np.exp(scales - scales.max(initial=0))
-    return utility
 
 
 def with_metadata(data: bytes, metadata: Metadata) -> tuple[bytes, int]:
@@ -168,23 +157,23 @@ def with_metadata(data: bytes, metadata: Metadata) -> tuple[bytes, int]:
     return write_preamble(packed) + data[preamble.size :] + chunk, len(chunk)
 
 
-def header_size(symbols: SceneSymbols, bounds: dict[str, float], mode: str, chunks: int, most: int) -> int:
+def header_size(symbols: SceneSymbols, mode: str, chunks: int, most: int) -> int:
     """Returns the bytes of preamble and header of a file with at most so many chunks of at most `most` bytes."""
-    header = Header(((0, most),) * chunks, mode, symbols.grid, symbols.info, bounds, bytes(DIGEST_SIZE))
+    header = Header(((0, most),) * chunks, mode, symbols.kind, symbols.table, symbols.info, bytes(DIGEST_SIZE))
     return PREAMBLE_SIZE + len(pack_header(header))
 
 
 def _write_layers(
-    symbols: SceneSymbols, bounds: dict[str, float], options: EncodeOptions, utility: Callable[[Scene], np.ndarray]
+    symbols: SceneSymbols, options: EncodeOptions, utility: Callable[[AnyScene], np.ndarray]
 ) -> list[list[_Slice]]:
     """Writes the slices of each layer. The preamble and the header count with the first slice."""
     if not options.slices:
-        return [[_Slice(len(layer.anchor_q), *write_layer(layer, options))] for layer in symbols.layers]
+        return [[_Slice(len(layer.anchor_q), *write_slice(layer, options))] for layer in symbols.layers]
     ends = np.cumsum([len(layer.anchor_q) for layer in symbols.layers])[:-1]
     values = np.split(utility(symbols.scene()), ends)
     bits = sum(float(layer.bits_per_row().sum()) for layer in symbols.layers)
     most = len(values) + math.ceil(bits / 8 / (LATER * SLACK * options.slices))  # more than there will be
-    header = header_size(symbols, bounds, options.mode, most, options.slices)
+    header = header_size(symbols, options.mode, most, options.slices)
     sizes = [options.slices - header, *[LATER * options.slices] * (len(values) - 1)]
     written = [
         _write_slices(layer, options, size, u) for layer, size, u in zip(symbols.layers, sizes, values, strict=True)
@@ -205,10 +194,10 @@ def _write_slices(layer: LayerSymbols, options: EncodeOptions, size: float, util
     costs = np.cumsum([0.0, *layer.bits_per_row()[rows]]) / 8  # bytes of the first 0, 1, .. rows
     done, found, past = 0, list[_Slice](), Past[Fitted]()
     scale = 1.0  # bytes that a slice takes per byte expected
-    fixed = len(write_layer(sliced(layer, rows[:0], True), options)[0])  # of planes and networks, in the first slice
+    fixed = len(write_slice(sliced(layer, rows[:0], True), options)[0])  # of planes and networks, in the first slice
     while done < len(rows) or not found:
         room = size - CHUNK_OVERHEAD
-        least = 1 if found or layer.kind.layer == 0 else 0
+        least = 1 if found or layer.layer == 0 else 0
         if found:
             fixed, room = 0, LATER * options.slices - CHUNK_OVERHEAD
             left = (costs[-1] - costs[done]) * scale
@@ -222,7 +211,8 @@ def _write_slices(layer: LayerSymbols, options: EncodeOptions, size: float, util
             likely = int(np.searchsorted(expected, room * SLACK, side="right"))
             count = min(max(likely, least), len(rows) - done)
             trial = past.copy()
-            payload, streams = write_layer(sliced(layer, rows[done : done + count], not found), options, trial)
+            part = sliced(layer, rows[done : done + count], not found)
+            payload, streams = write_slice(part, options, bool(found), trial)
             if count:
                 scale *= max(len(payload) - fixed, 1) / max(expected[count - 1] - fixed, 1)
             fits = len(payload) <= room or count <= least
@@ -235,16 +225,16 @@ def _write_slices(layer: LayerSymbols, options: EncodeOptions, size: float, util
     return found
 
 
-def _container(symbols: SceneSymbols, bounds: dict[str, float], mode: str, written: list[list[_Slice]]) -> bytes:
+def _container(symbols: SceneSymbols, mode: str, written: list[list[_Slice]]) -> bytes:
     """Returns the file of these slices."""
     parts = [
-        (layer.kind.layer, slice_flags(number, len(slices)), part.payload)
+        (layer.layer, slice_flags(number, len(slices)), part.payload)
         for layer, slices in zip(symbols.layers, written, strict=True)
         for number, part in enumerate(slices)
     ]
     digest = payload_digest(payload for *_, payload in parts)
     chunks = tuple((kind, len(payload)) for kind, _, payload in parts)
-    packed = pack_header(Header(chunks, mode, symbols.grid, symbols.info, bounds, digest))
+    packed = pack_header(Header(chunks, mode, symbols.kind, symbols.table, symbols.info, digest))
     scene_id = scene_id_of(packed)
     return b"".join([write_preamble(packed), *(write_chunk(kind, flags, scene_id, p) for kind, flags, p in parts)])
 
@@ -263,16 +253,16 @@ def _check_file(data: bytes, fingerprints: list[bytes]) -> None:
         raise EncodeError(f"verification: the file does not decode: {error}") from error
     if pack_header(header) != read_preamble(data).header:
         raise EncodeError("verification: the header decodes to other values")
-    if len(found.layers) != len(fingerprints):
-        raise EncodeError(f"verification: the file decodes to {len(found.layers)} layers, expected {len(fingerprints)}")
-    for layer, meant in zip(found.layers, fingerprints, strict=True):
+    if len(found) != len(fingerprints):
+        raise EncodeError(f"verification: the file decodes to {len(found)} layers, expected {len(fingerprints)}")
+    for layer, meant in zip(found, fingerprints, strict=True):
         if _fingerprint(layer) != meant:
-            raise EncodeError(f"verification: layer {layer.kind.layer} decodes to other symbols")
+            raise EncodeError(f"verification: layer {layer.layer} decodes to other symbols")
 
 
 def _fingerprint(layer: LayerSymbols) -> bytes:
     """Returns the SHA-256 of a layer's steps and symbols, with their shapes."""
-    digest = hashlib.sha256(repr(layer.steps).encode())
+    digest = hashlib.sha256(repr((layer.tensors.tables.steps, layer.tensors.tables.kind, layer.fill)).encode())
     for array in layer.arrays():
         digest.update(f"{array.dtype} {array.shape}".encode())
         digest.update(np.ascontiguousarray(array).data)
@@ -280,15 +270,15 @@ def _fingerprint(layer: LayerSymbols) -> bytes:
 
 
 def _layer_report(layer: LayerSymbols, slices: list[_Slice]) -> LayerReport:
-    positions, *streams = _added(slices)
+    streams = _added(slices)
     rows = [SliceReport(CHUNK_OVERHEAD + len(part.payload), part.anchors) for part in slices]
-    counted = [s for s in streams if s.name != "masks"]
+    counted = [s for s in streams if s.name not in ("positions", "masks")]
     return LayerReport(
-        layer=layer.kind.layer,
+        layer=layer.layer,
         bytes=sum(row.bytes for row in rows),
         payload_bits=sum(s.payload_bits for s in counted),
         rate_bits=sum(s.rate_bits for s in counted),
-        position_bits=positions.payload_bits,
+        position_bits=sum(s.payload_bits for s in streams if s.name == "positions"),
         symbols=sum(s.symbols for s in counted),
         anchors=len(layer.anchor_q),
         slices=rows,
@@ -297,7 +287,7 @@ def _layer_report(layer: LayerSymbols, slices: list[_Slice]) -> LayerReport:
 
 
 def _added(slices: list[_Slice]) -> list[StreamReport]:
-    """Sums the reports of the slices by section; the positions come first."""
+    """Sums the reports of the slices by group."""
     found: dict[str, StreamReport] = {}
     for row in (row for part in slices for row in part.streams):
         other = found.get(row.name, StreamReport(row.name, 0, 0.0, 0))

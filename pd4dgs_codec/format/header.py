@@ -1,4 +1,4 @@
-"""The file header <-> canonical msgpack (clause 5): chunk list, coding mode, attribute steps, SceneInfo."""
+"""The file header <-> canonical msgpack (clause 5): chunk list, coding mode, kind, rows, SceneInfo."""
 
 import hashlib
 from collections.abc import Iterable
@@ -10,34 +10,20 @@ from numpy.typing import ArrayLike
 
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.format import canonical
-from pd4dgs_codec.format.canonical import Fields, as_integer, as_list
+from pd4dgs_codec.format.canonical import Fields, as_integer, as_list, as_long
 from pd4dgs_codec.format.container import PREAMBLE_SIZE, SCENE_ID_SIZE
 from pd4dgs_codec.format.options import MODES
-from pd4dgs_codec.format.quantise import MAX_SYMBOL, Grid, is_step
-from pd4dgs_codec.format.registry import BY_CHUNK_TYPE, LAYER_KINDS, MAX_CHUNKS, MAX_PAYLOAD
-from pd4dgs_codec.scene import ATTRIBUTES, MAX_FEATURE, MAX_SLOTS, SCAFFOLD_NETWORKS, Camera, SceneInfo, Widths
+from pd4dgs_codec.format.quantise import MAX_SYMBOL, RowTable
+from pd4dgs_codec.format.registry import LAYERS, MAX_CHUNKS, MAX_PAYLOAD
+from pd4dgs_codec.format.tables import Kind, as_step, pack_rows, unpack_kind, unpack_rows
+from pd4dgs_codec.scene import Camera, SceneInfo
 
 # Keys of the header map.
-CHUNKS, MODE, CENTRE = range(1, 4)
-STEPS, VOXEL_SIZE, BOX, TIME_RANGE, BACKGROUND, NEAR_FAR, UP, UNIT = range(4, 12)
-CAMERA, ERROR_BOUNDS, DIGEST, WIDTHS = range(12, 16)
-KEYS = set(range(CHUNKS, WIDTHS + 1))
+CHUNKS, MODE, KIND, ROWS, CENTRE, VOXEL_SIZE, BOX, TIME_RANGE = range(1, 9)
+BACKGROUND, NEAR_FAR, UP, UNIT, CAMERA, DIGEST = range(9, 15)
+KEYS = set(range(CHUNKS, DIGEST + 1))
 # Keys of the camera map.
 VIEWMAT, INTRINSICS, WIDTH, HEIGHT = range(1, 5)
-
-#: Keys of the map of error bounds, by field of Steps.
-TENSOR_KINDS = {
-    "feature": 0,
-    "scaling_log": 1,
-    "offset": 2,
-    "weights_scaffold": 3,
-    "planes_global": 4,
-    "weights_global": 5,
-    "planes_local": 6,
-    "weights_local": 7,
-}
-#: The kinds of layer 0; the others belong to layers that a file may lack.
-ALWAYS_BOUNDED = (*ATTRIBUTES, LAYER_KINDS[0].weights_step)
 
 MAX_CAMERA_SIDE = 65535
 DIGEST_SIZE = 16  #: bytes
@@ -45,18 +31,14 @@ DIGEST_SIZE = 16  #: bytes
 
 @dataclass(frozen=True, eq=False)
 class Header:
-    """The file header. chunks: (type, payload length in bytes) in file order.
-
-    grid: of the attributes. error_bounds: by field of Steps, the largest distance of a decoded value from the value
-    given to the encoder, in the unit of the values; a binary32 value >= 0. digest: payload_digest of the layers that
-    were encoded together.
-    """
+    """The file header. chunks: (type, payload length in bytes) in file order. kind: of the scene. table: of the rows.
+    digest: payload_digest of the layers that were encoded together."""
 
     chunks: tuple[tuple[int, int], ...]
     mode: str
-    grid: Grid
+    kind: Kind
+    table: RowTable
     info: SceneInfo
-    error_bounds: dict[str, float]
     digest: bytes
 
 
@@ -66,11 +48,12 @@ def _f32(values: ArrayLike) -> list[float]:
 
 def pack_header(header: Header) -> bytes:
     """Returns the header's bytes. Raises EncodeError for a value that canonical msgpack cannot hold."""
-    info, grid = header.info, header.grid
+    info, table = header.info, header.table
     fields: dict[int, object] = {
         CHUNKS: [list(chunk) for chunk in header.chunks],
         MODE: MODES[header.mode],
-        STEPS: _f32([grid.steps[name] for name in ATTRIBUTES]),
+        KIND: list(header.kind),
+        ROWS: pack_rows(table.tensors),
         VOXEL_SIZE: _f32(info.voxel_size)[0],
         BOX: _f32(info.box),
         TIME_RANGE: _f32(info.time_range),
@@ -78,7 +61,10 @@ def pack_header(header: Header) -> bytes:
         NEAR_FAR: _f32([info.near, info.far]),
         UP: _f32(info.up),
         UNIT: _f32(info.unit)[0],
+        DIGEST: header.digest,
     }
+    if table.centre is not None:
+        fields[CENTRE] = table.centre.tolist()
     if info.camera is not None:
         camera = info.camera
         fields[CAMERA] = {
@@ -87,23 +73,13 @@ def pack_header(header: Header) -> bytes:
             WIDTH: int(camera.width),
             HEIGHT: int(camera.height),
         }
-    bounds = header.error_bounds
-    fields[ERROR_BOUNDS] = {number: bounds[name] for name, number in TENSOR_KINDS.items() if name in bounds}
-    viewing = sum(1 << SCAFFOLD_NETWORKS.index(name) for name in grid.widths.viewing)
-    fields |= {DIGEST: header.digest, WIDTHS: [grid.widths.feature, grid.widths.slots, viewing]}
-    if grid.widths.graded:
-        fields[CENTRE] = grid.centre.tolist()
     return canonical.pack(fields)
 
 
 def unpack_header(data: bytes) -> Header:
     """The inverse of pack_header. Raises subclasses of DecodeError."""
     fields = Fields(canonical.unpack(data, offset=PREAMBLE_SIZE), "header", KEYS)
-    steps = fields.reals(STEPS, len(ATTRIBUTES))
-    voxel_size = fields.real(VOXEL_SIZE)
-    for name, step in zip(["voxel_size", *ATTRIBUTES], [voxel_size, *steps], strict=True):
-        if not is_step(step):
-            raise Malformed(f"header: step {step!r} of {name}, expected a positive normal binary32 value")
+    voxel_size = as_step(fields.get(VOXEL_SIZE), "header: voxel size")
     box = np.array(fields.reals(BOX, 6), dtype=np.float32).reshape(2, 3)
     if (box[0] > box[1]).any():
         raise Malformed("header: a lower corner of the box lies above the upper one")
@@ -122,19 +98,12 @@ def unpack_header(data: bytes) -> Header:
     fault = info_fault(info)
     if fault is not None:
         raise Malformed(f"header: {fault}")
-    widths = _unpack_widths(fields)
-    chunks, mode = _unpack_chunks(fields.sequence(CHUNKS)), fields.choice(MODE, MODES)
+    chunks, mode = _unpack_chunks(fields.get(CHUNKS)), fields.choice(MODE, MODES)
     layers = layers_of(chunks)
     if mode == "lzma" and len(set(layers)) < len(layers):
         raise Malformed(f"header: layer chunks {layers} in mode lzma, expected each layer in one slice")
-    return Header(
-        chunks=chunks,
-        mode=mode,
-        grid=Grid(dict(zip(ATTRIBUTES, steps, strict=True)), widths, _unpack_centre(fields, widths)),
-        info=info,
-        error_bounds=_unpack_error_bounds(fields),
-        digest=_unpack_digest(fields.get(DIGEST)),
-    )
+    kind, table = unpack_kind(fields.get(KIND), "header: kind"), _unpack_table(fields)
+    return Header(chunks, mode, kind, table, info, _unpack_digest(fields.get(DIGEST)))
 
 
 def info_fault(info: SceneInfo) -> str | None:
@@ -176,10 +145,9 @@ def _unpack_digest(value: object) -> bytes:
     return value
 
 
-def _unpack_chunks(rows: list[Any]) -> tuple[tuple[int, int], ...]:
-    as_integer(len(rows), MAX_CHUNKS, "header: number of chunks", low=1)
+def _unpack_chunks(value: object) -> tuple[tuple[int, int], ...]:
     chunks = []
-    for i, row in enumerate(rows):
+    for i, row in enumerate(as_long(value, "header: chunks", MAX_CHUNKS)):
         kind, length = as_list(row, f"header: chunk {i}", 2)
         chunks.append(
             (
@@ -195,38 +163,16 @@ def _unpack_chunks(rows: list[Any]) -> tuple[tuple[int, int], ...]:
 
 def layers_of(chunks: Iterable[tuple[int, int]]) -> list[int]:
     """Returns the layer of each slice in a chunk list."""
-    return [kind for kind, _ in chunks if kind in BY_CHUNK_TYPE]
+    return [kind for kind, _ in chunks if kind in LAYERS]
 
 
-def _unpack_widths(header: Fields) -> Widths:
-    feature, slots, bits = header.sequence(WIDTHS, 3)
-    as_integer(feature, MAX_FEATURE, "header: feature width", low=1)
-    as_integer(slots, MAX_SLOTS, "header: slots", low=1)
-    as_integer(bits, (1 << len(SCAFFOLD_NETWORKS)) - 1, "header: networks that take the view direction")
-    viewing = tuple(name for i, name in enumerate(SCAFFOLD_NETWORKS) if bits >> i & 1)
-    return Widths(feature, slots, CENTRE in header, viewing)
-
-
-def _unpack_centre(header: Fields, widths: Widths) -> np.ndarray:
-    if not widths.graded:
-        return np.zeros(widths.channels, np.int32)
-    values = header.sequence(CENTRE, widths.channels)
-    return np.array(
-        [as_integer(m, MAX_SYMBOL, "header: a channel's centre", low=-MAX_SYMBOL) for m in values], np.int32
-    )
-
-
-def _unpack_error_bounds(header: Fields) -> dict[str, float]:
-    if ERROR_BOUNDS not in header:
-        raise Malformed(f"header: key {ERROR_BOUNDS}, the error bounds, is missing")
-    fields = Fields(header.get(ERROR_BOUNDS), "header error bounds", set(TENSOR_KINDS.values()))
-    bounds = {
-        name: fields.real(number) for name, number in TENSOR_KINDS.items() if number in fields or name in ALWAYS_BOUNDED
-    }
-    for name, bound in bounds.items():
-        if bound < 0:
-            raise Malformed(f"header: error bound {bound!r} of {name}, expected 0 or more")
-    return bounds
+def _unpack_table(header: Fields) -> RowTable:
+    table = RowTable(unpack_rows(header.get(ROWS), "header: rows"))
+    if CENTRE not in header:
+        return table
+    values: list[Any] = header.sequence(CENTRE, table.channels)
+    centre = [as_integer(m, MAX_SYMBOL, "header: a channel's centre", low=-MAX_SYMBOL) for m in values]
+    return RowTable(table.tensors, np.array(centre, np.int32))
 
 
 def _unpack_camera(data: object) -> Camera:

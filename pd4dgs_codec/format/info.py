@@ -5,16 +5,18 @@ from typing import Any
 
 import numpy as np
 
+from pd4dgs_codec import kinds
 from pd4dgs_codec.errors import DecodeError
 from pd4dgs_codec.format.container import CHUNK_OVERHEAD, MAJOR, MINOR, read_chunk, read_preamble
-from pd4dgs_codec.format.decoder import read_layers
-from pd4dgs_codec.format.deformation import arrays_of
 from pd4dgs_codec.format.header import unpack_header
 from pd4dgs_codec.format.metadata import CHUNK_TYPE, TEXTS, Metadata, read_metadata
-from pd4dgs_codec.format.payload import Declared, read_parameters
-from pd4dgs_codec.format.quantise import Grid, attribute_rows, classes_of, quantise
-from pd4dgs_codec.format.registry import BY_CHUNK_TYPE, LAYER_KINDS, Section
-from pd4dgs_codec.scene import MASK_STEP, Scene
+from pd4dgs_codec.format.quantise import NO_CLASSES, dequantise, quantise
+from pd4dgs_codec.format.reader import read_layers
+from pd4dgs_codec.format.registry import LAYERS
+from pd4dgs_codec.format.tables import Declared, Tables, read_parameters
+from pd4dgs_codec.kinds import AnyScene
+from pd4dgs_codec.kinds.splats import SplatScene
+from pd4dgs_codec.scene import MASK_STEP
 
 FORMAT_VERSION = f"{MAJOR}.{MINOR}"
 
@@ -23,45 +25,43 @@ def info(data: bytes) -> dict[str, Any]:
     """Returns the header and layers of a file, or of a prefix of it that holds at least the preamble and header.
 
     layers: {layer, offset, bytes, end, slices}; bytes counts whole chunks, and end is the length of the prefix with
-    layers 0 .. this one. Layers that `data` holds whole also have anchors, steps, planes ([C, x, y, z, t] per scale),
-    networks (output widths), key_instant if any, and sections (bytes by name, without frames and parameters).
-    slices: {offset, bytes, end}, and anchors if `data` holds the slice whole.
+    layers 0 .. this one. Layers that `data` holds whole also have anchors, and of a known kind what its `json_of_layer`
+    in `kinds` says, else grids, chains, layer rows, their steps and kind, see `Tables.json`. slices: {offset, bytes,
+    end}, and anchors and fill if `data` holds the slice whole. kind, rows: of the header; of a known kind also what its
+    `json` says.
     metadata: {title, source, licence, command, quality, slices, still_bytes} as far as given, {"fault"} if it cannot be
     read, None if `data` holds no metadata chunk. Raises DecodeError.
     """
     preamble = read_preamble(data)
     header = unpack_header(preamble.header)
     others, offset, declared = [], preamble.size, Declared()
-    layers: list[dict[str, Any]] = []
+    layers, tables = list[dict[str, Any]](), dict[int, Tables]()
     metadata: dict[str, Any] | None = None
     for index, (chunk_type, length) in enumerate(header.chunks):
         size = CHUNK_OVERHEAD + length
-        kind = BY_CHUNK_TYPE.get(chunk_type)
         place: dict[str, Any] = {"offset": offset, "bytes": size, "end": offset + size}
-        if kind is None:
+        if chunk_type not in LAYERS:
             others.append({"type": chunk_type, **place})
             if chunk_type == CHUNK_TYPE and metadata is None and offset + size <= len(data):
                 metadata = _about(read_chunk(data, offset, type=chunk_type, length=length, index=index).payload)
         else:
-            later = bool(layers) and layers[-1]["layer"] == kind.layer
+            later = bool(layers) and layers[-1]["layer"] == chunk_type
             if not later:
-                layers.append({"layer": kind.layer, **place, "bytes": 0, "slices": []})
+                layers.append({"layer": chunk_type, **place, "bytes": 0, "slices": []})
             row = layers[-1]
             row["slices"].append(place)
             row |= {"bytes": row["bytes"] + size, "end": place["end"]}
             if offset + size <= len(data):
                 payload = read_chunk(data, offset, type=chunk_type, length=length, index=index).payload
-                meta, _, declared = read_parameters(payload, kind, header.grid.widths, declared, later)
-                place["anchors"] = meta.rows
-                row["anchors"] = row.get("anchors", 0) + meta.rows
+                of = tables[chunk_type] if later else None
+                found, _, declared = read_parameters(payload, chunk_type, header.table, declared, of)
+                place |= {"anchors": found.rows, "fill": found.fill and list(found.fill)}
                 if not later:
-                    row |= {"steps": meta.steps, **meta.shape.json(), "sections": {}}
-                for key, section_bytes in sorted(meta.sections.items()):
-                    name = Section(key).name.lower()
-                    row["sections"][name] = row["sections"].get(name, 0) + section_bytes
+                    tables[chunk_type] = found.tables
+                    row |= kinds.json_of_layer(header.kind, header.table, tables)
+                row["anchors"] = row.get("anchors", 0) + found.rows
             else:
-                for known in ("anchors", "steps", "planes", "networks", "key_instant", "sections"):
-                    row.pop(known, None)
+                layers[-1] = {name: row[name] for name in ("layer", "offset", "bytes", "end", "slices")}
         offset += size
     return {
         "format_version": f"{preamble.major}.{preamble.minor}",
@@ -70,12 +70,8 @@ def info(data: bytes) -> dict[str, Any]:
         "header_bytes": preamble.size,
         "mode": header.mode,
         "voxel_size": header.info.voxel_size,
-        "feature_width": header.grid.widths.feature,
-        "slots": header.grid.widths.slots,
-        "view_dependent": list(header.grid.widths.viewing),
-        "graded": header.grid.widths.graded,
-        "steps": header.grid.steps,
-        "error_bounds": header.error_bounds,
+        **kinds.json(header.kind, header.table),
+        "graded": header.table.graded,
         "anchors": declared.rows if all("anchors" in row for row in layers) else None,
         "time_range": list(header.info.time_range),
         "camera": header.info.camera is not None,
@@ -112,20 +108,17 @@ def hashes(data: bytes, max_layer: int | None = None) -> list[dict[str, Any]]:
     """Returns {layer, symbols, tensors} per layer: SHA-256 in hex of the integers and of the float32 values in a
     complete file, or in its layers <= max_layer (later bytes are ignored). Clause 12.4.
 
-    symbols: int32 little-endian, C order, of anchor_q [n, 3], the rise of earlier rows' mask codes, the codes of own
-    rows, their step classes if there are any, attributes [channels, n], then planes [C, H, W] scale by scale in the
-    order xy xz xt yz yt zt, then weight [out, in] and bias [out] per linear layer, networks by ascending id.
-    tensors: float32 little-endian of anchor [n, 3], feature [n, D], scaling_log [n, 6], offset [n, G, 3] of own rows,
-    then planes and networks as above.
+    symbols: int32 little-endian, C order, of the own voxels [n, 3], the rises of earlier mask codes, the own codes, the
+    step classes if there are any, the rows [W, n] in steps, the layer rows likewise, then the planes [C, H, W] grid by
+    grid, then weight and bias per linear layer, chain by chain. tensors: float32 little-endian of the own positions [n,
+    3], the rows and layer rows (per tensor [n, C]), then planes, weights and biases as above.
     """
-    _, symbols = read_layers(data, max_layer=max_layer)
-    scene, found, first = symbols.scene(), [], 0
-    for layer, last in zip(symbols.layers, scene.rows, strict=True):
-        own, first = slice(first, last), last
-        tensors = [scene.anchor_at(own), *(values[own] for values in scene.attributes.values())]
-        tensors += [x for *_, x in arrays_of(scene.tensors(layer.kind.layer), layer.kind)]
-        digests = {"symbols": _digest(layer.arrays(), "<i4"), "tensors": _digest(tensors, "<f4")}
-        found.append({"layer": layer.kind.layer, **digests})
+    header, layers = read_layers(data, max_layer=max_layer)
+    found = []
+    for part in layers:
+        values = [dequantise(part.anchor_q, header.info.voxel_size), *header.table.dequantise(part.rows)]
+        values += [*part.layer_table.dequantise(part.layer_rows), *part.tensors.dequantised().arrays]
+        found.append({"layer": part.layer, "symbols": _digest(part.arrays(), "<i4"), "tensors": _digest(values, "<f4")})
     return found
 
 
@@ -138,37 +131,50 @@ def _digest(arrays: list[np.ndarray], dtype: str) -> str:
 
 # -- arrays for readers without this package ---------------------------------------------------------------------------
 
-#: Part of the names of each layer's networks and planes.
+#: Part of the names of each layer's networks and planes in a scaffold.
 OWNERS = {0: "", 1: "global", 2: "local"}
 
 
-def to_npz_dict(scene: Scene, symbols: bool = False) -> dict[str, np.ndarray]:
-    """Returns a scene as arrays by key, for numpy.savez: anchor, feature, scaling_log, offset (float32, one row per
-    anchor); mask_L per layer L present (float32 masks of the first rows); mlp.NAME.weight.i and .bias.i with NAME
-    opacity, covariance, color, {global,local}.trunk and {global,local}.HEAD; planes.{global,local}.SCALE.PLANE; meta_*
-    for the rest.
+def to_npz_dict(scene: AnyScene, symbols: bool = False) -> dict[str, np.ndarray]:
+    """Returns a scene as arrays by key, for numpy.savez: anchor (float32 positions at rest), the attributes (float32,
+    one row per anchor); mask_L per layer L present (float32 masks of the first rows); meta_* for the rest.
+
+    A scaffold has mlp.NAME.weight.i and .bias.i with NAME opacity, covariance, color, {global,local}.trunk and
+    {global,local}.HEAD, and planes.{global,local}.SCALE.PLANE. Splats have tracks.L.instants, tracks.L.bases.HEAD
+    [K c, 1, T] and tracks.L.coefficients.HEAD [n, K].
 
     Step classes add step_class (uint8), and NAME_centre (float32) per attribute, whose values are the centre plus
     multiples of 2^step_class steps.
 
     symbols: adds NAME_q (int32) and NAME_step (float32) for every quantised array; anchor_step is the voxel size.
+    Coefficients are NAME_q steps, whatever their class.
     """
     arrays, steps = {"anchor": scene.anchor, **scene.attributes}, dict[str, float]()
+    table, tracks = kinds.row_table(scene), scene.tracks if isinstance(scene, SplatScene) else None
     if scene.grading is not None:
         arrays["step_class"] = scene.grading.classes
-        for name, centre in attribute_rows(scene.grading.centre, scene.widths):
-            arrays[f"{name}_centre"] = centre.reshape(scene.widths.attributes[name])
-    for kind in LAYER_KINDS:
-        for step, name, array in arrays_of(scene.tensors(kind.layer), kind):
+        for (name, values), (_, centre) in zip(
+            scene.attributes.items(), table.of_each(scene.grading.centre), strict=True
+        ):
+            arrays[f"{name}_centre"] = centre.reshape(values.shape[1:])
+    for layer in LAYERS:
+        tensors = kinds.tensors_of(scene, layer)
+        names = kinds.array_names(layer, tensors.tables)
+        for step, name, array in zip(tensors.tables.steps, names, tensors.arrays, strict=True):
             family, rest = name.split(".", 1)
-            name = ".".join(filter(None, (family, OWNERS[kind.layer], rest)))
-            arrays[name], steps[name] = array, vars(scene.steps)[step]
+            name = ".".join(filter(None, (family, OWNERS[layer] if tracks is None else str(layer), rest)))
+            arrays[name], steps[name] = array, step
+        for name, head in tracks[layer].heads.items() if tracks and layer in tracks else ():
+            name = f"tracks.{layer}.coefficients.{name}"
+            arrays[name], steps[name] = head.coefficients, head.step
     if symbols:
         quantised = {name: quantise(arrays[name], step, name) for name, step in steps.items()}
-        channels = Grid.of(scene).quantise(scene.attributes, classes_of(scene))
-        for name, rows in attribute_rows(channels, scene.widths):
+        classes = NO_CLASSES if scene.grading is None else scene.grading.classes.astype(np.int32)
+        v = table.quantise(list(scene.attributes.values()), classes, list(scene.attributes))
+        channels = table.symbols(v, classes)
+        for name, (_, rows) in zip(scene.attributes, table.of_each(channels), strict=True):
             quantised[name] = rows.T.reshape(arrays[name].shape)
-        steps |= scene.steps.attributes
+        steps |= scene.row_steps
         arrays |= {f"{name}_q": k for name, k in quantised.items()}
         arrays |= {f"{name}_step": np.float32(step) for name, step in steps.items()}
         arrays |= {"anchor_q": scene.anchor_q, "anchor_step": np.float32(scene.info.voxel_size)}
@@ -179,7 +185,7 @@ def to_npz_dict(scene: Scene, symbols: bool = False) -> dict[str, np.ndarray]:
     return {name: np.asarray(a) for name, a in (arrays | _meta(scene)).items()}
 
 
-def _meta(scene: Scene) -> dict[str, np.ndarray]:
+def _meta(scene: AnyScene) -> dict[str, np.ndarray]:
     info = scene.info
     meta = {
         "layers": np.array(scene.layers, np.int32),

@@ -14,7 +14,7 @@ from pd4dgs_codec.entropy import EFFORTS, PRIORS
 from pd4dgs_codec.errors import EncodeError
 
 if TYPE_CHECKING:
-    from pd4dgs_codec.scene import Scene
+    from pd4dgs_codec.scene import S
 
 #: How symbols are coded, with the numbers of the header.
 MODES = {"ans": 0, "lzma": 1}
@@ -41,8 +41,8 @@ class EncodeOptions:
     after quantisation and anchors below the mask threshold are always left out. effort: 1 (fast) .. 9 (small). omit:
     "lossless" gives plane cells that no anchor reads values of little cost, "nothing" does not.
     step_scale: factor on every quantisation step. slices: most bytes of a slice, where planes and networks allow it,
-    the header counted with the first slice; 0 for one slice per layer. verify: decode the result, compare every symbol,
-    and check every value against the error bound in the header.
+    the header counted with the first slice; 0 for one slice per layer. verify: check the error of every value, decode
+    the result and compare every symbol.
     """
 
     mode: str = "ans"
@@ -66,9 +66,9 @@ class EncodeOptions:
         if self.slices and self.mode != "ans":
             raise EncodeError(f"slices in mode {self.mode}, expected mode ans or one slice per layer")
 
-    def apply_scale(self, scene: Scene) -> tuple[Scene, EncodeOptions]:
+    def apply_scale(self, scene: S) -> tuple[S, EncodeOptions]:
         """Returns (`scene` with its steps scaled and rounded to binary32, these options with step_scale 1)."""
-        return replace(scene, steps=scene.steps.scaled(self.step_scale)), replace(self, step_scale=1.0)
+        return scene.scaled(self.step_scale), replace(self, step_scale=1.0)
 
 
 DEFAULTS = EncodeOptions()

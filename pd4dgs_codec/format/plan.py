@@ -5,62 +5,72 @@ a layer is left out because it has no deformation, its anchors and masks pass to
 picture of the highest level stays the same.
 """
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
+from pd4dgs_codec import kinds
+from pd4dgs_codec.entropy.channels import Places
+from pd4dgs_codec.entropy.fitting import entropy_bits
 from pd4dgs_codec.errors import EncodeError
-from pd4dgs_codec.format import deformation
-from pd4dgs_codec.format.deformation import arrays_of, with_arrays
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
-from pd4dgs_codec.format.payload import write_layer
-from pd4dgs_codec.format.quantise import dequantise
-from pd4dgs_codec.format.registry import LAYER_KINDS, LayerKind
-from pd4dgs_codec.format.symbols import LayerSymbols, SceneSymbols, first_duplicate
+from pd4dgs_codec.format.payload import write_slice
+from pd4dgs_codec.format.quantise import NO_CLASSES, ROW_PREDICTORS, Rows, RowTable, expect
+from pd4dgs_codec.format.symbols import NO_LAYER_ROWS, Growing, LayerSymbols, first_duplicate
+from pd4dgs_codec.format.tables import NOTHING, Kind, Tensors
+from pd4dgs_codec.kinds import AnyScene, hexplane
+from pd4dgs_codec.kinds.splats import SplatScene
 from pd4dgs_codec.morton import morton_order
-from pd4dgs_codec.scene import TRUNK, Deformation, Scene, Steps, Widths
+from pd4dgs_codec.scene import MAX_CLASS, Deformation, S, Scene, SceneInfo
 
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
     """A part that was not written. Its cost is that of `anchors` average anchors if there are any, else that of coding
-    `tensors`, else `bits`, the order-0 entropy that was saved. lossless: no picture changes."""
+    the symbols `tensors`, else `bits`, the order-0 entropy that was saved. lossless: no picture changes."""
 
     what: str
     why: str
-    kind: LayerKind | None = None
-    tensors: Deformation | None = None
+    tensors: Tensors | None = None
     anchors: int = 0
     bits: float = 0.0
     lossless: bool = False
 
-    def row(self, steps: Steps, options: EncodeOptions, kept: int, kept_bits: int) -> dict[str, Any]:
+    def row(self, options: EncodeOptions, kept: int, kept_bits: int) -> dict[str, Any]:
         """Returns {what, why, lossless, bytes} for the report of a file whose `kept` anchors took kept_bits bits."""
         if self.anchors:
             cost = self.anchors * kept_bits / 8 / kept if kept else 0
-        elif self.tensors is not None and self.kind is not None:
-            cost = tensor_bytes(self.tensors, self.kind, steps, options)
+        elif self.tensors is not None:
+            cost = tensor_bytes(self.tensors, options)
         else:
             cost = self.bits / 8
         return {"what": self.what, "why": self.why, "lossless": self.lossless, "bytes": round(cost)}
 
 
-def tensor_bytes(tensors: Deformation, kind: LayerKind, steps: Steps, options: EncodeOptions) -> int:
-    """Returns the bytes of planes and networks, coded as a layer without anchors."""
+def tensor_bytes(symbols: Tensors, options: EncodeOptions) -> int:
+    """Returns the bytes of grids and chains, coded as a layer without anchors."""
     empty = np.zeros(0, np.int32)
-    alone = LayerSymbols(
-        kind=kind,
-        widths=Widths(),
-        anchor_q=np.zeros((0, 3), np.int32),
-        mask_increase=empty,
-        mask_own=empty,
-        classes=empty,
-        attributes=np.zeros((0, 0), np.int32),
-        tensors=deformation.quantise_tensors(tensors, kind, steps),
-        steps=deformation.layer_steps(steps, kind, tensors),
-    )
-    return len(write_layer(alone, options)[0])
+    alone = LayerSymbols(0, RowTable(), np.zeros((0, 3), np.int32), empty, empty, empty, NO_LAYER_ROWS, symbols)
+    return len(write_slice(alone, options)[0])
+
+
+@dataclass(frozen=True, eq=False)
+class SceneSymbols:
+    """A scene, or a prefix of its layers, as a file stores it. kind: of the scene. table: of the rows."""
+
+    info: SceneInfo
+    kind: Kind
+    table: RowTable
+    layers: Sequence[LayerSymbols]
+
+    def scene(self) -> AnyScene:
+        """Returns the dequantised scene (clause 11.5)."""
+        grown = Growing(self.table, self.info.voxel_size)
+        for layer in self.layers:
+            grown.add(layer)
+        return kinds.scene_of(self.kind, self.table, self.info, grown)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,45 +78,115 @@ class Plan:
     """scene: the parts of the given scene that the file holds, with other values where an omission changed symbols.
     symbols: of that scene, as the file stores them. left_out: the parts of the given scene that the file lacks."""
 
-    scene: Scene
+    scene: AnyScene
     symbols: SceneSymbols
     left_out: list[LeftOut]
 
 
-def plan(scene: Scene, options: EncodeOptions = DEFAULTS) -> Plan:
+def plan(scene: AnyScene, options: EncodeOptions = DEFAULTS) -> Plan:
     """Plans a file of `scene` by options.layers and options.omit; options.step_scale is not applied.
 
     Steps are rounded to binary32, and rows sorted by (layer, Morton order). Raises EncodeError for a value that has no
     symbol, and for voxels with two anchors.
     """
     left_out: list[LeftOut] = []
-    scene = replace(scene, steps=scene.steps.scaled(1.0))
+    scene = scene.scaled(1.0)
     auto = options.layers == "auto"
     if not auto:
         scene, left_out = _cut(scene, int(options.layers))
+    tensors = {layer: symbols_of(scene, layer) for layer in scene.layers}
     for layer in reversed(scene.layers[1:]):
-        scene, dropped = _drop_heads(scene, LAYER_KINDS[layer])
+        scene, tensors[layer], dropped = _drop_heads(scene, layer, tensors[layer])
         left_out += dropped
     kept = [layer for layer in scene.layers if layer == 0 or not auto or scene.deformation(layer) is not None]
     arranged, rows = in_file_order(scene, tuple(kept))
     if inactive := scene.rows[-1] - len(rows):
         why = f"mask at or below the threshold at level {scene.level}"
         left_out.append(LeftOut(f"{inactive} anchors", why, anchors=inactive))
-    symbols = SceneSymbols.of(arranged)
-    if options.omit != "nothing":
-        arranged, symbols, unread = _without_unread(arranged, symbols)
+    if options.omit != "nothing" and isinstance(arranged, Scene):
+        arranged, unread = _without_unread(arranged, tensors)
         left_out += unread
-    return Plan(arranged, symbols, left_out)
+    table = kinds.row_table(arranged)
+    if isinstance(arranged, SplatScene) and not table.graded:
+        table = _predicted(table, list(arranged.attributes.values()), NO_CLASSES)
+    layers = [layer_symbols(arranged, index, tensors[layer], table, options) for index, layer in enumerate(kept)]
+    return Plan(arranged, SceneSymbols(arranged.info, kinds.kind_of(arranged), table, layers), left_out)
 
 
-def _cut(scene: Scene, highest: int) -> tuple[Scene, list[LeftOut]]:
+def _predicted(table: RowTable, values: Sequence[np.ndarray], classes: np.ndarray) -> RowTable:
+    """Returns the table with the predictor of each tensor that takes the fewest bits by order-0 entropy. values:
+    float32 [n, any] of each, in coding order."""
+
+    def bits(tensor: Rows, x: np.ndarray, centre: np.ndarray | None) -> float:
+        alone = RowTable((tensor,), centre)
+        symbols = alone.symbols(alone.quantise([x], classes, [f"rows {tensor.id}"]), classes)
+        parts = Places.by(classes, MAX_CLASS + 1).parts(symbols) if alone.graded else symbols
+        return sum(map(entropy_bits, parts))
+
+    centres = [None] * len(values) if table.centre is None else [m for _, m in table.of_each(table.centre)]
+    chosen = [
+        min((replace(tensor, predictor=p) for p in ROW_PREDICTORS), key=lambda one: bits(one, x, m))  # noqa: B023
+        for tensor, x, m in zip(table.tensors, values, centres, strict=True)
+    ]
+    return RowTable(tuple(chosen), table.centre)
+
+
+def symbols_of(scene: AnyScene, layer: int) -> Tensors:
+    """Returns the symbols of the grids and chains of a layer. Raises EncodeError for a value without a symbol."""
+    given = kinds.tensors_of(scene, layer)
+    names, own = kinds.array_names(layer, given.tables), kinds.layer_name(scene, layer)
+    return given.quantised(lambda i: f"{own} {names[i]}")
+
+
+def layer_symbols(
+    scene: AnyScene,
+    index: int,
+    tensors: Tensors = NOTHING,
+    table: RowTable | None = None,
+    options: EncodeOptions = DEFAULTS,
+) -> LayerSymbols:
+    """Returns scene.layers[index] of a scene in file order, with these symbols of its grids and chains. table: of its
+    rows. Raises EncodeError for a value that has no symbol."""
+    first, last = scene.rows[index - 1] if index else 0, scene.rows[index]
+    table = kinds.row_table(scene) if table is None else table
+    codes = scene.mask[index].astype(np.int32)
+    before = scene.mask[index - 1].astype(np.int32) if index else codes[:0]
+    classes = NO_CLASSES if scene.grading is None else scene.grading.classes[first:last].astype(np.int32)
+    values = {name: x[first:last] for name, x in scene.attributes.items()}
+    own = LayerSymbols(
+        layer=scene.layers[index],
+        table=table,
+        anchor_q=scene.anchor_q[first:last],
+        rises=codes[:first] - before,
+        codes=codes[first:],
+        classes=classes,
+        rows=table.quantise(list(values.values()), classes, list(values)),
+        tensors=tensors,
+        fill=scene.fills[index] if scene.fills else None,
+    )
+    return _with_layer_rows(own, scene, last, options) if isinstance(scene, SplatScene) and tensors.tables.rows else own
+
+
+def _with_layer_rows(own: LayerSymbols, scene: SplatScene, last: int, options: EncodeOptions) -> LayerSymbols:
+    """Adds the layer rows of the scene's first `last` rows. Raises EncodeError for others that are not 0."""
+    given = scene.tracks[own.layer]
+    lost = [name for name, head in given.heads.items() if head.coefficients[last:].any()]
+    expect(not lost, f"tracks of layer {own.layer}: {lost} of anchors of a later layer, expected coefficients of 0")
+    earlier = NO_CLASSES if scene.grading is None else scene.grading.classes[: last - len(own.codes)].astype(np.int32)
+    own, values = replace(own, earlier=earlier), kinds.tracks.coefficients(given, last)
+    table = own.layer_table
+    if not (options.slices and table.graded and len(own.codes)):  # else a row's predecessor depends on its slice
+        table = _predicted(table, list(values.values()), own.all_classes)
+    names = [f"tracks of layer {own.layer} {name}" for name in values]
+    tensors = replace(own.tensors, tables=replace(own.tensors.tables, rows=table.tensors))
+    return replace(own, tensors=tensors, layer_rows=table.quantise(list(values.values()), own.all_classes, names))
+
+
+def _cut(scene: AnyScene, highest: int) -> tuple[AnyScene, list[LeftOut]]:
     """Returns (the layers <= highest with the anchors of all layers, a LeftOut for each layer above)."""
     why = f"only layers up to {highest} were requested"
-    left_out = [
-        LeftOut(f"layer {layer}", why, LAYER_KINDS[layer], scene.deformation(layer))
-        for layer in scene.layers
-        if layer > highest
-    ]
+    above = [layer for layer in scene.layers if layer > highest]
+    left_out = [LeftOut(f"layer {layer}", why, symbols_of(scene, layer)) for layer in above]
     kept = len(scene.layers) - len(left_out)
     cut = replace(
         scene.prefix(highest),
@@ -114,28 +194,33 @@ def _cut(scene: Scene, highest: int) -> tuple[Scene, list[LeftOut]]:
         mask=tuple(scene.full_masks()[:kept]),
         **scene.of_anchors(slice(None)),
     )
-    return cut, left_out
+    return replace(cut, **cut.of_layers()), left_out
 
 
-def _drop_heads(scene: Scene, kind: LayerKind) -> tuple[Scene, list[LeftOut]]:
+def _drop_heads(scene: AnyScene, layer: int, symbols: Tensors) -> tuple[AnyScene, Tensors, list[LeftOut]]:
     """Removes the heads of a layer that are zero after quantisation, or its deformation if no head is left and no layer
-    above reads its planes. Returns (scene, parts left out)."""
-    given = scene.deformation(kind.layer)
-    if given is None:
-        return scene, []
-    symbols = deformation.quantise_tensors(given, kind, scene.steps)
-    heads = [name for name in given.networks if name != TRUNK]
-    zero = [name for name in heads if deformation.is_zero(symbols, name)]
-    if len(zero) == len(heads) and any(map(scene.deformation, range(kind.layer + 1, 3))):
+    above reads its planes. Returns (scene, symbols of the layer, parts left out)."""
+    given, name = scene.deformation(layer), kinds.layer_name(scene, layer)
+    if not isinstance(given, Deformation) or isinstance(scene, SplatScene):
+        return scene, symbols, []
+    whole = hexplane.deformation_of(symbols)
+    zero, heads = hexplane.zero_heads(whole), len(given.networks) - 1
+    if len(zero) == heads and any(map(scene.deformation, range(layer + 1, 3))):
         zero = zero[1:]  # a deformation has at least one head
-    why = "zero after quantisation" if heads else "no heads"
-    if len(zero) == len(heads):
-        return scene.with_tensors(kind.layer, None), [LeftOut(kind.name, why, kind, given)]
-    rest = {name: network for name, network in given.networks.items() if name not in zero}
+    why = "zero after quantisation"
+    if len(zero) == heads:
+        return scene.with_deformation(layer, None), NOTHING, [LeftOut(name, why, symbols)]
+
+    def with_networks(of: Deformation, names: Iterable[str]) -> Deformation:
+        return replace(of, networks={n: of.networks[n] for n in names})
+
+    rest, steps = [n for n in given.networks if n not in zero], (symbols.tables.grid_step, symbols.tables.chain_step)
+    alone = [replace(with_networks(whole, [n]), planes=()) for n in zero]
     gone = [
-        LeftOut(f"{kind.name} head {name}", why, kind, Deformation((), {name: given.networks[name]})) for name in zero
+        LeftOut(f"{name} head {n}", why, hexplane.tensors_of(part, *steps)) for n, part in zip(zero, alone, strict=True)
     ]
-    return scene.with_tensors(kind.layer, replace(given, networks=rest)), gone
+    kept = hexplane.tensors_of(with_networks(whole, rest), *steps)
+    return scene.with_deformation(layer, with_networks(given, rest)), kept, gone
 
 
 def passed(scene: Scene, index: int, rows: np.ndarray) -> Scene:
@@ -146,7 +231,7 @@ def passed(scene: Scene, index: int, rows: np.ndarray) -> Scene:
     return replace(scene, rows=(scene.rows[-1],) * len(masks), mask=tuple(masks))
 
 
-def in_file_order(scene: Scene, kept: tuple[int, ...]) -> tuple[Scene, np.ndarray]:
+def in_file_order(scene: S, kept: tuple[int, ...]) -> tuple[S, np.ndarray]:
     """Returns (scene with the layers `kept` and rows sorted by (layer, Morton order), int64 [n], rows of the given
     scene in this order). Anchors with masks of 0 in all of these layers are dropped."""
     codes = scene.full_masks()
@@ -161,27 +246,27 @@ def in_file_order(scene: Scene, kept: tuple[int, ...]) -> tuple[Scene, np.ndarra
     if scene.grading is not None and not scene.grading.classes[order].any():
         scene = replace(scene, grading=None)
     masks_of = tuple(m[order][:n] for m, n in zip(masks, rows, strict=True))
-    arranged = replace(scene, layers=kept, rows=rows, mask=masks_of, **scene.of_anchors(order))
+    fills = dict(zip(scene.layers, scene.fills, strict=False))
+    of_kept = (*(fills[layer] for layer in kept[:-1]), scene.fills[-1]) if fills else ()
+    arranged = replace(scene, layers=kept, rows=rows, mask=masks_of, fills=of_kept, **scene.of_anchors(order))
     return arranged, order
 
 
-def _without_unread(scene: Scene, symbols: SceneSymbols) -> tuple[Scene, SceneSymbols, list[LeftOut]]:
-    """Gives plane cells that no anchor reads values of little cost. Returns (scene, its symbols, parts left out).
+def _without_unread(scene: Scene, tensors: dict[int, Tensors]) -> tuple[Scene, list[LeftOut]]:
+    """Gives plane cells that no anchor reads values of little cost. Returns (scene, parts left out).
 
-    scene: planned, with all rows active at its highest level. Its values change where its symbols change.
+    scene: in file order, with all rows active at its highest level. tensors: symbols by layer, which change; the values
+    of the scene change where they do.
     """
     low, high = scene.info.box
     unit = np.clip((scene.anchor - low) / np.maximum(high - low, np.finfo(np.float32).tiny), 0.0, 1.0)
-    layers, left_out = [], list[LeftOut]()
-    for layer in symbols.layers:
-        kind, given = layer.kind, scene.tensors(layer.kind.layer)
-        tensors, what, bits = deformation.without_unread(layer.tensors, unit)
-        if tensors is not layer.tensors:
-            left_out.append(LeftOut(f"{kind.name}: {what}", "no anchor reads them", bits=bits, lossless=True))
-            rows = zip(arrays_of(given, kind), arrays_of(layer.tensors, kind), arrays_of(tensors, kind), strict=True)
-            arrays = [
-                np.where(before == k, x, dequantise(k, layer.steps[of])) for (of, _, x), (*_, before), (*_, k) in rows
-            ]
-            scene = scene.with_tensors(kind.layer, with_arrays(given, kind, arrays))
-        layers.append(replace(layer, tensors=tensors))
-    return scene, replace(symbols, layers=layers), left_out
+    left_out = list[LeftOut]()
+    for layer in scene.layers[1:]:
+        before, given = tensors[layer], kinds.tensors_of(scene, layer)
+        after, what, bits = hexplane.without_unread(before, unit)
+        if after is not before:
+            left_out.append(LeftOut(f"{kinds.NAMES[layer]}: {what}", "no anchor reads them", bits=bits, lossless=True))
+            rows = zip(given.arrays, before.arrays, after.arrays, after.dequantised().arrays, strict=True)
+            values = given.with_arrays(np.where(old == new, x, restored) for x, old, new, restored in rows)
+            scene, tensors[layer] = kinds.with_tensors(scene, layer, values), after
+    return scene, left_out

@@ -1,4 +1,4 @@
-"""Planes, for `deformation`: prediction, the coded section, and cells that no anchor reads.
+"""The planes of grids: prediction, coded channels, and cells that no anchor reads.
 
 A plane is int32 [C, H, W]. A sample at row i, column j of a channel is predicted from its neighbours W = k[i, j-1],
 N = k[i-1, j] and NW = k[i-1, j-1], and the residual k - prediction is coded. In row 0 N and NW are taken equal to W, in
@@ -6,14 +6,12 @@ column 0 W and NW are taken equal to N, and at (0, 0) all three are 0 (clause 11
 """
 
 from collections.abc import Iterator, Sequence
-from itertools import accumulate
 
 import numpy as np
 
-from pd4dgs_codec.entropy.channels import Places, decode_joined, encode_channels
-from pd4dgs_codec.entropy.fitting import histogram
-from pd4dgs_codec.entropy.priors import BIT, frequency_costs
-from pd4dgs_codec.entropy.varint import ByteReader, put_varint
+from pd4dgs_codec.entropy.channels import ChannelReader, ChannelWriter, Places
+from pd4dgs_codec.entropy.fitting import Fitted, histogram
+from pd4dgs_codec.entropy.priors import BIT, Prior, frequency_costs
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, magnitude
 
@@ -58,7 +56,7 @@ def residual(predictor: int, k: Array) -> Array:
 def restore(planes: Sequence[tuple[int, Array]]) -> list[Array]:
     """The inverse of `residual` for many planes at once: [(predictor id, int32 [C, H, W] residuals)] -> int32 samples.
 
-    C is the same throughout. Raises Malformed if a sample's magnitude exceeds MAX_SYMBOL.
+    Raises Malformed if a sample's magnitude exceeds MAX_SYMBOL.
     """
     scanned = iter(_scan([r for predictor, r in planes if predictor == MEDIAN]))
     result = [next(scanned) if predictor == MEDIAN else _summed(r.astype(np.int64)) for predictor, r in planes]
@@ -77,14 +75,15 @@ def _summed(r: Array) -> Array:
 def _scan(planes: Sequence[Array]) -> list[Array]:
     """Undoes the median on int32 [C, H, W] along anti-diagonals: all cells with equal i + j are independent.
 
-    Planes are scanned in groups in which none has more than twice the diagonals of another. So there are at most
-    4 (H + W) steps, with the largest plane's H and W, for any number of planes, and memory is linear in the cells.
+    Planes are scanned in groups of one number of channels in which none has more than twice the diagonals of another.
+    So there are at most 4 (H + W) steps per number of channels, with the largest plane's H and W, for any number of
+    planes, and memory is linear in the cells.
     """
     result = list(planes)
-    order = sorted(range(len(planes)), key=lambda i: -sum(planes[i].shape[1:]))
+    order = sorted(range(len(planes)), key=lambda i: (len(planes[i]), -sum(planes[i].shape[1:])))
     while order:
-        longest = sum(planes[order[0]].shape[1:])
-        alike = [i for i in order if 2 * sum(planes[i].shape[1:]) >= longest]
+        channels, longest = len(planes[order[0]]), sum(planes[order[0]].shape[1:])
+        alike = [i for i in order if len(planes[i]) == channels and 2 * sum(planes[i].shape[1:]) >= longest]
         for i, k in zip(alike, _scan_together([planes[i] for i in alike]), strict=True):
             result[i] = k
         order = order[len(alike) :]
@@ -137,6 +136,12 @@ def choose_predictor(k: Array) -> tuple[int, Array, float]:
     bits = [_estimated_bits(r) for r in residuals]
     best = int(np.argmin(bits))
     return best, residuals[best], bits[best]
+
+
+def rate_bits(k: Array) -> float:
+    """Returns the sum of R(a) of the residuals of samples k int32 [C, H, W] under the cheapest predictor."""
+    _, residuals, _ = choose_predictor(k)
+    return sum(histogram(channel.ravel()).rate_bits for channel in residuals)
 
 
 def _estimated_bits(residuals: Array) -> float:
@@ -199,67 +204,49 @@ def _filled(k: Array, given: Array, predictor: int) -> Array:
     return np.ascontiguousarray(x.astype(np.int32).T).reshape(k.shape)
 
 
-# -- the planes section of mode ans (clauses 8.6 and 8.7) --------------------------------------------------------------
+# -- coded channels of mode ans (clauses 8.6 and 8.7) ------------------------------------------------------------------
 
 # The residuals of one cell tend to be large together, so the channels of a plane are split by the *activity* of the
 # channels before. All arithmetic is on integers.
 
 
-def write_planes(residuals: Sequence[Array], priors: str, effort: int) -> tuple[bytes, float]:
-    """Writes residuals int32 [C, H, W] per plane: (section bytes, sum of R(a) of all channels)."""
+def write_planes(residuals: Sequence[Array], writer: ChannelWriter, known: list[Fitted]) -> float:
+    """Codes residuals int32 [C, H, W] per plane, a batch per stage. Returns the sum of R(a) of all channels. known: the
+    prior list."""
     planes = [plane.reshape(len(plane), -1) for plane in residuals]
-    payloads = [
-        encode_channels(
-            [part for channels, places in stage for part in places.parts(channels)], priors=priors, effort=effort
-        ).payload
-        for stage in _stages(planes, [plane.shape for plane in residuals])
-    ]
-    out = bytearray()
-    for payload in payloads[:-1]:
-        put_varint(out, len(payload))
-    return bytes(out) + b"".join(payloads), sum(histogram(c).rate_bits for plane in planes for c in plane)
+    for stage in _stages(planes, [plane.shape for plane in residuals]):
+        writer.write([part for channels, places in stage for part in places.parts(channels)], known)
+    return sum(histogram(c).rate_bits for plane in planes for c in plane)
 
 
-def read_planes(data: bytes, shapes: Sequence[PlaneShape]) -> list[Array]:
-    """Reads residuals int32 [C, H, W] per plane, the inverse of write_planes. shapes: checked against the limits."""
-    reader = ByteReader(data)
-    number = _stage_count(shapes)
-    lengths = [reader.varint(reader.remaining, f"the length of stage {stage}") for stage in range(number - 1)]
-    rest = reader.rest()
-    if sum(lengths) > len(rest):
-        raise Malformed(f"stages of {sum(lengths)} bytes or more, {len(rest)} bytes are left")
-    bounds = [0, *accumulate(lengths), len(rest)]
+def read_planes(reader: ChannelReader, shapes: Sequence[PlaneShape], known: list[Prior]) -> list[Array]:
+    """Decodes residuals int32 [C, H, W] per plane, the inverse of write_planes. shapes: checked against the limits."""
     planes = [np.zeros((c, h * w), np.int32) for c, h, w in shapes]
-    for stage, groups in enumerate(_stages(planes, shapes)):
+    for groups in _stages(planes, shapes):
         counts = [count for channels, places in groups for count in places.sizes * len(channels)]
-        symbols, end = decode_joined(rest[bounds[stage] : bounds[stage + 1]], counts), 0
+        symbols, end = reader.read(counts, known), 0
         for channels, places in groups:
             first, end = end, end + channels.size
             places.put(symbols[first:end], channels)
     return [plane.reshape(shape) for plane, shape in zip(planes, shapes, strict=True)]
 
 
-def _stage_count(shapes: Sequence[PlaneShape]) -> int:
-    """Returns the number of stages; all planes of a layer have the same number of channels."""
-    return max(1, (shapes[0][0] - 1).bit_length())
-
-
 def _stages(planes: Sequence[Array], shapes: Sequence[PlaneShape]) -> Iterator[list[tuple[Array, Places]]]:
-    """Yields (channels int32 [m, H * W], order of their places) per plane for each stage, which is decoded before the
-    next. planes: int32 [C, H * W], read only as far as earlier stages reach."""
+    """Yields (channels int32 [m, H * W], order of their places) per plane that has any, for each stage, which is
+    decoded before the next. planes: int32 [C, H * W], read only as far as earlier stages reach."""
     activities = [np.zeros(plane.shape[1]) for plane in planes]
-    for stage in range(_stage_count(shapes)):
-        first, end = (1 << stage if stage else 0), 2 << stage
+    first, end, most = 0, 2, max((len(plane) for plane in planes), default=0)
+    while first < most:
         groups: list[tuple[Array, Places]] = []
         for plane, activity, shape in zip(planes, activities, shapes, strict=True):
-            places = Places.whole(plane.shape[1])
-            if stage:
-                places = Places.by(activity_classes(_around(activity, shape)), CLASSES)
-            groups.append((plane[first:end], places))
+            if first < len(plane):
+                by = Places.by(activity_classes(_around(activity, shape)), CLASSES) if first else None
+                groups.append((plane[first:end], by or Places.whole(plane.shape[1])))
         yield groups
-        if end < len(planes[0]):
-            for plane, activity in zip(planes, activities, strict=True):
+        for plane, activity in zip(planes, activities, strict=True):
+            if end < len(plane):
                 activity += relative_magnitude(plane[first:end])
+        first, end = end, 2 * end
 
 
 def _around(activity: np.ndarray, shape: PlaneShape) -> np.ndarray:

@@ -1,15 +1,14 @@
-"""Uniform scalar quantisation between float32 values and int32 symbols, and the quantisation grid of attributes."""
+"""Uniform scalar quantisation between float32 values and int32 symbols, and the quantisation of rows."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from pd4dgs_codec.errors import EncodeError
-from pd4dgs_codec.scene import ATTRIBUTES, MASK_MIN_CODE, MASK_THRESHOLD, Scene, Widths
+from pd4dgs_codec.errors import EncodeError, Malformed
+from pd4dgs_codec.scene import MASK_MIN_CODE, MASK_THRESHOLD
 
 #: Symbols k satisfy |k| <= MAX_SYMBOL: binary64(k) * binary64(Q) is exact, and no two symbols of one step share a
 #: binary32 value, so that quantising a dequantised value gives the same symbol.
@@ -81,17 +80,12 @@ def all_finite(k: np.ndarray, step: float) -> bool:
     return magnitude(k) * step < _TO_INFINITY
 
 
-def dequantise(k: np.ndarray, step: float, centre: Integers = 0, spacing: Integers = 1) -> np.ndarray:
-    """binary32(binary64(centre + k spacing) * binary64(step)), float32 of k's shape: an exact product, rounded once.
+def dequantise(k: np.ndarray, step: float) -> np.ndarray:
+    """binary32(binary64(k) * binary64(step)), float32 of k's shape: an exact product, rounded once.
 
-    Computed in binary32 with the same result: |k|, |centre| and |centre + k spacing| are at most MAX_SYMBOL, spacings
-    are powers of two and the step is a binary32, so only the last product is rounded.
+    Computed in binary32 with the same result, as |k| <= MAX_SYMBOL and the step is a binary32.
     """
     values: np.ndarray = k.astype(np.float32)
-    if np.ndim(spacing) or spacing != 1:
-        values *= np.asarray(spacing, np.float32)
-    if np.any(centre):
-        values += np.asarray(centre, np.float32)
     with np.errstate(over="ignore"):  # the caller refuses infinities, see all_finite
         values *= np.float32(step)
     return values
@@ -108,7 +102,7 @@ def mask_codes(mask: np.ndarray) -> np.ndarray:
     return np.where(m <= MASK_THRESHOLD, 0, np.maximum(MASK_MIN_CODE, np.rint(m * 255.0))).astype(np.uint8)
 
 
-# -- attributes --------------------------------------------------------------------------------------------------------
+# -- rows --------------------------------------------------------------------------------------------------------------
 
 #: Anchors that are quantised or dequantised at a time, because intermediate values are twice as wide.
 BLOCK = 4096
@@ -119,81 +113,149 @@ def row_blocks(n: int) -> Iterator[slice]:
     yield from (slice(first, min(first + BLOCK, n)) for first in range(0, max(n, 1), BLOCK))
 
 
-def attribute_rows(channels: np.ndarray, widths: Widths) -> Iterator[tuple[str, np.ndarray]]:
-    """Yields (name of an attribute, its rows) of an array with a row per channel, in coding order."""
-    first = 0
-    for name in ATTRIBUTES:
-        last = first + math.prod(widths.attributes[name])
-        yield name, channels[first:last]
-        first = last
+#: Predictors of rows by their id in the bitstream.
+ROW_PREDICTORS = {0: "none", 1: "previous row"}
 
 
-def classes_of(scene: Scene) -> np.ndarray:
-    """Returns the step classes int32 [N] of a scene, or NO_CLASSES."""
-    return NO_CLASSES if scene.grading is None else scene.grading.classes.astype(np.int32)
+@dataclass(frozen=True)
+class Rows:
+    """A tensor of the form rows: its id, its channels C per row, its step Q, and the id of its predictor."""
+
+    id: int
+    channels: int
+    step: float
+    predictor: int = 0
 
 
 @dataclass(frozen=True, eq=False)
-class Grid:
-    """The values that attributes can have: (m + k 2^c) Q with a symbol k, the step Q of the attribute, the centre m of
-    the channel and the step class c of the anchor (clause 11.5).
+class RowTable:
+    """The tensors of a row. Their values are v Q with an integer v, int32 [W, n], channel-major (clause 11.2).
 
-    steps: Q by attribute. centre: int32 [channels] in steps, 0 if the anchors are not graded. Symbols are int32
-    [channels, n], channel-major; classes are int32 [n], or NO_CLASSES.
+    Without a predictor v is m + k 2^c, with a symbol k, the centre m of the channel and the step class c of the row.
+    With predictor 1, k 2^c is the difference from the last row before of class c or lower, or from m.
+
+    tensors: by ascending id. centre: int32 [W], None if rows have no step classes. Classes: int32 [n], or NO_CLASSES.
     """
 
-    steps: dict[str, float]
-    widths: Widths
-    centre: np.ndarray
+    tensors: tuple[Rows, ...] = ()
+    centre: np.ndarray | None = None
 
-    @staticmethod
-    def of(scene: Scene) -> Grid:
-        """Returns the grid of a scene's attributes. Raises EncodeError for a centre that has no symbol."""
-        steps, widths = scene.steps.attributes, scene.widths
-        centre = np.zeros(widths.channels, np.int32)
-        if scene.grading is not None:
-            rows = attribute_rows(scene.grading.centre, widths)
-            centre = np.concatenate([quantise(x, steps[name], f"centre of {name}") for name, x in rows])
-        return Grid(steps, widths, centre)
+    @property
+    def channels(self) -> int:
+        """W, the number of scalars of a row."""
+        return sum(tensor.channels for tensor in self.tensors)
+
+    @property
+    def graded(self) -> bool:
+        """Whether rows have step classes."""
+        return self.centre is not None
 
     @property
     def centre_values(self) -> np.ndarray:
-        """float32 [channels]: the value of symbol 0 in each channel."""
-        rows = attribute_rows(self.centre, self.widths)
-        return np.concatenate([dequantise(m, self.steps[name]) for name, m in rows])
+        """float32 [W]: m Q."""
+        return np.concatenate([dequantise(m, tensor.step) for tensor, m in self.of_each(self._centres)])
 
-    def _spacing(self, classes: np.ndarray) -> np.ndarray | int:
-        return 1 << classes.astype(np.int64) if self.widths.graded else 1
+    @property
+    def _centres(self) -> np.ndarray:
+        return np.zeros(self.channels, np.int32) if self.centre is None else self.centre
 
-    def _with_centres(self, symbols: np.ndarray) -> Iterator[tuple[str, np.ndarray, np.ndarray]]:
-        """Yields (name of an attribute, its rows of symbols [channels, n], their centres [rows, 1])."""
-        both = (attribute_rows(rows, self.widths) for rows in (symbols, self.centre[:, None]))
-        yield from ((name, own, centre) for (name, own), (_, centre) in zip(*both, strict=True))
+    def of_each(self, channels: np.ndarray) -> Iterator[tuple[Rows, np.ndarray]]:
+        """Yields (tensor, its part) of an array [W, ...]."""
+        first = 0
+        for tensor in self.tensors:
+            last = first + tensor.channels
+            yield tensor, channels[first:last]
+            first = last
 
-    def farthest(self, symbols: np.ndarray, classes: np.ndarray) -> dict[str, int]:
-        """Returns the largest |m + k 2^c| by attribute; 0 without anchors."""
-        most = dict.fromkeys(ATTRIBUTES, 0)
-        for rows in row_blocks(symbols.shape[1]) if self.widths.graded else [slice(None)]:
-            at = symbols[:, rows]
-            if self.widths.graded:
-                at = self.centre[:, None] + at.astype(np.int64) * self._spacing(classes[rows])
-            for name, own in attribute_rows(at, self.widths):
-                most[name] = max(most[name], magnitude(own))
-        return most
+    def _mapped(self, a: np.ndarray, b: np.ndarray) -> Iterator[tuple[Rows, np.ndarray, np.ndarray, np.ndarray]]:
+        """Yields (tensor, its part of a and of b, both [W, n], its centres [C, 1])."""
+        parts = zip(self.of_each(a), self.of_each(b), self.of_each(self._centres[:, None]), strict=True)
+        yield from ((tensor, own, other, m) for (tensor, own), (_, other), (_, m) in parts)
 
-    def quantise(self, values: dict[str, np.ndarray], classes: np.ndarray) -> np.ndarray:
-        """Returns the symbols of float32 [n, *shape] by attribute. Raises EncodeError for a value without a symbol."""
-        symbols = np.empty((self.widths.channels, len(values[ATTRIBUTES[0]])), np.int32)
-        for name, own, centre in self._with_centres(symbols):
-            for rows in row_blocks(symbols.shape[1]):
-                channels = values[name][rows].reshape(-1, len(centre)).T
-                own[:, rows] = quantise(channels, self.steps[name], name, centre, self._spacing(classes[rows]))
+    def quantise(self, given: Sequence[np.ndarray], classes: np.ndarray, names: Sequence[str]) -> np.ndarray:
+        """Returns v of float32 [n, any], one array per tensor, the nearest that symbols can give. names: for messages.
+        Raises EncodeError for a value without a symbol."""
+        v = np.empty((self.channels, len(given[0])), np.int32)
+        spacing = np.int32(1) << classes if self.graded else np.ones(v.shape[1], np.int32)
+        for x, name, (tensor, own, _, m) in zip(given, names, self._mapped(v, v), strict=True):
+            if tensor.predictor and self.graded:  # v is whole steps from that of the last row of a lower class
+                flat = x.reshape(-1, tensor.channels).T
+                for c, upto, of_class in _runs(classes, v.shape[1]):
+                    last, rows = _last_lower(of_class)[of_class], upto[of_class]
+                    base = np.concatenate([own[:, upto], m], axis=1)[:, last]
+                    own[:, rows] = base + (quantise(flat[:, rows], tensor.step, name, base, 1 << c) << c)
+                continue
+            for rows in row_blocks(v.shape[1]):
+                channels = x[rows].reshape(-1, tensor.channels).T
+                own[:, rows] = quantise(channels, tensor.step, name, m, spacing[rows]) * spacing[rows] + m
+        return v
+
+    def dequantise(self, v: np.ndarray) -> list[np.ndarray]:
+        """Returns the values float32 [n, C] of each tensor, C-contiguous."""
+        return [np.ascontiguousarray(dequantise(own, tensor.step).T) for tensor, own in self.of_each(v)]
+
+    @property
+    def _plain(self) -> bool:
+        """Whether symbols are values."""
+        return not self.graded and not any(tensor.predictor for tensor in self.tensors)
+
+    def values(self, symbols: np.ndarray, classes: np.ndarray) -> np.ndarray:
+        """Returns v of symbols k int32 [W, n]. Raises Malformed if a magnitude exceeds MAX_SYMBOL."""
+        if magnitude(symbols) > MAX_SYMBOL:
+            raise Malformed(f"a symbol of a row over {MAX_SYMBOL} in magnitude")
+        if self._plain:
+            return symbols
+        v, shifts = np.empty_like(symbols), classes if self.graded else 0
+        for tensor, k, out, m in self._mapped(symbols, v):
+            found = _accumulated(k, m, classes) if tensor.predictor else (k << shifts) + m
+            if magnitude(found) > MAX_SYMBOL:
+                raise Malformed(f"a value of a row more than {MAX_SYMBOL} steps from 0")
+            out[:] = found
+        return v
+
+    def symbols(self, v: np.ndarray, classes: np.ndarray) -> np.ndarray:
+        """The inverse of `values`. Raises EncodeError if no symbols give v."""
+        if self._plain:
+            return v
+        symbols, shifts = np.empty_like(v), classes if self.graded else 0
+        for tensor, own, out, m in self._mapped(v, symbols):
+            steps = _differences(own, m, classes) if tensor.predictor else own - m
+            out[:] = steps >> shifts
+            expect(np.array_equal(out << shifts, steps), f"rows {tensor.id}: values between the steps of their class")
+            expect(magnitude(out) <= MAX_SYMBOL, f"rows {tensor.id}: a symbol over {MAX_SYMBOL} in magnitude")
         return symbols
 
-    def dequantise(self, symbols: np.ndarray, classes: np.ndarray) -> dict[str, np.ndarray]:
-        """The inverse of `quantise`: float32 [n, *shape] by attribute, C-contiguous."""
-        values, spacing = {}, self._spacing(classes)
-        for name, own, centre in self._with_centres(symbols):
-            found = np.ascontiguousarray(dequantise(own, self.steps[name], centre, spacing).T)
-            values[name] = found.reshape(-1, *self.widths.attributes[name])
-        return values
+
+def _runs(classes: np.ndarray, n: int) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
+    """Yields, for each class c that occurs, ascending: c, the rows int64 of classes <= c, and which of them have it."""
+    classes = classes if classes.size else np.zeros(n, np.int32)
+    for c in np.unique(classes).tolist():
+        rows = np.flatnonzero(classes <= c)
+        yield c, rows, classes[rows] == c
+
+
+def _last_lower(own: np.ndarray) -> np.ndarray:
+    """Returns the place of the last row of a lower class before each row, int64 [n], or -1. own: which have the class.
+    A row of a lower class is its own."""
+    found: np.ndarray = np.maximum.accumulate(np.where(own, -1, np.arange(len(own))))
+    return found
+
+
+def _accumulated(k: np.ndarray, m: np.ndarray, classes: np.ndarray) -> np.ndarray:
+    """Undoes predictor 1: int64 [C, n] of symbols k [C, n] and centres m [C, 1]."""
+    v = np.zeros(k.shape, np.int64)
+    for c, rows, own in _runs(classes, k.shape[1]):
+        sums = np.cumsum(np.where(own, k[:, rows].astype(np.int64) << c, 0), axis=1)
+        last = _last_lower(own)
+        base = np.concatenate([v[:, rows] - sums, np.broadcast_to(m, (len(m), 1))], axis=1)
+        v[:, rows[own]] = (base[:, last] + sums)[:, own]
+    return v
+
+
+def _differences(v: np.ndarray, m: np.ndarray, classes: np.ndarray) -> np.ndarray:
+    """Applies predictor 1: int64 [C, n], k 2^c of values v [C, n] and centres m [C, 1]."""
+    steps = np.empty(v.shape, np.int64)
+    for _, rows, own in _runs(classes, v.shape[1]):
+        differences = np.diff(v[:, rows].astype(np.int64), axis=1, prepend=m)
+        steps[:, rows[own]] = differences[:, own]
+    return steps

@@ -1,73 +1,71 @@
-"""A scene as integers: Scene -> SceneSymbols -> Scene. A file stores the symbols exactly."""
+"""The layers of a file as integers and as values, slice by slice."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain
 
 import numpy as np
 
 from pd4dgs_codec.errors import Malformed
-from pd4dgs_codec.format.deformation import NOTHING, arrays_of, dequantise_tensors, layer_steps, quantise_tensors
-from pd4dgs_codec.format.quantise import MAX_SYMBOL, Grid, all_finite, classes_of, row_blocks
-from pd4dgs_codec.format.registry import LAYER_KINDS, LayerKind
+from pd4dgs_codec.format.quantise import NO_CLASSES, RowTable, all_finite, dequantise, row_blocks
+from pd4dgs_codec.format.tables import Fill, Tables, Tensors
 from pd4dgs_codec.morton import MAX_VOXEL, morton_order
-from pd4dgs_codec.scene import Deformation, Grading, Scene, SceneInfo, Steps, Widths
+from pd4dgs_codec.scene import Network
+
+NO_LAYER_ROWS = np.zeros((0, 0), np.int32)
 
 
 @dataclass(frozen=True, eq=False)
 class LayerSymbols:
-    """The content of a layer, or of one slice of it; later slices have only anchors with masks and attributes.
+    """The content of a layer, or of one slice of it; later slices have only anchors.
 
-    widths: of the anchors. anchor_q: int32 [n, 3] voxel indices of its own anchors, in Morton order. mask_increase:
-    int32 [rows before] rise of the earlier anchors' mask codes. mask_own: int32 [n] codes of its own anchors. classes:
-    int32 [n] step classes, or NO_CLASSES. attributes: int32 [channels, n]. tensors: int32 planes and networks, the
-    networks in the order of their numbers. steps: the steps in its chunk by name; none if it has no networks.
+    anchor_q: int32 [n, 3] voxel indices of its own anchors, in Morton order. rises: int32 [rows before], of the earlier
+    anchors' mask codes. codes: int32 [n], of its own anchors. classes: int32 [n] step classes, or NO_CLASSES. rows:
+    int32 [W, n], in steps. tensors: int32. fill: what a prefix that ends here has behind its Gaussians; None: the
+    background. earlier: int32 [rows before], the step classes of earlier anchors, empty without any and in a later
+    slice. layer_rows: int32 [channels, rows before + n], in steps; in a later slice only of its own anchors. bits: that
+    each group of channels took in the file, by its name, if it was read from one.
     """
 
-    kind: LayerKind
-    widths: Widths
+    layer: int
+    table: RowTable
     anchor_q: np.ndarray
-    mask_increase: np.ndarray
-    mask_own: np.ndarray
+    rises: np.ndarray
+    codes: np.ndarray
     classes: np.ndarray
-    attributes: np.ndarray
-    tensors: Deformation
-    steps: dict[str, float]
+    rows: np.ndarray
+    tensors: Tensors
+    fill: Fill | None = None
+    earlier: np.ndarray = field(default_factory=lambda: NO_CLASSES)
+    layer_rows: np.ndarray = field(default_factory=lambda: NO_LAYER_ROWS)
+    bits: Mapping[str, int] = field(default_factory=dict)
+
+    @property
+    def layer_table(self) -> RowTable:
+        """The table of the layer rows."""
+        rows = RowTable(self.tensors.tables.rows)
+        return RowTable(rows.tensors, np.zeros(rows.channels, np.int32)) if self.table.graded else rows
+
+    @property
+    def all_classes(self) -> np.ndarray:
+        """int32 [rows before + n], or NO_CLASSES: the step classes of the layer rows."""
+        return np.concatenate([self.earlier, self.classes])
 
     def arrays(self) -> list[np.ndarray]:
         """All arrays, in the order in which info --hashes digests them."""
-        own = [self.anchor_q, self.mask_increase, self.mask_own, self.classes, self.attributes]
-        return own + [array for *_, array in arrays_of(self.tensors, self.kind)]
+        own = [self.anchor_q, self.rises, self.codes, self.classes, self.rows, self.layer_rows]
+        return own + self.tensors.arrays
 
     def bits_per_row(self) -> np.ndarray:
         """Estimates the bits of each anchor, float64 [n], from the frequencies of its symbols in their channels."""
         n = len(self.anchor_q)
         bits = np.full(n, 3.0 * max(n, 2).bit_length())  # of a position
-        for channel in (self.mask_own, *self.attributes):
+        for channel in (self.codes, *self.table.symbols(self.rows, self.classes)):
             _, index, counts = np.unique(channel, return_inverse=True, return_counts=True)
             bits += np.log2(n / counts)[index]
         return bits
-
-
-def layer_symbols(scene: Scene, index: int) -> LayerSymbols:
-    """Returns the symbols of scene.layers[index]. Raises EncodeError for a value that has no symbol."""
-    kind = LAYER_KINDS[scene.layers[index]]
-    first, last = (scene.rows[index - 1] if index else 0), scene.rows[index]
-    codes = scene.mask[index].astype(np.int32)
-    before = scene.mask[index - 1].astype(np.int32) if index else codes[:0]
-    tensors, classes = scene.tensors(kind.layer), classes_of(scene)[first:last]
-    return LayerSymbols(
-        kind=kind,
-        widths=scene.widths,
-        anchor_q=scene.anchor_q[first:last],
-        mask_increase=codes[:first] - before,
-        mask_own=codes[first:],
-        classes=classes,
-        attributes=Grid.of(scene).quantise({k: v[first:last] for k, v in scene.attributes.items()}, classes),
-        tensors=quantise_tensors(tensors, kind, scene.steps),
-        steps=layer_steps(scene.steps, kind, tensors),
-    )
 
 
 def merged(slices: Sequence[LayerSymbols]) -> LayerSymbols:
@@ -75,53 +73,62 @@ def merged(slices: Sequence[LayerSymbols]) -> LayerSymbols:
     if len(slices) == 1:
         return slices[0]
     anchor_q = np.concatenate([part.anchor_q for part in slices])
-    order = morton_order(anchor_q)
+    order, earlier = morton_order(anchor_q), len(slices[0].rises)
+    classes = np.concatenate([part.classes for part in slices])
+    layer_rows = np.concatenate([part.layer_rows for part in slices], axis=1)
+    if layer_rows.size:
+        layer_rows = layer_rows[:, np.concatenate([np.arange(earlier), earlier + order])]
     return replace(
         slices[0],
         anchor_q=anchor_q[order],
-        mask_own=np.concatenate([part.mask_own for part in slices])[order],
-        classes=np.concatenate([part.classes for part in slices])[order if slices[0].widths.graded else slice(0)],
-        attributes=np.concatenate([part.attributes for part in slices], axis=1)[:, order],
+        codes=np.concatenate([part.codes for part in slices])[order],
+        classes=classes[order] if len(classes) else classes,
+        rows=np.concatenate([part.rows for part in slices], axis=1)[:, order],
+        fill=slices[-1].fill,
+        layer_rows=layer_rows,
+        bits={name: sum(part.bits.get(name, 0) for part in slices) for name in slices[0].bits},
     )
 
 
 def sliced(layer: LayerSymbols, rows: np.ndarray, first: bool) -> LayerSymbols:
     """Returns a slice with the anchors `rows` int64 [n] of a layer. first: whether it carries the layer's rest too."""
-    rows = rows[morton_order(layer.anchor_q[rows])]
-    part = layer if first else replace(layer, mask_increase=layer.mask_increase[:0], tensors=NOTHING, steps={})
+    rows, earlier = rows[morton_order(layer.anchor_q[rows])], len(layer.rises)
+    part, kept = layer, np.concatenate([np.arange(earlier if first else 0), earlier + rows])
+    if not first:
+        tensors = Tensors(Tables(rows=layer.tensors.tables.rows))
+        part = replace(layer, rises=layer.rises[:0], tensors=tensors, earlier=NO_CLASSES)
     return replace(
         part,
+        layer_rows=layer.layer_rows[:, kept] if layer.layer_rows.size else layer.layer_rows,
         anchor_q=layer.anchor_q[rows],
-        mask_own=layer.mask_own[rows],
-        classes=layer.classes[rows] if layer.widths.graded else layer.classes,
-        attributes=layer.attributes[:, rows],
+        codes=layer.codes[rows],
+        classes=layer.classes[rows] if len(layer.classes) else layer.classes,
+        rows=layer.rows[:, rows],
     )
 
 
 @dataclass(frozen=True, eq=False)
-class SceneSymbols:
-    """A scene, or a prefix of its layers, as a file stores it. grid: of the attributes."""
+class LayerTensors:
+    """A decoded layer: the values of its slices, by form and id.
 
-    info: SceneInfo
-    grid: Grid
-    layers: Sequence[LayerSymbols]
+    layer: its number. kind: of its deformation (number, parameters), empty if it states none. fill: RGB 0..255 behind
+    its Gaussians, None for the background. voxels: int32 [n, 3] and positions: float32 [n, 3] of its own anchors.
+    codes: uint8 [N], the mask codes of the anchors of all layers so far. classes: uint8 [n] step classes, 0 without
+    any. rows: float32 [n, C] by id. layer_rows: float32 [N, C] by id. grids: planes float32 [C, H, W] by id. chains:
+    (weight [outputs, inputs], bias [outputs]) of each linear layer by id, float32.
+    """
 
-    @staticmethod
-    def of(scene: Scene) -> SceneSymbols:
-        """Returns the symbols of a planned scene. Raises EncodeError for a value that has no symbol."""
-        return SceneSymbols(scene.info, Grid.of(scene), [layer_symbols(scene, i) for i in range(len(scene.layers))])
-
-    @property
-    def steps(self) -> Steps:
-        """All steps; those that no layer uses have the defaults of Steps."""
-        return Steps(**self.grid.steps, **{name: q for layer in self.layers for name, q in layer.steps.items()})
-
-    def scene(self) -> Scene:
-        """Returns the dequantised scene (clause 11.5)."""
-        grown = GrowingScene(self.info, self.grid)
-        for layer in self.layers:
-            grown.add(layer)
-        return grown.scene()
+    layer: int
+    kind: tuple[int, ...]
+    fill: Fill | None
+    voxels: np.ndarray
+    positions: np.ndarray
+    codes: np.ndarray
+    classes: np.ndarray
+    rows: dict[int, np.ndarray]
+    layer_rows: dict[int, np.ndarray]
+    grids: dict[int, tuple[np.ndarray, ...]]
+    chains: dict[int, Network]
 
 
 # -- slices as they come -----------------------------------------------------------------------------------------------
@@ -166,52 +173,54 @@ class _Column:
         np.take(values[first:], order, axis=0, out=self._room[first : self.size], mode="clip")  # other modes copy `out`
 
 
-class GrowingScene:
-    """The dequantised scene of the slices so far. Each slice is dequantised only once.
+class Growing:
+    """The values of the slices so far. Each slice is dequantised only once.
 
     The rows of a layer are in order of arrival until the next layer begins or `sort` is called, and then in the order
     of clause 12.2.
     """
 
-    def __init__(self, info: SceneInfo, grid: Grid):
-        self._info, self._grid = info, grid
-        shapes = {name: (np.float32, shape) for name, shape in grid.widths.attributes.items()}
-        columns = {"anchor_q": (np.int32, (3,)), **shapes, "classes": (np.uint8, ())}
-        self._columns = {name: _Column(dtype, *shape) for name, (dtype, shape) in columns.items()}
-        self._masks = list[_Column]()
-        self._tensors = dict[int, Deformation]()
-        self._steps = Steps(**grid.steps)
+    def __init__(self, table: RowTable, voxel_size: float):
+        self._table, self._voxel_size = table, voxel_size
+        self._anchor_q, self._classes = _Column(np.int32, 3), _Column(np.uint8)
+        self._rows = [_Column(np.float32, tensor.channels) for tensor in table.tensors]
+        self._codes = list[_Column]()
+        self._layer_rows = list[list[_Column]]()  # by layer present
+        self.tensors = dict[int, Tensors]()  #: float32, by layer
+        self.fills = dict[int, Fill | None]()  #: by layer
         self._first = 0  # row of the layer in progress
         self._sorted = True  # whether its rows are
-        self._centre = grid.centre_values
 
     def add(self, part: LayerSymbols, first: bool = True) -> None:
         """Adds a slice. first: whether it is the first one of its layer."""
-        n, layer = len(part.anchor_q), part.kind.layer
+        n = len(part.anchor_q)
         if first:
             self.sort()
-            self._first, codes = self._columns["anchor_q"].size, _Column(np.uint8)
+            self._first, codes = self._anchor_q.size, _Column(np.uint8)
             before = self.codes
             raised = codes.grow(len(before))
-            np.add(before, part.mask_increase, out=raised, casting="unsafe")
-            self._masks.append(codes)
-            self._steps = replace(self._steps, **part.steps)
-            self._tensors[layer] = dequantise_tensors(part.tensors, part.kind, self._steps)
+            np.add(before, part.rises, out=raised, casting="unsafe")
+            self._codes.append(codes)
+            self.tensors[part.layer] = part.tensors.dequantised()
+            self._layer_rows.append([_Column(np.float32, tensor.channels) for tensor in part.tensors.tables.rows])
+        self.fills[part.layer] = part.fill
         self._sorted = first or (self._sorted and not n)
-        self._masks[-1].grow(n)[:] = part.mask_own
-        self._columns["anchor_q"].grow(n)[:] = part.anchor_q
-        self._columns["classes"].grow(part.classes.size)[:] = part.classes
-        rows = {name: self._columns[name].grow(n) for name in self._grid.widths.attributes}
-        for at in row_blocks(n):
-            for name, x in self._grid.dequantise(part.attributes[:, at], part.classes[at]).items():
-                rows[name][at] = x
+        self._codes[-1].grow(n)[:] = part.codes
+        self._anchor_q.grow(n)[:] = part.anchor_q
+        self._classes.grow(part.classes.size)[:] = part.classes
+        tables = ((self._table, self._rows, part.rows), (part.layer_table, self._layer_rows[-1], part.layer_rows))
+        for table, columns, v in tables if part.layer_rows.size else tables[:1]:
+            grown = [column.grow(v.shape[1]) for column in columns]
+            for at in row_blocks(v.shape[1]):
+                for own, x in zip(grown, table.dequantise(v[:, at]), strict=True):
+                    own[at] = x
 
     def sort(self) -> None:
         """Sorts the rows of the layer in progress by Morton order."""
         if self._sorted:
             return
-        order = morton_order(self._columns["anchor_q"].values[self._first :])
-        for column in (*self._columns.values(), self._masks[-1]):
+        order = morton_order(self._anchor_q.values[self._first :])
+        for column in (self._anchor_q, self._classes, *self._rows, self._codes[-1], *self._layer_rows[-1]):
             if column.size:
                 column.reorder(self._first, order)
         self._sorted = True
@@ -219,48 +228,65 @@ class GrowingScene:
     @property
     def codes(self) -> np.ndarray:
         """uint8 [rows so far]: the mask codes of the latest layer."""
-        return self._masks[-1].values if self._masks else np.zeros(0, np.uint8)
+        return self._codes[-1].values if self._codes else np.zeros(0, np.uint8)
 
-    def scene(self, writeable: bool = True) -> Scene:
-        """Returns the scene so far, of at least one slice. Scenes share their arrays: write to at most one of them."""
-        arrays = {name: column.give() for name, column in self._columns.items()}
-        masks = tuple(column.give() for column in self._masks)
-        for array in (*arrays.values(), *masks):
+    @property
+    def classes(self) -> np.ndarray:
+        """int32 [rows so far], or NO_CLASSES: the step classes."""
+        return self._classes.values.astype(np.int32)
+
+    def arrays(self, writeable: bool = True) -> tuple[list[np.ndarray], list[np.ndarray], list[list[np.ndarray]]]:
+        """Returns (voxels int32 [N, 3], classes uint8 [N or 0] and the rows of each tensor float32 [N, C]; the mask
+        codes of each layer, uint8 [rows so far]; its layer rows of each tensor, float32 [rows so far, C]). Later calls
+        may return the same arrays."""
+        values = [column.give() for column in (self._anchor_q, self._classes, *self._rows)]
+        codes = [column.give() for column in self._codes]
+        layer_rows = [[column.give() for column in columns] for columns in self._layer_rows]
+        for array in (*values, *codes, *chain(*layer_rows)):
             array.flags.writeable = writeable
-        classes, tensors = arrays.pop("classes"), self._tensors
-        return Scene(
-            info=self._info,
-            steps=self._steps,
-            layers=tuple(tensors),
-            rows=tuple(codes.size for codes in masks),
-            mask=masks,
-            networks=tensors[0].networks,
-            global_deformation=tensors[1] if 1 in tensors and tensors[1].networks else None,
-            local_deformation=tensors[2] if 2 in tensors and tensors[2].networks else None,
-            grading=Grading(classes, self._centre) if self._grid.widths.graded else None,
-            **arrays,
-        )
+        return values, codes, layer_rows
+
+    def layers(self) -> list[LayerTensors]:
+        """Returns the layers so far."""
+        (voxels, classes, *rows), codes, layer_rows = self.arrays()
+        classes = classes if self._table.graded else np.zeros(len(voxels), np.uint8)
+        found, first = list[LayerTensors](), 0
+        for (layer, tensors), own_codes, of_layer in zip(self.tensors.items(), codes, layer_rows, strict=True):
+            own, first = slice(first, len(own_codes)), len(own_codes)
+            found.append(
+                LayerTensors(
+                    layer=layer,
+                    kind=tensors.tables.kind,
+                    fill=self.fills[layer],
+                    voxels=voxels[own],
+                    positions=dequantise(voxels[own], self._voxel_size),
+                    codes=own_codes,
+                    classes=classes[own],
+                    rows={tensor.id: x[own] for tensor, x in zip(self._table.tensors, rows, strict=True)},
+                    layer_rows={tensor.id: x for tensor, x in zip(tensors.tables.rows, of_layer, strict=True)},
+                    grids=tensors.grids,
+                    chains=tensors.chains,
+                )
+            )
+        return found
 
 
 # -- rules between slices ----------------------------------------------------------------------------------------------
 
 
-def check_slice(layer: LayerSymbols, before: np.ndarray, voxel_size: float, grid: Grid) -> None:
+def check_slice(part: LayerSymbols, before: np.ndarray, voxel_size: float) -> None:
     """Checks a slice against the header and the mask codes before it, uint8 [rows before].
 
-    Raises Malformed if a mask code is above 255, an attribute lies too many steps from 0, or a dequantised value would
-    not be finite.
+    Raises Malformed if a mask code is above 255 or a dequantised value would not be finite.
     """
-    where = f"layer {layer.kind.layer}"
-    if layer.mask_increase.size:
-        highest = int((before + layer.mask_increase).max())
+    where = f"layer {part.layer}"
+    if part.rises.size:
+        highest = int((before + part.rises).max())
         if highest > 255:
             raise Malformed(f"{where}: mask code {highest}, expected at most 255")
-    farthest = grid.farthest(layer.attributes, layer.classes)
-    if max(farthest.values()) > MAX_SYMBOL:
-        raise Malformed(f"{where}: an attribute more than {MAX_SYMBOL} steps from 0")
-    stored = [(layer.anchor_q, voxel_size), *((np.array(k), grid.steps[name]) for name, k in farthest.items())]
-    stored += [(k, layer.steps[name]) for name, _, k in arrays_of(layer.tensors, layer.kind)]
+    stored = [(part.anchor_q, voxel_size), *zip(part.tensors.arrays, part.tensors.tables.steps, strict=True)]
+    for table, v in ((part.table, part.rows), (part.layer_table, part.layer_rows)):
+        stored += [(own, tensor.step) for tensor, own in table.of_each(v)]
     if not all(all_finite(k, step) for k, step in stored):
         raise Malformed(f"{where}: a dequantised value is not finite")
 

@@ -1,40 +1,35 @@
 """Exports a level of a scene as explicit Gaussians, and measures the loss of quality.
 
-The decoders take the view direction, so opacity, size, rotation and colour of a Gaussian depend on it. Baking evaluates
-them from a set of eyes, each with a weight per anchor. Opacity is the weighted mean over the eyes; an eye that does not
-see the Gaussian counts as 0. The weights of covariance and colour are multiplied by opacity. Covariance is a mean;
-colours are harmonics fitted by least squares, with a ridge that keeps unseen directions near the mean colour.
-
-No eye sees this average, so refinement then fits the Gaussians to pictures of the scene by gradient descent.
+Splats are explicit already. The decoders of a scaffold take the view direction, so opacity, size, rotation and colour
+of a Gaussian depend on it. Baking evaluates them from a set of eyes, each with a weight per anchor. Opacity is the
+weighted mean over the eyes; an eye that does not see the Gaussian counts as 0. The weights of covariance and colour are
+multiplied by opacity. Covariance is a mean; colours are harmonics fitted by least squares, with a ridge that keeps
+unseen directions near the mean colour.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pd4dgs_codec.data.view import View, rotation_matrix
 from pd4dgs_codec.draw.gaussians import LEAST_NEAR, near_plane
-from pd4dgs_codec.draw.player import Player
-from pd4dgs_codec.draw.rasteriser import Geometry, backward, composite, project
+from pd4dgs_codec.draw.player import Drawer, Player, SplatPlayer
 from pd4dgs_codec.interchange.splats import (
-    Splats,
-    harmonics,
+    evenly,
+    finite_rows,
     looking,
     picture,
     principal_axes,
     quaternions,
     sphere,
-    spread,
-    unit,
 )
-from pd4dgs_codec.quality.frames import shrunk
+from pd4dgs_codec.kinds.splats import Splats, harmonics, product, unit
 from pd4dgs_codec.quality.image import mpsnr
 from pd4dgs_codec.scene import MIN_OPACITY, Camera
 
-Step = Callable[[], None]
 UNTURNED = np.eye(3)
 #: Eyes of a bake; more of them change held-out PSNR by less than 0.01 dB.
 EYES = 48
@@ -47,17 +42,6 @@ RIDGE = 1e-4
 PIXELS = 400  #: width and height of the pictures of a file without a camera
 #: `eyes_of_scene` weighs an eye at the angle a from the file's camera by exp(CONCENTRATION (cos a - 1)).
 CONCENTRATION = 2.0
-#: Refinement shrinks the eyes' pictures by a whole factor to at most this many pixels.
-TARGET_PIXELS = 1 << 17
-#: Later times start from the refinement of the previous time and take this share of the steps.
-LATER = 0.25
-#: Initial learning rates, which decay to LAST of that. The rate of means is relative to a Gaussian's largest scale.
-RATES = {"means": 0.02, "quats": 0.01, "log_scales": 0.02, "logits": 0.05, "sh": 0.01}
-LAST = 0.1
-REST = 0.2  #: factor of the rate for harmonics of degree 1 and above, which 3D Gaussian splatting lowers as well
-BETAS, EPSILON = (0.9, 0.99), 1e-15
-SMALLEST = np.float32(1e-9)  #: scene units
-FAINTEST, STRONGEST = 1e-3, 1 - 1e-4  #: bounds of opacities before their logits are taken
 
 
 # -- eyes and baking ---------------------------------------------------------------------------------------------------
@@ -78,7 +62,7 @@ class Eyes:
 
 def eyes_of_cameras(cameras: Sequence[Camera]) -> Eyes:
     """Picks EYES cameras, evenly spaced in their order, or all if there are fewer. Their weights are equal."""
-    chosen = spread(cameras, EYES)
+    chosen = evenly(cameras, EYES)
     return Eyes(chosen, np.ones(len(chosen)))
 
 
@@ -104,6 +88,38 @@ def eyes_of_scene(player: Player, count: int = EYES) -> Eyes:
         like, weights = camera, np.exp(CONCENTRATION * (places @ (away / distance) - 1))
     up = np.asarray(info.up, np.float64)
     return Eyes(tuple(looking(middle + distance * d, -d, up, like) for d in places), weights)
+
+
+def exported(
+    player: Drawer, t: float, eyes: Eyes | None, degree: int, turn: np.ndarray = UNTURNED
+) -> tuple[Splats, np.ndarray]:
+    """Returns (Gaussians at normalised time t in 0..1, their slots int64 [N]), without Gaussians too faint to be drawn.
+
+    eyes: from which a scaffold is baked; None for splats, which stay as they are. degree: of the harmonics, at most.
+    turn: rotation of the world, [3, 3].
+    """
+    if isinstance(player, SplatPlayer):
+        splats, slots = player.splats(t)
+        if not (finite := finite_rows(vars(splats))).all():
+            splats, slots = splats.taken(finite), slots[finite]
+        return _turned(replace(splats, sh=splats.sh[:, : (degree + 1) ** 2]), turn), slots
+    assert isinstance(player, Player) and eyes
+    return bake(player, t, eyes, degree, turn)
+
+
+def _turned(splats: Splats, turn: np.ndarray) -> Splats:
+    """Returns the Gaussians in a world that is rotated by `turn` [3, 3]."""
+    if turn is UNTURNED:
+        return splats
+    directions = sphere(4 * splats.sh.shape[1])  # harmonics of a degree span what they are turned to
+    own, turned = harmonics(directions, splats.degree), harmonics(directions @ turn.T, splats.degree)
+    return Splats(
+        means=(splats.means @ turn.T).astype(np.float32),
+        quats=product(quaternions(turn[None]), splats.quats).astype(np.float32),
+        scales=splats.scales,
+        opacities=splats.opacities,
+        sh=np.einsum("jk,nkc->njc", np.linalg.lstsq(turned, own, rcond=None)[0], splats.sh).astype(np.float32),
+    )
 
 
 def bake(player: Player, t: float, eyes: Eyes, degree: int, turn: np.ndarray = UNTURNED) -> tuple[Splats, np.ndarray]:
@@ -179,139 +195,7 @@ def _fitted(basis: np.ndarray, colors: np.ndarray, weights: np.ndarray) -> np.nd
     return np.asarray(np.linalg.solve(normal, weighted @ (colors.transpose(1, 0, 2) - 0.5)))
 
 
-# -- refinement --------------------------------------------------------------------------------------------------------
-
-
-#: A camera, and the picture to match, float32 [H, W, 3].
-Target = tuple[Camera, np.ndarray]
-
-
-def refine(
-    splats: Splats,
-    targets: Mapping[int, Target],
-    order: Sequence[int],
-    background: tuple[float, float, float],
-    near: float,
-    step: Step = lambda: None,
-) -> Splats:
-    """Refines Gaussians by Adam (Kingma and Ba 2015) on the squared error. order: key of each step's target."""
-    size = np.maximum(splats.scales.max(axis=1, keepdims=True), SMALLEST)
-    values = {
-        "means": splats.means / size,
-        "quats": splats.quats.copy(),
-        "log_scales": np.log(np.maximum(splats.scales, SMALLEST)),
-        "logits": logits(splats.opacities),
-        "sh": splats.sh.copy(),
-    }
-    moments = {name: (np.zeros_like(value), np.zeros_like(value)) for name, value in values.items()}
-    behind = np.array(background, np.float32)
-    for i, which in enumerate(order):
-        gradients = _gradients(values, size, *targets[which], behind, near)
-        rate = LAST ** (i / max(len(order) - 1, 1))
-        for name, gradient in gradients.items():
-            first, second = moments[name]
-            first += (1 - BETAS[0]) * (gradient - first)
-            second += (1 - BETAS[1]) * (gradient * gradient - second)
-            corrected = np.sqrt(second / np.float32(1 - BETAS[1] ** (i + 1))) + np.float32(EPSILON)
-            change = np.float32(rate * RATES[name] / (1 - BETAS[0] ** (i + 1))) * first / corrected
-            if name == "sh":
-                change[:, 1:] *= np.float32(REST)
-            values[name] -= change
-        step()
-    return _splats(values, size)
-
-
-def logits(opacities: np.ndarray) -> np.ndarray:
-    """Returns the logits float32 [N] of opacities [N], bounded so that gradients do not vanish."""
-    p = np.clip(opacities, FAINTEST, STRONGEST).astype(np.float32)
-    return np.asarray(np.log(p / (1 - p)))
-
-
-def _splats(values: dict[str, np.ndarray], size: np.ndarray) -> Splats:
-    return Splats(
-        np.ascontiguousarray(values["means"] * size),
-        unit(values["quats"]),
-        np.exp(values["log_scales"]),
-        1 / (1 + np.exp(-values["logits"])),
-        values["sh"],
-    )
-
-
-def _gradients(
-    values: dict[str, np.ndarray], size: np.ndarray, camera: Camera, image: np.ndarray, behind: np.ndarray, near: float
-) -> dict[str, np.ndarray]:
-    """Returns the gradients of one picture's mean squared error by the names of `values`."""
-    splats = _splats(values, size)
-    basis = harmonics(unit(splats.means - camera.eye), splats.degree)
-    raw = np.einsum("nj,njc->nc", basis, splats.sh) + np.float32(0.5)
-    colors = np.maximum(raw, 0)
-    geometry = Geometry(splats.means, splats.quats, splats.scales, splats.opacities)
-    projected = project(geometry, camera, near)
-    picture, transmittance = composite(projected, colors, behind)
-    slope = (2 / picture.size) * (picture - image)
-    g = backward(projected, geometry, colors, picture, transmittance, slope, np.zeros_like(transmittance))
-    g_quats = g.geometry.quats
-    return {
-        "means": g.geometry.means * size,
-        "quats": g_quats - splats.quats * np.einsum("nd,nd->n", g_quats, splats.quats)[:, None],
-        "log_scales": g.geometry.scales * splats.scales,
-        "logits": g.geometry.opacities * splats.opacities * (1 - splats.opacities),
-        "sh": basis[:, :, None] * (g.colors * (raw > 0))[:, None, :],
-    }
-
-
-# -- export ------------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Export:
-    """Turns a scene into explicit Gaussians. degree: of the harmonics, 0 to 3; steps: of refinement, 0 for none."""
-
-    player: Player
-    eyes: Eyes
-    degree: int
-    steps: int
-
-    def splats(
-        self, t: float, turn: np.ndarray = UNTURNED, before: Learnt | None = None, step: Step = lambda: None
-    ) -> tuple[Splats, Learnt]:
-        """Returns (Gaussians at normalised time t, their changes by refinement). turn: rotation of the world, [3, 3].
-        before: changes of another time to start from. step: called after each step of refinement."""
-        baked, slots = bake(self.player, t, self.eyes, self.degree, turn)
-        started = baked if before is None else before.applied(baked, slots)
-        steps = self.steps if before is None else int(np.ceil(LATER * self.steps))
-        if not (steps and len(slots)):
-            return started, Learnt(slots, baked, started)
-        weights, info = self.eyes.weights / self.eyes.weights.sum(), self.player.info
-        order = np.random.default_rng(0).choice(len(weights), steps, p=weights).tolist()
-        targets = {}
-        for i in set(order):
-            camera = self.eyes.cameras[i]
-            camera = shrunk(camera, int(np.ceil(np.sqrt(camera.width * camera.height / TARGET_PIXELS))))
-            targets[i] = turned_camera(camera, turn), self.player.picture(camera, t)
-        refined = refine(started, targets, order, info.background, near_plane(info), step)
-        return refined, Learnt(slots, baked, refined)
-
-
-@dataclass(frozen=True, eq=False)
-class Learnt:
-    """The changes by refinement at one time: slots int64 [N] and their Gaussians before and after it."""
-
-    slots: np.ndarray
-    baked: Splats
-    refined: Splats
-
-    def applied(self, splats: Splats, slots: np.ndarray) -> Splats:
-        """Applies the changes to the Gaussians of another time by slot. Sizes and rotations stay, since the order of
-        their axes differs from time to time."""
-        _, here, there = np.intersect1d(slots, self.slots, assume_unique=True, return_indices=True)
-        old, new = self.baked.taken(there), self.refined.taken(there)
-        parts = {name: values.copy() for name, values in vars(splats).items()}
-        parts["means"][here] += new.means - old.means
-        gained = logits(new.opacities) - logits(old.opacities)
-        parts["opacities"][here] = 1 / (1 + np.exp(-logits(parts["opacities"][here]) - gained))
-        parts["sh"][here] += new.sh - old.sh
-        return Splats(**parts)
+# -- axes and loss -----------------------------------------------------------------------------------------------------
 
 
 def upright(up: Sequence[float]) -> np.ndarray:
@@ -323,24 +207,19 @@ def upright(up: Sequence[float]) -> np.ndarray:
     return np.asarray(np.eye(3) + 2 * np.outer(b, a) - np.outer(a + b, a + b) / (1 + a @ b))
 
 
-def turned_camera(camera: Camera, turn: np.ndarray) -> Camera:
-    """Rotates a camera together with the world by `turn` [3, 3], so that its picture stays the same."""
-    viewmat = camera.viewmat.astype(np.float64)
-    viewmat[:3, :3] = viewmat[:3, :3] @ turn.T
-    return replace(camera, viewmat=viewmat.astype(np.float32))
-
-
-def cost(export: Export, views: Sequence[View], step: Step = lambda: None) -> dict[str, float]:
+def cost(
+    player: Drawer, eyes: Eyes | None, degree: int, views: Sequence[View], step: Callable[[], None] = lambda: None
+) -> dict[str, float]:
     """Measures the loss by export: each view's time is exported by itself and drawn from the view's camera.
 
     Returns the number of views and means over them in dB: direct_mpsnr (direct picture against the truth),
     exported_mpsnr (exported against the truth) and exported_to_direct_psnr (exported against direct).
     """
-    rows, info = [], export.player.info
+    rows, info = [], player.info
     for view in views:
-        direct = export.player.picture(view.camera, view.time)
-        splats, _ = export.splats(view.time)
-        image = picture(splats, view.camera, info.background, near_plane(info))
+        direct = player.picture(view.camera, view.time)
+        splats, _ = exported(player, view.time, eyes, degree)
+        image = picture(splats, view.camera, player.background, near_plane(info))
         error = float(np.square(image.astype(np.float64) - direct).mean())
         to_direct = -10 * np.log10(max(error, np.finfo(float).tiny))
         rows.append((mpsnr(direct, view.image, view.mask), mpsnr(image, view.image, view.mask), to_direct))

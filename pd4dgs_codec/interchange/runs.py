@@ -13,6 +13,9 @@ logarithms of scales, quaternions, logits of opacities and harmonics; `cfg_args`
 Deformable-3DGS (`deform/iteration_N/deform.pth`): a network with a skip takes sines and cosines of mean and time. It
 adds to scales and unit quaternions, and adds to means or moves them by a screw (6DoF). The sums of quaternions are not
 normalised, so the rotation matrix also scales: https://github.com/ingra14m/Deformable-3D-Gaussians/issues/18
+
+SpacetimeGaussians (Li et al. 2024): a PLY file with cubic polynomials of means and linear ones of quaternions, in the
+time since the centre of a bell that multiplies the opacity. The lite model has plain colours.
 """
 
 from __future__ import annotations
@@ -29,19 +32,18 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.archives import read_tensors
-from pd4dgs_codec.data.files import LARGEST, WHITE, Color, array, number, read_file, whole_number
+from pd4dgs_codec.data.files import LARGEST, WHITE, Color, array, number, read_file, read_vertices, whole_number
 from pd4dgs_codec.data.view import check_rotation, rotation_matrix, up_direction, world_to_camera
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.splats import (
-    Splats,
     activated,
     checked,
     finite_rows,
     principal_axes,
     quaternions,
     read_parameters,
-    unit,
 )
+from pd4dgs_codec.kinds.splats import SH_C0, Splats, unit
 from pd4dgs_codec.scene import Camera
 
 PLY = "point_cloud.ply"
@@ -50,10 +52,9 @@ MAX_WIDTH = 1024
 Layer = tuple[np.ndarray, np.ndarray]  #: weight float32 [outputs, inputs], bias float32 [outputs]
 
 
-def iteration(folder: Path, number: int | None = None) -> Path | None:
-    """Finds the folder with point_cloud.ply: `folder` itself, or iteration `number` below it (None: the last);
-    None if it has no such iteration."""
-    if (folder / PLY).is_file() and (number is None or folder.name == f"iteration_{number}"):
+def iteration(folder: Path) -> Path | None:
+    """Finds the folder with point_cloud.ply: `folder` itself, or the last iteration below it; None if it has none."""
+    if (folder / PLY).is_file():
         return folder
     base = folder / "point_cloud" if (folder / "point_cloud").is_dir() else folder
     found = {
@@ -61,7 +62,7 @@ def iteration(folder: Path, number: int | None = None) -> Path | None:
         for path in base.glob("iteration_*")
         if (match := re.fullmatch(r"iteration_(\d{1,9})", path.name)) and (path / PLY).is_file()
     }
-    return found.get(max(found, default=0) if number is None else number)
+    return found.get(max(found, default=0))
 
 
 def run_of(place: Path) -> Path:
@@ -382,3 +383,52 @@ def _screwed(means: np.ndarray, axis: np.ndarray, way: np.ndarray) -> np.ndarray
 
     sine, versine = np.sin(angle), 1 - np.cos(angle)
     return np.asarray(combined(means, 1.0, sine, versine) + combined(way, angle, versine, angle - sine))
+
+
+# -- SpacetimeGaussians ------------------------------------------------------------------------------------------------
+
+SPACETIME = b"property float trbf_center"  #: in the header of its PLY files
+#: Beyond so many widths of its bell a Gaussian is invisible and stays where it is, which keeps polynomials small.
+BELL_REACH = 2.5
+
+
+def visible(windows: np.ndarray, t: float) -> np.ndarray:
+    """Returns float32 [n]: the factors on opacities at time t of windows [n, 3] (centre, half width, softness)."""
+    outside = np.maximum(np.abs(t - windows[:, 0]) - windows[:, 1], 0)
+    return np.asarray(np.exp(-0.5 * np.square(outside / windows[:, 2])), np.float32)
+
+
+def read_spacetime(path: Path, raw: bytes) -> tuple[Callable[[float], Splats], np.ndarray]:
+    """Reads a PLY file of the lite model as (function of time 0..1 -> Gaussians without their bells, bells as windows
+    float32 [n, 3]). Raises DataError."""
+    rows = read_vertices(path, raw)
+    names = set(rows.dtype.names or ())
+    if names & {"f_t_0", "f_dc_3"}:
+        what = "SpacetimeGaussians' full model, whose colours come from a network"
+        raise DataError(f"{path}: is {what}, expected the lite model with plain colours")
+
+    def stack(prefix: str, places: Iterable[object]) -> np.ndarray:
+        wanted = [f"{prefix}{place}" for place in places]
+        if missing := [name for name in wanted if name not in names]:
+            raise DataError(f"{path}: has no property {missing[0]}, expected those of SpacetimeGaussians")
+        return np.stack([rows[name] for name in wanted], axis=1).astype(np.float32)
+
+    parts = {
+        "means": stack("", "xyz"), "motion": stack("motion_", range(9)), "quats": stack("rot_", range(4)),
+        "omega": stack("omega_", range(4)), "scales": stack("scale_", range(3)), "opacities": stack("opacity", [""]),
+        "colors": stack("f_dc_", range(3)), "bell": stack("trbf_", ["center", "scale"]),
+    }  # fmt: skip
+    good = finite_rows(parts) & (np.abs(parts["quats"]).sum(axis=1) > 0) & (np.abs(parts["bell"][:, 1]) < 20)
+    parts = {name: values[good] for name, values in parts.items()}
+    center, width = parts["bell"][:, :1], np.exp(parts["bell"][:, 1:])
+    still = activated(parts)
+
+    def bare(t: float) -> Splats:
+        past = np.clip(t - center, -BELL_REACH * width, BELL_REACH * width)
+        powers = (past, past**2, past**3)
+        means = parts["means"] + sum(parts["motion"][:, 3 * i : 3 * i + 3] * x for i, x in enumerate(powers))
+        sh = (parts["colors"][:, None] - np.float32(0.5)) / np.float32(SH_C0)
+        quats = parts["quats"] + past * parts["omega"]
+        return checked(f"{path} at {t:g}", means, quats, still["scales"], still["opacities"][:, 0], sh)
+
+    return bare, np.concatenate([center, np.zeros_like(center), width / np.float32(2**0.5)], axis=1)

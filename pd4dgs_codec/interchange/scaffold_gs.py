@@ -43,16 +43,13 @@ LAYERS = {
 }
 
 
-def read_scaffold_gs(
-    folder: Path, appearance: int | None = None, voxel_size: float | None = None, number: int | None = None
-) -> Scene:
+def read_scaffold_gs(folder: Path, appearance: int | None = None, voxel_size: float | None = None) -> Scene:
     """Reads a scene with anchors in voxels, whitened features and all else as it is. Raises DataError for unsupported
     models.
 
-    appearance: index of the picture whose embedding is used. voxel_size: scene units, None to derive it. number: of
-    the iteration, None for the last.
+    appearance: index of the picture whose embedding is used. voxel_size: scene units, None to derive it.
     """
-    place = _iteration(folder, number)
+    place = _iteration(folder)
     run = run_of(place)
     config = Config.of(run)
     ply = place / PLY
@@ -86,16 +83,16 @@ def read_scaffold_gs(
     )
 
 
-def _iteration(folder: Path, number: int | None) -> Path:
+def _iteration(folder: Path) -> Path:
     """Finds the folder of the iteration. Raises DataError unless it holds static Gaussians."""
     if not folder.is_dir():
         raise DataError(f"{folder}: found {'a file' if folder.exists() else 'nothing'}, expected a folder")
-    place = iteration(folder, number)
+    place = iteration(folder)
     if place is None:
-        what = f"iteration_{number}" if number is not None else f"{PLY}, here or in point_cloud/iteration_N"
+        what = f"{PLY}, here or in point_cloud/iteration_N"
         raise DataError(f"{folder}: has no {what}; expected a checkpoint of Scaffold-GS")
     if network := network_of(place):
-        how = f"train with pd4dgs-train teacher:{folder}"
+        how = f"-o FILE.pd4 packs it, pd4dgs-train teacher:{folder} learns from it"
         raise DataError(f"{folder}: {network.name} moves its Gaussians, expected a checkpoint of Scaffold-GS; {how}")
     return place
 

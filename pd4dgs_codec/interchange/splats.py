@@ -1,9 +1,6 @@
-"""Explicit Gaussians as in 3D Gaussian splatting: only colour depends on the view direction, by spherical harmonics.
+"""Files of explicit Gaussians as in 3D Gaussian splatting, see `kinds.splats`, and pictures of them.
 
-Real harmonics and their signs are those of its reference implementation (Kerbl et al. 2023), as in PLY, SPZ and
-KHR_gaussian_splatting. A colour is max(0, 0.5 + sum c_j Y_j(d)), d the unit vector from the eye to the mean.
-
-Files: reads PLY, SPZ, .splat and gsplat checkpoints, which it tells apart by their content, and writes PLY, glTF, SPZ
+Reads PLY, SPZ, .splat and gsplat checkpoints, which it tells apart by their content, and writes PLY, glTF, SPZ
 and 4dgs. SPZ and compressed PLY need gaussforge, 4dgs needs fourdgs; the extra `interchange` installs both.
 """
 
@@ -20,7 +17,7 @@ import sys
 import warnings
 import zlib
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -31,13 +28,11 @@ from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, LARGEST, MAX_HEADER, r
 from pd4dgs_codec.data.view import world_to_camera
 from pd4dgs_codec.draw.rasteriser import draw
 from pd4dgs_codec.errors import DamageWarning, DataError, one_line, required
+from pd4dgs_codec.kinds.splats import MAX_DEGREE, SH_C0, Splats, unit
 from pd4dgs_codec.scene import Camera
 
 T = TypeVar("T")
 
-MAX_DEGREE = 3
-#: Y_0, a constant: the factor between a colour and its first coefficient.
-SH_C0 = 0.28209479177387814
 EXTRA = "interchange"  #: the extra that installs gaussforge and fourdgs
 #: Number of coefficients of the harmonics without the constant -> degree.
 REST = {(degree + 1) ** 2 - 1: degree for degree in range(MAX_DEGREE + 1)}
@@ -51,56 +46,33 @@ TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 JSON, BINARY = 0x4E4F534A, 0x004E4942  #: types of chunks
 #: SPZ stores positions in 24 bits, 12 of them fractional: multiples of SPZ_STEP below SPZ_REACH, scene units.
 SPZ_STEP, SPZ_REACH = 1 / 4096, 2048.0
+SPZ_SCALE = float(np.exp(255 / 16 - 10))  #: the largest scale of an SPZ file, scene units
 #: SPZ's first bytes; most Gaussians, and least and most unpacked bytes of each: 16 in version 1, 65 with all harmonics,
 #: the rest for extensions.
 SPZ_MAGIC, SPZ_MOST, SPZ_LEAST, SPZ_BYTES = b"NGSP", 10_000_000, 16, 128
 GZIP, ZIP, PICKLE = b"\x1f\x8b\x08", b"PK\3\4", b"\x80\x02\x8a"  #: first bytes of SPZ below version 4, of torch's files
 PACKED = b"\nproperty uint packed_position"  #: in the header of a compressed PLY
+KINDS = "a PLY, SPZ, .splat or .4dgs file or a checkpoint of gsplat"
+#: Files of Gaussians that are not read: the first bytes, bytes that are in them, and what they are. The first of a
+#: .ksplat file, which has no signature, are its version.
+#: https://github.com/mkkellogg/GaussianSplats3D/blob/main/src/loaders/SplatBuffer.js
+NOT_READ = (
+    (b"\0\1\0\0", bytes(2048), "a .ksplat file"),
+    (ZIP, b"means_l.webp", "a .sog file"),
+    (b"glTF", b"KHR_gaussian_splatting", "a glTF file"),
+)
 #: A row of a .splat file: linear scales, and as 0..255 sRGB, opacity and a quaternion wxyz around 128.
 #: https://github.com/antimatter15/splat
 ROUNDED = 0.05  #: most difference of the length of such a quaternion from 1
 ROW = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgb", "u1", 3), ("a", "u1"), ("quats", "u1", 4)])
-#: 4dgs files store harmonics from degree 1 on as bytes, for values from -SH_SPAN to SH_SPAN.
+#: 4dgs files store harmonics from degree 1 on as bytes, for values from -SH_SPAN to SH_SPAN; no byte stands for 0.
 SH_SPAN = 4.0
-
-
-@dataclass(frozen=True, eq=False)
-class Splats:
-    """N Gaussians at an instant, float32."""
-
-    means: np.ndarray  #: [N, 3] world, scene units
-    quats: np.ndarray  #: [N, 4] wxyz, unit
-    scales: np.ndarray  #: [N, 3] standard deviations, scene units
-    opacities: np.ndarray  #: [N] 0..1
-    sh: np.ndarray  #: [N, (degree + 1)^2, 3] coefficients of red, green and blue
-
-    @property
-    def degree(self) -> int:
-        """Degree of the harmonics, 0 to 3."""
-        return int(np.sqrt(self.sh.shape[1])) - 1
-
-    def colors(self, eye: np.ndarray) -> np.ndarray:
-        """Returns the colours float32 [N, 3] >= 0 seen from `eye` [3], world."""
-        basis = harmonics(unit(self.means - eye.astype(np.float32)), self.degree)
-        return np.asarray(np.maximum(np.einsum("nj,njc->nc", basis, self.sh) + np.float32(0.5), 0))
-
-    @property
-    def base_colors(self) -> np.ndarray:
-        """float32 [N, 3] 0..1: the mean colours over all directions."""
-        return np.asarray(np.clip(self.sh[:, 0] * np.float32(SH_C0) + np.float32(0.5), 0, 1))
-
-    @property
-    def rest(self) -> np.ndarray:
-        """float32 [N, 3 ((degree + 1)^2 - 1)]: coefficients from degree 1 on, channel by channel as in files."""
-        return np.asarray(self.sh[:, 1:].transpose(0, 2, 1).reshape(len(self.sh), 3 * (self.sh.shape[1] - 1)))
-
-    def taken(self, rows: np.ndarray) -> Splats:
-        """Returns the Gaussians `rows`, indices or a mask."""
-        return Splats(*(part[rows] for part in vars(self).values()))
-
-    def scaled(self, factor: float) -> Splats:
-        """Returns the Gaussians with all lengths multiplied by `factor`."""
-        return replace(self, means=self.means * np.float32(factor), scales=self.scales * np.float32(factor))
+SH_HALF_STEP = SH_SPAN / 255
+#: fourdgs rounds the instant at which a moving Gaussian is at its position to multiples of TICK seconds.
+TICK = 0.004
+#: What the numbers of our 4dgs files mean, and that no Gaussian fades.
+#: https://github.com/avala-ai/4dgs/blob/main/website/docs/spec/registry.md
+FOURDGS_METADATA = {"color_space": "srgb-rec709-display", "visibility_profile": "box"}
 
 
 def picture(splats: Splats, camera: Camera, background: tuple[float, float, float], near: float = 0.01) -> np.ndarray:
@@ -120,7 +92,7 @@ def looking(eye: np.ndarray, ahead: np.ndarray, up: np.ndarray, like: Camera) ->
     return replace(like, viewmat=viewmat.astype(np.float32))
 
 
-def spread(items: Sequence[T], count: int) -> tuple[T, ...]:
+def evenly(items: Sequence[T], count: int) -> tuple[T, ...]:
     """Picks `count` items, evenly spaced in their order, or all if there are fewer."""
     rows = np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int))
     return tuple(items[i] for i in rows)
@@ -131,36 +103,6 @@ def sphere(count: int) -> np.ndarray:
     i = np.arange(count) + 0.5
     polar, turn = np.arccos(1 - 2 * i / count), np.pi * (1 + 5**0.5) * i
     return np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
-
-
-def unit(vectors: np.ndarray) -> np.ndarray:
-    """Divides vectors [..., d] by their length; zero vectors stay zero."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.asarray(vectors / np.maximum(length, np.finfo(vectors.dtype).tiny))
-
-
-def harmonics(directions: np.ndarray, degree: int) -> np.ndarray:
-    """Evaluates (degree + 1)^2 real harmonics [..., j], degree 0 to 3, at unit vectors [..., 3] in their dtype."""
-    x, y, z = np.moveaxis(directions, -1, 0)
-    rows = [np.full_like(x, SH_C0)]
-    if degree >= 1:
-        c = 0.4886025119029199
-        rows += [-c * y, c * z, -c * x]
-    if degree >= 2:
-        c = 1.0925484305920792
-        xx, yy, zz = x * x, y * y, z * z
-        rows += [c * x * y, -c * y * z, 0.31539156525252005 * (2 * zz - xx - yy), -c * x * z, c / 2 * (xx - yy)]
-    if degree >= 3:
-        rows += [
-            -0.5900435899266435 * y * (3 * xx - yy),
-            2.890611442640554 * x * y * z,
-            -0.4570457994644658 * y * (4 * zz - xx - yy),
-            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
-            -0.4570457994644658 * x * (4 * zz - xx - yy),
-            1.445305721320277 * z * (xx - yy),
-            -0.5900435899266435 * x * (xx - 3 * yy),
-        ]
-    return np.stack(rows, axis=-1).astype(directions.dtype)
 
 
 def quaternions(matrices: np.ndarray) -> np.ndarray:
@@ -245,6 +187,9 @@ def read_splats(path: Path, raw: bytes | None = None) -> Splats:
     """Reads a PLY file of 3D Gaussian splatting, a compressed PLY, an SPZ or .splat file, or a checkpoint of gsplat,
     whatever its name. raw: its bytes, if known. Raises DataError."""
     raw = read_file(path) if raw is None else raw
+    for first, inside, kind in NOT_READ:
+        if raw.startswith(first) and inside in raw:
+            raise DataError(f"{path}: is {kind}, expected {KINDS}: convert it to PLY first")
     if raw.startswith((ZIP, PICKLE)):
         return _read_gsplat(path, raw)
     return checked(str(path), **activated(read_parameters(path, raw)))
@@ -294,8 +239,7 @@ def _splat_rows(path: Path, raw: bytes) -> dict[str, np.ndarray]:
     quats = (rows["quats"].astype(np.float32) - 128) / 128
     units = np.count_nonzero(np.abs(np.linalg.norm(quats, axis=1) - 1) < ROUNDED)
     if len(raw) % ROW.itemsize or 2 * units <= len(rows):
-        kinds = "a PLY, SPZ, .splat or .4dgs file or a checkpoint of gsplat"
-        raise DataError(f"{path}: begins with {raw[:8]!r} and is of no known kind, expected {kinds}")
+        raise DataError(f"{path}: begins with {raw[:8]!r} and is of no known kind, expected {KINDS}")
     with np.errstate(divide="ignore", invalid="ignore"):
         opacities, scales = rows["a"] / np.float32(255), np.log(rows["scales"])
         return {
@@ -468,19 +412,22 @@ def spz_bytes(splats: Splats) -> bytes:
 def fourdgs_bytes(frames: Sequence[tuple[float, Splats, np.ndarray]], seconds: float) -> bytes:
     """Returns a .4dgs file of `seconds`. Each Gaussian is shown in its frame and moves to its slot in the next frame.
 
-    frames: (start in seconds, Gaussians, their slots int64 [N]), ascending from 0.
+    frames: (start in seconds, Gaussians, their slots int64 [N]), ascending from 0. Harmonics of the highest degrees are
+    left out if their bytes are farther from them than 0. Raises DataError.
     """
     fourdgs = required("fourdgs", EXTRA, ".4dgs files")
+    degree = max(_fourdgs_degree(splats) for _, splats, _ in frames)
     starts = [start for start, _, _ in frames]
     ends = [*starts[1:], seconds]
     parts: dict[str, list[np.ndarray]] = {}
     for i, (start, splats, slots) in enumerate(frames):
-        n, middle = len(slots), (start + ends[i]) / 2
+        n, middle = len(slots), TICK * round((start + ends[i]) / 2 / TICK)
         speed = np.zeros((n, 3), np.float32)
         if i + 1 < len(frames):
             _, later, later_slots = frames[i + 1]
             _, here, there = np.intersect1d(slots, later_slots, assume_unique=True, return_indices=True)
             speed[here] = (later.means[there] - splats.means[here]) / np.float32(ends[i] - start)
+        rest = replace(splats, sh=splats.sh[:, : (degree + 1) ** 2]).rest
         for name, values in {
             "positions": splats.means + speed * np.float32(middle - start),
             "scales": splats.scales,
@@ -491,16 +438,23 @@ def fourdgs_bytes(frames: Sequence[tuple[float, Splats, np.ndarray]], seconds: f
             "sigma_t": np.full(n, np.inf, np.float32),
             "win_lo": np.full(n, start),
             "win_hi": np.full(n, ends[i]),
-            "sh": np.clip(np.rint((splats.rest + SH_SPAN) * (255 / (2 * SH_SPAN))), 0, 255).astype(np.uint8),
+            "sh": np.clip(np.rint((rest + SH_SPAN) * (255 / (2 * SH_SPAN))), 0, 255).astype(np.uint8),
         }.items():
             parts.setdefault(name, []).append(values)
     columns: dict[str, Any] = {name: np.concatenate(values) for name, values in parts.items()}
-    degree = frames[0][1].degree
     if degree == 0:
         columns["sh"] = None
-    stream = io.BytesIO()
+    stream, options = io.BytesIO(), fourdgs.WriteOptions(metadata=FOURDGS_METADATA)
     try:
-        fourdgs.write(stream, fourdgs.GaussianSet(**columns, sh_degree=degree), seconds)
+        fourdgs.write(stream, fourdgs.GaussianSet(**columns, sh_degree=degree), seconds, options=options)
     except (fourdgs.FourdgsError, ValueError) as error:
-        raise DataError(f"fourdgs cannot write this file: {error}") from None
+        wide, scale = (float(x) for x in (np.ptp(columns["positions"], axis=0).max(), np.median(columns["scales"])))
+        found = f"Gaussians {wide:.3g} units apart, with a median scale of {scale:.3g}"
+        raise DataError(f"fourdgs cannot write {found}: {one_line(str(error), 160)}") from None
     return stream.getvalue()
+
+
+def _fourdgs_degree(splats: Splats) -> int:
+    """Returns the highest degree with a coefficient that a byte stands for better than 0 does."""
+    large = (np.abs(splats.sh[:, 1:]) > SH_HALF_STEP).any(axis=(0, 2))
+    return int(np.sqrt(large.nonzero()[0].max(initial=-1) + 1))

@@ -1,9 +1,10 @@
 """Renders other programs' Gaussians over time into a dataset: the source `teacher:PATH[?key=value&...]`.
 
 PATH is a folder of PLY, SPZ or .splat files, one per frame, in the order of the last number in their names, or one such
-file; a `.4dgs` file; a static gsplat checkpoint; a run of 4DGaussians or Deformable-3DGS or one of its
-`point_cloud/iteration_N`; or `module:function`, called with t in 0..1. The function returns means, quats (wxyz),
-scales, opacities and either colors or sh, as a mapping or as attributes, numpy arrays or tensors.
+file; a `.4dgs` file; a PLY file of SpacetimeGaussians (lite); a static gsplat checkpoint; a run of 3D Gaussian
+splatting, 4DGaussians or Deformable-3DGS or one of its `point_cloud/iteration_N`; or `module:function`, called with t
+in 0..1. The function returns means, quats (wxyz), scales, opacities and either colors or sh, as a mapping or as
+attributes, numpy arrays or tensors.
 
 Keys: cameras=SOURCE uses the training cameras of a dataset and their times. Otherwise views=N cameras (200) of
 size=WxH pixels (400x400) surround the Gaussians; a `cameras.json` beside them gives at most N cameras instead. fps=F
@@ -28,22 +29,31 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.data.dataset import color, load
-from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, files_of, last_numbers, read_file, split_options
+from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, MAX_HEADER, files_of, last_numbers, read_file, split_options
 from pd4dgs_codec.data.view import Dataset, View, depth_range, held_out, normalised_times, points_box, seconds_range
 from pd4dgs_codec.errors import DataError, one_line, required
-from pd4dgs_codec.interchange.runs import read_cameras, read_deformed
+from pd4dgs_codec.interchange.runs import (
+    PLY,
+    SPACETIME,
+    Config,
+    iteration,
+    read_cameras,
+    read_deformed,
+    read_spacetime,
+    run_of,
+    visible,
+)
 from pd4dgs_codec.interchange.splats import (
     EXTRA,
-    SH_C0,
     SH_SPAN,
-    Splats,
     checked,
+    evenly,
     looking,
     picture,
     read_splats,
     sphere,
-    spread,
 )
+from pd4dgs_codec.kinds.splats import SH_C0, Splats
 from pd4dgs_codec.quality.frames import shrunk
 from pd4dgs_codec.scene import Camera
 
@@ -109,13 +119,13 @@ def load_source(
 
 
 def _around(source: str, place: Path, teacher: Teacher, options: Options, downscale: int, holdout: int) -> Dataset:
-    """Returns the teacher's pictures by `_cameras` as a dataset, every holdout-th picture held out."""
+    """Returns the teacher's pictures by `cameras_of` as a dataset, every holdout-th picture held out."""
     solid = _solid(source, teacher, MIDDLE)
-    cameras, up = _cameras(place, teacher.splats(teacher.nearest(MIDDLE)).means[solid], options, downscale)
+    cameras, up = cameras_of(place, teacher.splats(teacher.nearest(MIDDLE)).means[solid], options, downscale)
     still = teacher.times is not None and len(teacher.times) == 1
     poses = [(camera, 0.0 if still else i * GOLDEN % 1.0) for i, camera in enumerate(cameras)]
     times = teacher.times or tuple(np.linspace(0, 1, BOX_TIMES))
-    some = spread(times, BOX_TIMES)
+    some = evenly(times, BOX_TIMES)
     everywhere = np.concatenate([teacher.splats(t).means[_solid(source, teacher, t)] for t in some])
     box = points_box(everywhere).astype(np.float32)
     near, far = depth_range([c.viewmat.astype(np.float64) for c in cameras], box, everywhere)
@@ -172,18 +182,18 @@ def _value(key: str, text: str) -> Any:
     raise ValueError(text)
 
 
-def _cameras(place: Path, points: np.ndarray, options: Options, downscale: int) -> tuple[list[Camera], Triple]:
+def cameras_of(place: Path, points: np.ndarray, options: Options, downscale: int = 1) -> tuple[list[Camera], Triple]:
     """Returns (cameras of a cameras.json beside the Gaussians, else cameras around `points` [n, 3]; up direction)."""
     beside = next((p / "cameras.json" for p in (place, *place.parents[:2]) if (p / "cameras.json").is_file()), None)
     if beside is not None:
         cameras, up = read_cameras(beside)
-        some = spread(cameras, options.views)
+        some = evenly(cameras, options.views)
         return [shrunk(c, downscale * math.ceil(max(c.width, c.height) / max(options.size))) for c in some], up
     middle = np.median(points, axis=0).astype(np.float64)
     radius = max(float(np.percentile(np.linalg.norm(points - middle, axis=1), 90)), 1e-6)
     axis = np.asarray(options.up) / max(float(np.linalg.norm(options.up)), 1e-12)
     places = sphere(2 * options.views)
-    places = np.stack(spread(list(places[places @ axis >= LOWEST]), options.views))
+    places = np.stack(evenly(list(places[places @ axis >= LOWEST]), options.views))
     width, height = options.size
     focal = 0.5 * max(width, height) / math.tan(FIELD_OF_VIEW / 2)
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32)
@@ -199,13 +209,18 @@ class Teacher:
     """A model that gives Gaussians at a time.
 
     splats: normalised time -> Gaussians. times: the known times, None if it knows all. seconds: from the first time to
-    the last. background: of its training.
+    the last. background: of its training. windows: float32 [n, 3], the centre, half width and softness in normalised
+    time of the window that each Gaussian's opacity has (clause 13.7); bare: `splats` without them. None: no windows.
+    varies: whether other Gaussians are given at other times.
     """
 
     splats: Callable[[float], Splats]
     times: tuple[float, ...] | None
     seconds: float
     background: Triple = (0.0, 0.0, 0.0)
+    windows: np.ndarray | None = None
+    bare: Callable[[float], Splats] | None = None
+    varies: bool = False
 
     def nearest(self, t: float) -> float:
         """Returns the known time nearest to t."""
@@ -217,11 +232,13 @@ def read_model(place: str, fps: float) -> Teacher:
     path = Path(place)
     if path.is_dir():
         run = read_deformed(path)
-        return Teacher(run[0], None, 1.0, run[1]) if run else _folder(path, fps)
+        return Teacher(run[0], None, 1.0, run[1]) if run else _still_run(path) or _folder(path, fps)
     if path.is_file():
         raw = read_file(path)
         if raw.startswith(FOURDGS):
             return _fourdgs(path, raw)
+        if SPACETIME in raw[:MAX_HEADER]:
+            return _spacetime(path, raw)
         splats = read_splats(path, raw)
         return Teacher(lambda t: splats, (0.0,), 1.0)
     if match := re.fullmatch(r"([A-Za-z_][\w.]*):([A-Za-z_]\w*)", place):
@@ -231,12 +248,39 @@ def read_model(place: str, fps: float) -> Teacher:
     )
 
 
+def _still_run(folder: Path) -> Teacher | None:
+    """Reads the last iteration of a run of 3D Gaussian splatting, or of SpacetimeGaussians; None for other folders."""
+    place = iteration(folder)
+    if place is None or place == folder and len(files_of(folder, FRAME_SUFFIXES)) > 1:
+        return None
+    if (place / "opacity_mlp.pt").is_file() or (place / "checkpoints.pth").is_file():
+        raise DataError(f"{folder}: is a run of Scaffold-GS, which becomes a checkpoint: pd4dgs-import -o model.pt")
+    return replace(read_model(str(place / PLY), 1.0), background=Config.of(run_of(place)).background)
+
+
+def _spacetime(path: Path, raw: bytes) -> Teacher:
+    """Reads a PLY file of SpacetimeGaussians."""
+    bare, windows = read_spacetime(path, raw)
+
+    def splats(t: float) -> Splats:
+        found = bare(t)
+        return replace(found, opacities=found.opacities * visible(windows, t))
+
+    return Teacher(splats, None, 1.0, windows=windows, bare=bare)
+
+
 def _folder(folder: Path, fps: float) -> Teacher:
     """Reads a folder of one file per frame, in the order of the last number in the names."""
     paths = max((files_of(folder, [suffix]) for suffix in FRAME_SUFFIXES), key=len)
     if not paths:
         raise DataError(f"{folder}: holds no file that ends in {', '.join(FRAME_SUFFIXES)}, expected one per frame")
-    paths = [path for _, path in sorted(zip(last_numbers(paths) or range(len(paths)), paths, strict=True))]
+    numbers = last_numbers(paths) or list(range(len(paths)))
+    paths, numbers = [path for _, path in sorted(zip(numbers, paths, strict=True))], sorted(numbers)
+    gaps = np.diff(numbers)
+    if len(gaps) and (odd := np.flatnonzero(gaps != max(gaps.min(), 1))).size:
+        least, before = int(gaps.min()), numbers[int(odd[0])]
+        what = f"has no frame {before + least}" if least else f"has several frames {numbers[int(gaps.argmin())]}"
+        raise DataError(f"{folder}: {what}, expected one for each number from {numbers[0]} to {numbers[-1]}")
     times = tuple(i / max(len(paths) - 1, 1) for i in range(len(paths)))
 
     frame = lru_cache(maxsize=2)(read_splats)
@@ -273,7 +317,7 @@ def _fourdgs(path: Path, data: bytes) -> Teacher:
             sh=np.concatenate(sh, axis=1),
         )
 
-    return Teacher(splats, None, seconds)
+    return Teacher(splats, None, seconds, varies=True)
 
 
 def _numbers(data: bytes, most: int) -> int:

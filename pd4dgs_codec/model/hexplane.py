@@ -19,7 +19,8 @@ from torch.autograd.function import once_differentiable
 from pd4dgs_codec.draw import hexplane as kernels
 from pd4dgs_codec.draw.hexplane import SPATIAL, TEMPORAL, PlaneLayout
 from pd4dgs_codec.draw.simd import LANES
-from pd4dgs_codec.format.deformation import plane_rate_bits
+from pd4dgs_codec.format.planes import rate_bits
+from pd4dgs_codec.format.quantise import quantise
 from pd4dgs_codec.model import plane_terms
 from pd4dgs_codec.model.config import DeformationConfig
 from pd4dgs_codec.model.networks import round_straight_through, rounded
@@ -190,7 +191,7 @@ class HexPlane(nn.Module):
     def bits(self, step: float) -> float:
         """Returns the sum of R(a) over the planes' coded residuals at a quantisation step, with one Gaussian prior per
         channel of a plane, as with `--priors gauss`."""
-        return plane_rate_bits(self.arrays(), step)
+        return sum(rate_bits(quantise(plane, step, name)) for scale in self.arrays() for name, plane in scale.items())
 
     @torch.no_grad()
     def arrays(self) -> Planes:

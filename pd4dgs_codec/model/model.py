@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, cast
 
 import numpy as np
@@ -33,6 +33,7 @@ from pd4dgs_codec.scene import (
     SCAFFOLD_NETWORKS,
     Camera,
     Grading,
+    LayeredScene,
     Scene,
     SceneInfo,
     Steps,
@@ -83,6 +84,7 @@ class Model(nn.Module):
     ):
         super().__init__()
         self.info, self.steps = info, steps
+        self.backgrounds = dict[int, tuple[float, float, float]]()  #: of levels of incomplete files
         self.register_buffer("anchor_q", anchor_q)
         widths = Widths(feature.shape[1], offset.shape[1])
         no_class, no_centre = torch.zeros(len(anchor_q), dtype=torch.uint8), torch.zeros(widths.channels)
@@ -95,6 +97,10 @@ class Model(nn.Module):
         self.networks = nn.ModuleDict(networks)
         self.global_deformation = global_deformation
         self.local_deformation = local_deformation
+
+    def shown(self, level: int) -> SceneInfo:
+        """Returns `info` with the background of a level."""
+        return replace(self.info, background=self.backgrounds.get(level, self.info.background))
 
     @property
     def anchor(self) -> Tensor:
@@ -269,11 +275,14 @@ def to_scene(model: Model) -> Scene:
     )
 
 
-def from_scene(scene: Scene) -> Model:
+def from_scene(scene: LayeredScene) -> Model:
     """Returns the model that renders `scene`, with anchors in the scene's order.
 
-    A level whose layer is absent equals the level below it; masks are reproduced to within 1e-6.
+    A level whose layer is absent equals the level below it; masks are reproduced to within 1e-6. Raises DataError for a
+    scene without networks.
     """
+    if not isinstance(scene, Scene):
+        raise DataError("found a scene of splats, which has no networks; models and checkpoints hold scaffolds only")
     n = len(scene.anchor_q)
     masks = np.zeros((n, 3), np.float64)
     for level in range(3):
@@ -283,7 +292,7 @@ def from_scene(scene: Scene) -> Model:
     box = scene.info.box
     fields = (scene.global_deformation, scene.local_deformation)
     global_field, local_field = (None if f is None else DeformationField.from_arrays(f, box) for f in fields)
-    return Model(
+    model = Model(
         scene.info,
         scene.steps,
         torch.from_numpy(scene.anchor_q.astype(np.int32)),
@@ -296,6 +305,9 @@ def from_scene(scene: Scene) -> Model:
         local_field,
         *(() if scene.grading is None else map(torch.tensor, (scene.grading.classes, scene.grading.centre))),
     )
+    found = {level: scene.background(level) for level in range(3)}
+    model.backgrounds = {level: color for level, color in found.items() if color != scene.info.background}
+    return model
 
 
 def _numpy(tensor: torch.Tensor) -> np.ndarray:

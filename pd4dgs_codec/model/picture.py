@@ -51,11 +51,11 @@ def render(
     check_time(t)
     gaussians = model.gaussians(level, t, camera, rounding, only)
     if torch.is_grad_enabled():
-        return draw(model.info, gaussians, camera)
+        return draw(model.shown(level), gaussians, camera)
     # a colour that overflowed hides its Gaussian; training refuses the step instead
     opacities = torch.where(gaussians.colors.isfinite().all(1), gaussians.opacities, 0.0)
     shown = replace(gaussians, opacities=opacities, colors=gaussians.colors.nan_to_num())
-    return replace(draw(model.info, shown, camera), gaussians=gaussians)
+    return replace(draw(model.shown(level), shown, camera), gaussians=gaussians)
 
 
 def draw(info: SceneInfo, gaussians: Gaussians, camera: Camera) -> Picture:

@@ -66,75 +66,6 @@ def _probability(z: float, h: float, u: float, v: float, narrow_below: float) ->
     return math.log(mass) - 0.5 * u * u - _HALF_LN_2PI, 1.0 / mass
 
 
-@parallel(lambda log_p, *_: len(log_p))
-def _log_probabilities(
-    tasks: Tasks, log_p: Array, slopes: Array, a: Array, mu: Array, sigma: Array, q: Array, narrow_below: float
-) -> None:
-    """Fills log_p [n] with ln P, and slopes [3, n] with its derivatives by a, sigma and Q. All float64 [n]."""
-    for i in range(tasks[0], tasks[1]):
-        signed = a[i] - mu[i]
-        z, h = abs(signed) / sigma[i], 0.5 * q[i] / sigma[i]
-        u, v = (abs(signed) - 0.5 * q[i]) / sigma[i], (abs(signed) + 0.5 * q[i]) / sigma[i]
-        log_p[i], ratio = _probability(z, h, u, v, narrow_below)
-        m = math.expm1(-2 * z * h)
-        slopes[0, i] = np.sign(signed) * ratio * m / sigma[i]
-        slopes[1, i] = -ratio * (2 * h + v * m) / sigma[i]
-        slopes[2, i] = ratio * h * (2 + m) / q[i]
-
-
-class _LogProbability(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, *inputs: Tensor) -> Tensor:
-        wide = np.broadcast_arrays(*(x.numpy().astype(np.float64) for x in inputs))
-        a, mu, sigma, q = map(np.ravel, wide)
-        log_p, slopes = np.empty(len(a)), np.empty((3, len(a)))
-        _log_probabilities(log_p, slopes, a, mu, sigma, q, NARROW[inputs[0].dtype])
-        ctx.slopes = torch.from_numpy(slopes).view(3, *wide[0].shape)
-        ctx.shapes, ctx.dtype = [x.shape for x in inputs], inputs[0].dtype
-        return torch.from_numpy(log_p).view(wide[0].shape).to(ctx.dtype)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, ...]:
-        by_a, by_sigma, by_q = grad * ctx.slopes
-        grads = (by_a, -by_a, by_sigma, by_q)
-        return tuple(g.sum_to_size(shape).to(ctx.dtype) for g, shape in zip(grads, ctx.shapes, strict=True))
-
-
-def log_probability(a: Tensor, mu: Tensor, sigma: Tensor, q: Tensor | float) -> Tensor:
-    """Returns ln P of a +- Q/2 under N(mu, sigma), broadcast, on the CPU; gradients reach all arguments, finite in the
-    tails."""
-    q = torch.as_tensor(q, dtype=a.dtype)
-    log_p: Tensor = _LogProbability.apply(a, mu, sigma, q)  # type: ignore[no-untyped-call]
-    return log_p
-
-
-class _ClipValue(torch.autograd.Function):
-    """Clips bits forward but passes the gradient of the unclipped bits, so that it still reaches outliers."""
-
-    @staticmethod
-    def forward(ctx: Any, bits: Tensor) -> Tensor:
-        return bits.clamp(max=MAX_BITS)
-
-    @staticmethod
-    def backward(ctx: Any, grad: Tensor) -> Tensor:
-        return grad
-
-
-def rate_bits(a: Tensor, mu: Tensor, sigma: Tensor, q: Tensor | float) -> Tensor:
-    """Returns R(a) in bits, in the shape of the broadcast inputs on the CPU, probabilities clipped at 1e-6."""
-    q = torch.as_tensor(q, dtype=a.dtype)
-    sigma = torch.maximum(sigma, q * MIN_SIGMA_RATIO)
-    bits: Tensor = _ClipValue.apply(-log_probability(a, mu, sigma, q) / _LN2)  # type: ignore[no-untyped-call]
-    return bits
-
-
-def channel_moments(x: Tensor) -> tuple[Tensor, Tensor]:
-    """Returns mean and standard deviation per column of x [n, c], n >= 1, both differentiable."""
-    mu = x.mean(0)
-    return mu, ((x - mu).square().mean(0) + MIN_VARIANCE).sqrt()
-
-
 # -- rows of anchors, in numba -----------------------------------------------------------------------------------------
 
 # `classes` int8 [N] is the step class of each anchor, -1 if inactive. Values are [N, c] of one float type, computed in
@@ -163,7 +94,7 @@ def _class_sums(tasks: Tasks, parts: Array, values: Array, classes: Array, centr
 
 
 @parallel(lambda bits, *_: len(bits))
-def _scalar_bits(
+def scalar_bits(
     tasks: Tasks,
     bits: Array,
     by_value: Array,
@@ -222,7 +153,7 @@ class _RowBits(torch.autograd.Function):
             sigma = np.sqrt(_sums(x, of, mu, 2) / each + MIN_VARIANCE)
             by_value, by_sigma = (np.empty((len(picked), x.shape[1])) for _ in range(2))
             limits = MIN_SIGMA_RATIO, MAX_BITS, NARROW[values.dtype]
-            _scalar_bits(bits, by_value, by_sigma, x, picked, of, mu, sigma, step, *limits)
+            scalar_bits(bits, by_value, by_sigma, x, picked, of, mu, sigma, step, *limits)
             total += bits
             ctx.moments.append((mu, sigma, by_value, by_sigma))
         ctx.each = each

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.format.symbols import layer_symbols
+from pd4dgs_codec.format.plan import layer_symbols
 from pd4dgs_codec.model.model import Gaussians, Model, from_scene
 from pd4dgs_codec.model.networks import EXACT, Rounding
 from pd4dgs_codec.model.picture import draw, render_image
@@ -65,7 +65,7 @@ def _gated(model: Model, level: int, t: float, camera: Camera, rounding: Roundin
     gate = torch.ones(len(model.anchor_q), device=g.means.device, requires_grad=True)
     shown = gate[torch.div(g.slots, model.widths.slots, rounding_mode="floor")]
     gated = replace(g, scales=g.scales * shown[:, None], opacities=g.opacities * shown)
-    return draw(model.info, gated, camera).image, gate, _met(model, g)
+    return draw(model.shown(level), gated, camera).image, gate, _met(model, g)
 
 
 def _met(model: Model, gaussians: Gaussians) -> Tensor:
@@ -124,7 +124,7 @@ def attribute_slopes(
     values = [getattr(model, name) for name in ATTRIBUTES]
     with torch.enable_grad():
         g = model.gaussians(level, t, camera, rounding)
-        image = draw(model.info, g, camera).image
+        image = draw(model.shown(level), g, camera).image
         slopes = [torch.zeros_like(value) for value in values]
         if len(g.scales):
             slopes = list(torch.autograd.grad((image * _signs(image, generator, weights)).sum(), values))

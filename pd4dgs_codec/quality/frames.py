@@ -38,9 +38,11 @@ class Frame:
     truth: np.ndarray | None = None
 
 
-def dataset_frames(views: Sequence[View]) -> list[Frame]:
-    """Returns the cameras, times and images of a dataset's views."""
-    return [Frame(view.camera, view.time, view.image) for view in views]
+def dataset_frames(views: Sequence[View], most: int | None = None) -> list[Frame]:
+    """Returns the cameras, times and images of a dataset's views; with `most`, of at most so many, evenly spread."""
+    count = min(most or len(views), len(views))
+    chosen = (views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count))
+    return [Frame(view.camera, view.time, view.image) for view in chosen]
 
 
 def own_frames(info: SceneInfo, count: int, orbit: float = 0.0, downscale: int = 1) -> list[Frame]:

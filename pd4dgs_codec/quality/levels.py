@@ -12,13 +12,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from pd4dgs_codec.draw.player import Player
+from pd4dgs_codec.draw.player import Drawer, drawer
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.format.container import SIGNATURE
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.io import read_source
-from pd4dgs_codec.scene import MASK_THRESHOLD, Camera, Scene
+from pd4dgs_codec.kinds import AnyScene
+from pd4dgs_codec.scene import MASK_THRESHOLD, Camera
 
 if TYPE_CHECKING:
     from pd4dgs_codec.model.model import Model
@@ -30,14 +31,19 @@ class Level:
     decode_seconds: time to decode it, both None for a checkpoint."""
 
     level: int
-    model: Player | Model
+    model: Drawer | Model
     anchors: int
     cumulative_bytes: int | None = None
     decode_seconds: float | None = None
 
+    @property
+    def background(self) -> tuple[float, float, float]:
+        """RGB in 0..1 behind every Gaussian."""
+        return self.model.background if isinstance(self.model, Drawer) else self.model.shown(self.level).background
+
     def picture(self, camera: Camera, time: float) -> np.ndarray:
         """Renders float32 [H, W, 3] in 0..1 at normalised time 0..1."""
-        if isinstance(self.model, Player):
+        if isinstance(self.model, Drawer):
             return self.model.picture(camera, time)
         from pd4dgs_codec.model.picture import render_image
 
@@ -50,9 +56,9 @@ class Level:
         return image, 1e3 * (perf_counter() - start)
 
 
-def level_of(scene: Scene) -> Level:
+def level_of(scene: AnyScene) -> Level:
     """Returns the highest level of a decoded scene."""
-    return Level(scene.level, Player(scene), int((scene.mask[-1] > 0).sum()))
+    return Level(scene.level, drawer(scene), int((scene.mask[-1] > 0).sum()))
 
 
 def load_levels(
@@ -79,6 +85,8 @@ def load_levels(
     if background is not None:
         for level in levels:
             level.model.info = replace(level.model.info, background=background)
+            if isinstance(level.model, Drawer):
+                level.model.background = background
     return levels
 
 

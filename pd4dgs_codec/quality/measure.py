@@ -9,10 +9,10 @@ import numpy as np
 import torch
 
 from pd4dgs_codec.data.view import View
+from pd4dgs_codec.draw.player import drawer
 from pd4dgs_codec.format.options import EncodeOptions
-from pd4dgs_codec.format.plan import in_file_order, passed, tensor_bytes
-from pd4dgs_codec.format.registry import LAYER_KINDS
-from pd4dgs_codec.format.symbols import layer_symbols
+from pd4dgs_codec.format.plan import in_file_order, layer_symbols, passed, symbols_of, tensor_bytes
+from pd4dgs_codec.kinds import AnyScene
 from pd4dgs_codec.model.model import Model, from_scene
 from pd4dgs_codec.model.networks import EXACT, Rounding
 from pd4dgs_codec.model.picture import render_image
@@ -52,19 +52,26 @@ def level_psnr(
 ) -> float:
     """Returns the mean mPSNR of a level over `views`, dB, of each at most MOST_DB. step is called after each."""
 
-    def draw(view: View) -> np.ndarray:
-        return render_image(model, level, view.time, view.camera, rounding)
+    return _mean_psnr(lambda view: render_image(model, level, view.time, view.camera, rounding), views, step)
 
+
+def _mean_psnr(draw: Callable[[View], np.ndarray], views: Sequence[View], step: Callable[[], None]) -> float:
     capped = {"mpsnr": lambda *pictures: min(mpsnr(*pictures), MOST_DB)}
     return mean_scores(draw, views, capped, step)["mpsnr"]
 
 
 def true_psnr(
-    scene: Scene, levels: Iterable[int], views: Sequence[View], step: Callable[[], None] = lambda: None
+    scene: AnyScene, levels: Iterable[int], views: Sequence[View], step: Callable[[], None] = lambda: None
 ) -> dict[int, float]:
     """Returns `level_psnr` of a decoded scene at each of `levels`, which may lie above its highest layer."""
-    model = from_scene(scene)
-    return {level: level_psnr(model, level, views, step) for level in levels}
+    if isinstance(scene, Scene):
+        model = from_scene(scene)
+        return {level: level_psnr(model, level, views, step) for level in levels}
+    players = {level: drawer(scene.prefix(level)) for level in levels}
+    return {
+        level: _mean_psnr(lambda view: player.picture(view.camera, view.time), views, step)  # noqa: B023
+        for level, player in players.items()
+    }
 
 
 # -- errors of a quantised scene ---------------------------------------------------------------------------------------
@@ -85,7 +92,7 @@ class RenderedLoss:
         model = from_scene(self.scene)
         return {level: pictures(model, level, self.viewpoints, self.step) for level in self.scene.layers}
 
-    def mse(self, scene: Scene) -> dict[int, float]:
+    def mse(self, scene: AnyScene) -> dict[int, float]:
         """Returns per level the mean squared error over all pictures, colours in 0..1."""
         model, found = from_scene(scene), {}
         for level, references in self.references.items():
@@ -93,7 +100,7 @@ class RenderedLoss:
             found[level] = float(np.mean([np.square(a - b).mean() for a, b in pairs]))
         return found
 
-    def mean_mse(self, scene: Scene) -> float:
+    def mean_mse(self, scene: AnyScene) -> float:
         """Returns the mean of `mse` over the levels."""
         return float(np.mean(list(self.mse(scene).values())))
 
@@ -163,7 +170,7 @@ def _enough(
         shown = pictures(model, level, viewpoints)
         return float(sum(np.square(a - b).sum() for a, b in zip(shown, whole, strict=True)))
 
-    motion = tensor_bytes(scene.tensors(above), LAYER_KINDS[above], scene.steps, options)
+    motion = tensor_bytes(symbols_of(scene, above), options)
     size = np.cumsum(layer_symbols(scene, index).bits_per_row()[order - (scene.rows[index] - len(order))]) / 8
     parts = np.linspace(0.0, size[-1] if len(size) else 0.0, PARTS + 1)
     counts = np.searchsorted(size, parts, side="right")

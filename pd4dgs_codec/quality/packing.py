@@ -9,14 +9,16 @@ from dataclasses import asdict, dataclass, replace
 from itertools import accumulate
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.data.view import spread
+from pd4dgs_codec.data.view import spread, thinned
+from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.decoder import decode, every_prefix
 from pd4dgs_codec.format.encoder import Report, encode_with_report, with_metadata
 from pd4dgs_codec.format.metadata import Metadata
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.plan import LeftOut, plan
+from pd4dgs_codec.kinds import AnyScene
 from pd4dgs_codec.quality.frames import own_frames
-from pd4dgs_codec.scene import Scene, SceneInfo, Viewpoint
+from pd4dgs_codec.scene import LayeredScene, Scene, SceneInfo, Viewpoint
 
 if TYPE_CHECKING:
     import numpy as np
@@ -46,8 +48,7 @@ class Views:
     def of(cls, dataset: Dataset, source: str, most: int) -> Views:
         """Picks about `most` training and as many held-out views (training views if there are none), evenly spread."""
         fitting = [(view.camera, view.time) for view in spread(dataset.train, most)]
-        held_out = dataset.test or dataset.train
-        return cls(f"training views of {source}", fitting, held_out[:: -(-len(held_out) // most)])
+        return cls(f"training views of {source}", fitting, thinned(dataset.test or dataset.train, most))
 
     @classmethod
     def remembered(cls, viewpoints: Sequence[Viewpoint]) -> Views:
@@ -73,7 +74,7 @@ class Packed:
     """
 
     data: bytes
-    scene: Scene
+    scene: AnyScene
     report: Report
     target: dict[str, Any] | None
     slices: dict[str, Any] | None = None
@@ -88,7 +89,7 @@ class Packed:
 
 
 def pack(
-    source: Scene | Model,
+    source: AnyScene | Model,
     options: EncodeOptions = DEFAULTS,
     *,
     target_sizes: Mapping[int | None, int] | None = None,
@@ -105,19 +106,23 @@ def pack(
     sizes or keep_levels some pass to later layers, see `measure.in_order`. Without views or a camera the largest
     anchors come first.
 
-    Only target sizes and slices need torch. Raises EncodeError, RenderError for target sizes without a camera.
+    Only target sizes, and slices that views order, need torch. Raises EncodeError, also for target sizes of splats, and
+    RenderError for target sizes without a camera.
     """
-    if not isinstance(source, Scene):
+    if not isinstance(source, LayeredScene):
         from pd4dgs_codec.model.model import to_scene
 
         source = to_scene(source)
     scene, options = options.apply_scale(source)
-    if views is None and (target_sizes or (options.slices and scene.info.camera)):
+    networks = isinstance(scene, Scene)
+    if target_sizes and not networks:
+        raise EncodeError("target sizes of a scene of splats, whose steps pd4dgs-import chooses, expected a scaffold")
+    if views is None and networks and (target_sizes or (options.slices and scene.info.camera)):
         views = Views.own(scene.info)
     pictures = _Pictures(views, progress)
-    if target_sizes:
+    if target_sizes and isinstance(scene, Scene):
         return pictures.fit(scene, options, target_sizes, metadata)
-    data, report, slices = pictures.write(scene, options, [], metadata, passing=not keep_levels)
+    data, report, slices = pictures.write(scene, options, [], metadata, passing=networks and not keep_levels)
     return Packed(data, scene, report, None, slices)
 
 
@@ -140,8 +145,8 @@ class _Pictures:
         from pd4dgs_codec.quality.target import Fitter
 
         planned = plan(scene, options)
+        assert self.views and isinstance(planned.scene, Scene)
         scene, left_out = planned.scene, planned.left_out
-        assert self.views
         viewpoints = self.views.fitting
         with self.progress("fitting sizes") as step:
             loss = RenderedLoss(scene, viewpoints, step)
@@ -168,35 +173,48 @@ class _Pictures:
         return Packed(data, fitted, report, target, slices)
 
     def write(
-        self, scene: Scene, options: EncodeOptions, left_out: list[LeftOut], metadata: Metadata | None, *, passing: bool
+        self,
+        scene: AnyScene,
+        options: EncodeOptions,
+        left_out: list[LeftOut],
+        metadata: Metadata | None,
+        *,
+        passing: bool,
     ) -> tuple[bytes, Report, dict[str, Any] | None]:
         """Returns (file, report, slices of the report if it has slices). passing: whether anchors may then pass to
         later layers."""
         if not options.slices:
             return *encode_with_report(scene, options, left_out=left_out, metadata=metadata), None
-        from pd4dgs_codec.model.model import from_scene
-        from pd4dgs_codec.quality.measure import in_order, level_psnr, own_views, true_psnr
+        order_of = "gate" if isinstance(scene, Scene) else "opacity"
+        about: dict[str, Any] = {"order": f"{order_of} times area", "cameras": None, "pictures": 0}
+        about["size"] = options.slices
+        if self.views is None:
+            return *encode_with_report(scene, options, left_out=left_out, metadata=metadata), about
+        from pd4dgs_codec.quality.measure import in_order, own_views, true_psnr
 
-        about: dict[str, Any] = {"order": "gate times area", "cameras": None, "pictures": 0, "size": options.slices}
-        order: Callable[[Scene], np.ndarray] | None = None
-        if views := self.views:
+        views = self.views
+        order: Callable[[AnyScene], np.ndarray] | None = None
+        if isinstance(scene, Scene):
             planned = plan(scene, options)
+            assert isinstance(planned.scene, Scene)
             about |= {"order": "rendered gain per byte", "cameras": views.source, "pictures": len(views.fitting)}
             left_out = [*left_out, *planned.left_out]
             with self.progress("ordering anchors") as step:
                 scene, values = in_order(planned.scene, views.fitting, options, step, passing=passing)
 
-            def order(_: Scene) -> np.ndarray:
+            def order(_: AnyScene) -> np.ndarray:
                 return values
 
         data, report = encode_with_report(scene, options, left_out=left_out, utility=order)
         if self.held_out:
             with self.progress("measuring slices") as step:
                 about["psnr"] = [
-                    level_psnr(from_scene(prefix), prefix.level, self.held_out, step) for prefix in every_prefix(data)
+                    true_psnr(prefix, [prefix.level], self.held_out, step)[prefix.level]
+                    for prefix in every_prefix(data)
                 ]
             metadata = replace(metadata or Metadata(), slices=tuple(about["psnr"]))
-        if views and passing:
+        if passing:
+            assert isinstance(planned.scene, Scene)
             with self.progress("measuring levels") as step:
                 judges = views.held_out or own_views(planned.scene, views.checking or views.fitting)
                 whole = true_psnr(planned.symbols.scene(), scene.layers, judges, step)

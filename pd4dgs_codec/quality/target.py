@@ -20,14 +20,14 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.errors import EncodeError
-from pd4dgs_codec.format.check import rounding_bounds
 from pd4dgs_codec.format.container import write_chunk
 from pd4dgs_codec.format.encoder import encode_with_report, header_size
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
-from pd4dgs_codec.format.payload import write_layer
+from pd4dgs_codec.format.payload import write_slice
 from pd4dgs_codec.format.plan import LeftOut, Plan, in_file_order, passed, plan
-from pd4dgs_codec.format.registry import LAYER_KINDS, MAX_PAYLOAD
+from pd4dgs_codec.format.registry import MAX_PAYLOAD
 from pd4dgs_codec.format.symbols import LayerSymbols, sliced
+from pd4dgs_codec.kinds import AnyScene, step_names
 from pd4dgs_codec.scene import Scene
 
 #: Values tried: log2 of the factor on a step, and the share of a layer's anchors that leave it.
@@ -202,7 +202,7 @@ class Fitter:
 
     scene: Scene
     targets: Mapping[int | None, int]
-    loss: Callable[[Scene], float]
+    loss: Callable[[AnyScene], float]
     omission_error: Callable[[Scene, int], np.ndarray]
     options: EncodeOptions = DEFAULTS
     growth: defaultdict[int | None, float] = field(default_factory=lambda: defaultdict(lambda: 1.0))
@@ -267,7 +267,7 @@ class _Layer:
         steps = list(scene.attributes) if 0 in self.layers else []
         for number in self.layers:
             if number == 0 or scene.deformation(number) is not None:
-                steps += LAYER_KINDS[number].step_names
+                steps += step_names(number)
         masks = scene.full_masks()
         active = masks[self.indices[-1]] > 0
         if self.indices[0]:
@@ -278,8 +278,7 @@ class _Layer:
         self.header = 0
         if 0 in self.layers:
             symbols = self._planned({}).symbols
-            number, bounds = len(symbols.layers), rounding_bounds(symbols)
-            self.header = header_size(symbols, bounds, self.options.mode, number, MAX_PAYLOAD)
+            self.header = header_size(symbols, self.options.mode, len(symbols.layers), MAX_PAYLOAD)
         self._sizes: dict[tuple[int, frozenset[tuple[str, float]]], int] = {}
         self._losses: dict[frozenset[tuple[str, float]], float] = {}
 
@@ -297,7 +296,7 @@ class _Layer:
         for symbols in self._symbols({**self.smallest, ANCHORS: 0.0}):
             bits = symbols.bits_per_row()
             kept = np.argsort(bits, kind="stable")[: len(bits) - round(SHARES[-1] * len(bits))]
-            total += len(write_chunk(0, 0, bytes(8), write_layer(sliced(symbols, kept, True), self.options)[0]))
+            total += len(write_chunk(0, 0, bytes(8), write_slice(sliced(symbols, kept, True), self.options)[0]))
         return math.floor(BOUND * total)
 
     def apply(self, setting: Setting) -> Scene:
@@ -323,11 +322,11 @@ class _Layer:
             added = report.added_bytes()
             return sum(added.get(layer, 0) for layer in self.layers)
         options, symbols = replace(self.options, effort=effort), self._symbols(setting)
-        chunks = [len(write_chunk(0, 0, bytes(8), write_layer(layer, options)[0])) for layer in symbols]
+        chunks = [len(write_chunk(0, 0, bytes(8), write_slice(layer, options)[0])) for layer in symbols]
         return self.header + sum(chunks) if chunks else 0
 
     def _symbols(self, setting: Setting) -> list[LayerSymbols]:
-        return [symbols for symbols in self._planned(setting).symbols.layers if symbols.kind.layer in self.layers]
+        return [symbols for symbols in self._planned(setting).symbols.layers if symbols.layer in self.layers]
 
     def final_size(self, setting: Setting) -> int:
         """`size` at the effort of the file."""

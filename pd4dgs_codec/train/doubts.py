@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch.nn.functional import avg_pool2d
 
-from pd4dgs_codec.data.view import View
+from pd4dgs_codec.data.view import View, thinned
 from pd4dgs_codec.quality.image import mean_image_baseline
 from pd4dgs_codec.train.phases.levels import images, other_views
 from pd4dgs_codec.train.rollout import near_key
@@ -24,8 +24,7 @@ PART, LACKS, MORE = 1 / 12, 0.02, 4.0
 def doubts(state: TrainState, views: Sequence[View], psnr: Sequence[float]) -> list[str]:
     """Returns a line for each doubt. views: those that the model was measured on. psnr: its dB by level there."""
     found = []
-    train = state.dataset.train
-    mean = mean_image_baseline(train[:: -(-len(train) // MEAN_OF)], views)
+    mean = mean_image_baseline(thinned(state.dataset.train, MEAN_OF), views)
     if mean is not None and max(psnr) < mean:
         what = "held-out" if state.dataset.test else "training"
         seen = f"{max(psnr):.2f} dB on {what} views, and the mean of the training pictures has {mean:.2f} dB"

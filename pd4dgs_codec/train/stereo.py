@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, unfold
 
-from pd4dgs_codec.data.view import Dataset, View, points_box, shrunk_view, spans_volume
+from pd4dgs_codec.data.view import Dataset, View, points_box, shrunk_view, spans_volume, thinned
 from pd4dgs_codec.train import workers
 
 #: Views that are searched. They are those of one instant if it has at least CAMERAS, else evenly spread over all.
@@ -48,12 +48,11 @@ def with_points(dataset: Dataset, key: float | None) -> Dataset:
     return replace(dataset, points=points, box=box, near=float(near / 2), far=float(far * 1.5))
 
 
-def _chosen(views: Sequence[View], key: float) -> list[View]:
+def _chosen(views: Sequence[View], key: float) -> Sequence[View]:
     """The views to search."""
     nearest = min(views, key=lambda view: abs(view.time - key)).time
     together = [view for view in views if view.time == nearest]
-    chosen = together if len(together) >= CAMERAS else views
-    return list(chosen[:: -(-len(chosen) // VIEWS)])
+    return thinned(together if len(together) >= CAMERAS else views, VIEWS)
 
 
 def pixel_rays(rotation: Tensor, K: Tensor, rows: Tensor, columns: Tensor) -> Tensor:

@@ -34,7 +34,7 @@ from pd4dgs_codec.format.container import PREAMBLE_SIZE, read_preamble
 from pd4dgs_codec.format.decoder import open_stream
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.format.registry import MAX_HEADER
-from pd4dgs_codec.scene import Scene
+from pd4dgs_codec.kinds import AnyScene
 from pd4dgs_codec.web import is_url
 from pd4dgs_codec.web.headers import content_range, strong_etag
 
@@ -122,7 +122,7 @@ class Transfer:
         attempts: in place of those of the transfer. Raises Changed, or DeliveryError if the file is not available.
         """
         failures, attempts = 0, attempts or self.attempts
-        while not self._is_here(end):
+        while not any(most is not None and len(self.data) >= most for most in (end, self.total)):
             try:
                 if self._response is None:
                     self._request(reach)
@@ -158,10 +158,6 @@ class Transfer:
             self._connection.close()
         self._connection = self._response = None
         self._place = self._home
-
-    def _is_here(self, end: int | None) -> bool:
-        size = len(self.data)
-        return (end is not None and size >= end) or (self.total is not None and size >= self.total)
 
     def _receive(self, end: int | None) -> bytes:
         """Reads a block of the response; returns b"" at its regular end and for bytes that are skipped."""
@@ -284,15 +280,12 @@ def _connect(connection: http.client.HTTPConnection, seconds: float) -> None:
             result.set_exception(OSError(f"{connection.host} is not a host name"))
         except BaseException as error:
             result.set_exception(error)
-        if abandoned.is_set():
-            connection.close()
 
-    abandoned = threading.Event()
     threading.Thread(target=run, daemon=True).start()
     try:
         result.result(timeout=seconds)
     except futures.TimeoutError:
-        abandoned.set()
+        result.add_done_callback(lambda _: connection.close())
         raise TimeoutError from None
 
 
@@ -323,12 +316,19 @@ def _reason(error: BaseException) -> str:
 # -- prefixes of a .pd4 file -------------------------------------------------------------------------------------------
 
 
+def described(data: bytes | bytearray) -> dict[str, Any] | None:
+    """The `info` of a file by its header alone; None if `data`, its first bytes, ends within it."""
+    try:
+        return info(bytes(data[: read_preamble(data).size]))
+    except Truncated:
+        return None
+
+
 def slice_ends(data: bytes | bytearray) -> list[tuple[int, int]]:
     """Reads (layer, end offset) of each slice in file order from a file's first bytes; empty if they end within the
     header."""
-    size = _header_size(data)
-    layers = [] if size is None else info(bytes(data[:size]))["layers"]
-    return [(row["layer"], part["end"]) for row in layers for part in row["slices"]]
+    about = described(data)
+    return [(row["layer"], part["end"]) for row in about["layers"] for part in row["slices"]] if about else []
 
 
 def prefix_end(slices: list[tuple[int, int]], max_layer: int | None = None, max_bytes: int | None = None) -> int:
@@ -360,26 +360,17 @@ def fetch(transfer: Transfer, max_layer: int | None = None, max_bytes: int | Non
 
     while True:
         with contextlib.suppress(Changed):
-            size = _header_size(fill(HEADER_GUESS)) or _header_size(fill(LONGEST_HEADER))
-            if size is None:
+            about = described(fill(HEADER_GUESS)) or described(fill(LONGEST_HEADER))
+            if about is None:
                 return bytes(transfer.data)
-            header = bytes(transfer.data[:size])
-            end = info(header)["bytes"] if whole else prefix_end(slice_ends(header), max_layer, max_bytes)
+            end = about["bytes"] if whole else prefix_end(slice_ends(transfer.data), max_layer, max_bytes)
             if max_bytes is None:
                 check_end(end)
-            data = fill(max(end, size))
+            data = fill(max(end, about["header_bytes"]))
             if whole and len(data) == end:
                 with contextlib.suppress(DeliveryError, Changed):  # a length that is not that of the file
                     data += transfer.read(min(end + 1, MOST_BYTES), attempts=1)
             return data
-
-
-def _header_size(data: bytes | bytearray) -> int | None:
-    """Bytes of preamble and header; None if `data`, the first bytes of a file, ends within them."""
-    try:
-        return read_preamble(data).size
-    except Truncated:
-        return None
 
 
 # -- scenes as slices arrive -------------------------------------------------------------------------------------------
@@ -410,7 +401,7 @@ class SceneClient:
         """Closes the connection; `scenes` may be called again and opens another."""
         self.transfer.close()
 
-    def scenes(self, max_layer: int | None = None, max_bytes: int | None = None) -> Iterator[Scene]:
+    def scenes(self, max_layer: int | None = None, max_bytes: int | None = None) -> Iterator[AnyScene]:
         """Yields the newest scene, with all slices so far, as slices arrive. Only slices of layers up to max_layer that
         end within the first max_bytes of the file (None: MOST_BYTES) are fetched.
 
@@ -444,7 +435,7 @@ class SceneClient:
         self._stream, self._fed = open_stream(), 0
         self._slices: list[tuple[int, int]] = []
 
-    def _ready(self, max_layer: int | None, max_bytes: int) -> list[Scene]:
+    def _ready(self, max_layer: int | None, max_bytes: int) -> list[AnyScene]:
         """Feeds new bytes to the decoder. After a fault the transfer goes back to the end of the last valid slice."""
         data, end = self.transfer.data, len(self.transfer.data)
         try:

@@ -16,11 +16,11 @@ from urllib.parse import quote
 from pd4dgs_codec.errors import DeliveryError, printable
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.info import info
-from pd4dgs_codec.scene import Scene
+from pd4dgs_codec.kinds import AnyScene
 from pd4dgs_codec.web import PAGE
 from pd4dgs_codec.web.headers import cache_control
 from pd4dgs_codec.web.manifests import MAX_SECONDS, Video, dash, fragment, hls, hls_video, initialisation, ticks
-from pd4dgs_codec.web.page import Still, page
+from pd4dgs_codec.web.page import CHARSET, Still, page, with_policy
 
 SCENE, SEGMENTS, MPD, PLAYLIST, INDEX = "scene.pd4", "scene.mp4", "scene.mpd", "scene.m3u8", "index.json"
 VIDEO, VIDEO_PLAYLIST, POSTER = "fallback.mp4", "fallback.m3u8", "poster.jpg"
@@ -36,8 +36,8 @@ def presentation_seconds(low: float, high: float) -> float:
 
 def package(
     data: bytes,
-    render: Callable[[Scene], Video | None] = lambda scene: None,
-    draw: Callable[[Scene], Still | None] = lambda scene: None,
+    render: Callable[[AnyScene], Video | None] = lambda scene: None,
+    draw: Callable[[AnyScene], Still | None] = lambda scene: None,
     *,
     immutable: bool = False,
 ) -> dict[str, bytes]:
@@ -188,9 +188,9 @@ def _library_page(scenes: list[dict[str, Any]]) -> str:
         about = html.escape(f"{scene['bytes'] / 1e6:.2f} MB; first picture after {first}")
         link = f'<a href="{html.escape(scene["page"])}">{poster or "<div class=none></div>"}'
         cards.append(f"{link}<br>{html.escape(scene['name'])}<br><small>{about}</small></a>")
-    title, head = f"{len(scenes)} scenes", '<!doctype html><html lang="en"><meta charset="utf-8">'
+    title, head = f"{len(scenes)} scenes", f'<!doctype html><html lang="en">{CHARSET}'
     head += f"<title>{title}</title><style>{STYLE}</style>\n<h1>{title}</h1>"
-    return f"{head}\n<main>\n" + "\n".join(cards) + "\n</main>\n"
+    return with_policy(f"{head}\n<main>\n" + "\n".join(cards) + "\n</main>\n", img="'self'")
 
 
 # -- scenes to choose from ---------------------------------------------------------------------------------------------
@@ -219,7 +219,8 @@ def choice_page(sizes: dict[str, int]) -> bytes:
         f"{html.escape(printable(name, ''))}<br><small>{size / 1e3:,.0f} kB</small></a>"
         for i, (name, size) in enumerate(sizes.items())
     ]
-    head = f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{len(sizes)} scenes</title>'
+    head = f'<!doctype html><html lang="en">{CHARSET}<title>{len(sizes)} scenes</title>'
     head += f'<meta name="viewport" content="width=device-width"><style>{_CHOICE_STYLE}</style>\n<nav>\n'
     frame = f'<iframe name="scene" title="The scene" allow="fullscreen" src="{player_of(next(iter(sizes)))}"></iframe>'
-    return (head + "\n".join(links) + f"\n</nav>\n{frame}\n<script>{_CHOICE_SCRIPT}</script>\n").encode()
+    text = head + "\n".join(links) + f"\n</nav>\n{frame}\n<script>{_CHOICE_SCRIPT}</script>\n"
+    return with_policy(text, frame="'self'").encode()

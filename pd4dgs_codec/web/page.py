@@ -8,6 +8,7 @@ paint needs: a small picture of the scene, then the loader that requests the sce
 
 import base64
 import gzip
+import hashlib
 import html
 import os
 import re
@@ -18,7 +19,8 @@ from pathlib import Path
 from pd4dgs_codec.errors import DataError, DeliveryError
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.info import info
-from pd4dgs_codec.scene import Scene
+from pd4dgs_codec.kinds import AnyScene
+from pd4dgs_codec.scene import LayeredScene
 from pd4dgs_codec.web import PAGE, is_url
 
 #: The page's script, and the one that requests the scene while the rest of the page arrives.
@@ -26,6 +28,7 @@ SCRIPT, EARLY = "page.js", "early.js"
 WORKERS = ("loader-worker.js", "sort-worker.js", "evaluate-worker.js")
 #: Which module a script of all entry points starts: a worker's address names it, except that of EARLY's worker.
 ENTRY = f'self.document?"{SCRIPT}":"render/"+(location.hash.slice(1)||"{WORKERS[0]}")'
+CHARSET = '<meta charset="utf-8">'  #: the first element of our pages
 #: Encoder effort for a scene that is shown immediately.
 EFFORT = 1
 
@@ -127,9 +130,9 @@ document.head.append(Object.assign(document.createElement("script"),{src:packed}
 def page(source: bytes | str | None = None, about: bytes | None = None, still: Still | None = None) -> str:
     """Returns the player as one HTML file.
 
-    source: the bytes of a `.pd4` to embed, or its URL; None: `scene.pd4` beside the page, or the page's
-    `?src=address`. about: bytes of a `.pd4` whose metadata name the page; default: those that are embedded. still:
-    shown before any script has arrived.
+    source: the bytes of a `.pd4` to embed, or its URL, whatever `?src=` says; None: `scene.pd4` beside the page, or the
+    page's `?src=address`. about: bytes of a `.pd4` whose metadata name the page; default: those that are embedded.
+    still: shown before any script has arrived.
     """
     root = player_folder()
     code = bundle(root, SCRIPT, *(f"render/{name}" for name in WORKERS), start=ENTRY)
@@ -148,7 +151,23 @@ def page(source: bytes | str | None = None, about: bytes | None = None, still: S
     zipped = gzip.compress(code.encode(), 9, mtime=0)
     parts = [_held('id="scene"', source)] if isinstance(source, bytes) else []
     parts += [_held('class="code"', zipped[:AHEAD]), early, _held('class="code"', zipped[AHEAD:]), UNPACK]
-    return f"{head}{''.join(parts)}</html>\n"
+    asked = "'none'" if isinstance(source, bytes) else "'self'" if source and not is_url(source) else "http: https:"
+    more = {"script": "blob: 'wasm-unsafe-eval'", "worker": "blob:", "img": "'self' data: blob:", "connect": asked}
+    return with_policy(f"{head}{''.join(parts)}</html>\n", **more)
+
+
+def with_policy(text: str, **sources: str) -> str:
+    """Returns a page with a Content-Security-Policy that allows its own inline scripts and styles by their digests, and
+    nothing else but `sources`: by kind, such as img, what the directive allows."""
+    inline: dict[str, list[str]] = {}
+    for kind, content in re.findall(r"<(script|style)>(.*?)</\1>", text, re.DOTALL):
+        digest = base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()
+        inline.setdefault(kind, []).append(f"'sha256-{digest}'")
+    allowed = {kind: " ".join([*inline.get(kind, ()), sources.get(kind, "")]).strip() for kind in {**inline, **sources}}
+    rules = ["default-src 'none'", "base-uri 'none'", "form-action 'none'"]
+    rules += [f"{kind}-src {what}" for kind, what in allowed.items()]
+    policy = f'<meta http-equiv="Content-Security-Policy" content="{"; ".join(rules)}">'
+    return text.replace(CHARSET, CHARSET + policy, 1)
 
 
 def _held(name: str, data: bytes) -> str:
@@ -181,7 +200,7 @@ class Shown:
         return f"<a page of {len(self.page):,} characters; a notebook shows it>"
 
 
-def show(scene: Scene | bytes | str | os.PathLike[str], *, width: str = "100%", height: int = 480) -> Shown:
+def show(scene: AnyScene | bytes | str | os.PathLike[str], *, width: str = "100%", height: int = 480) -> Shown:
     """Shows a scene in a notebook, as the last line of a cell or by `display(show(scene))`.
 
     scene: a decoded scene, the bytes of a `.pd4`, its path or its URL. The page embeds the scene, except for a URL,
@@ -190,7 +209,7 @@ def show(scene: Scene | bytes | str | os.PathLike[str], *, width: str = "100%", 
     """
     if isinstance(scene, str) and is_url(scene):
         return Shown(page(scene), width, height)
-    if isinstance(scene, Scene):
+    if isinstance(scene, LayeredScene):
         from pd4dgs_codec.format.encoder import encode
 
         data = encode(scene, effort=EFFORT)

@@ -28,14 +28,11 @@ export class AnsDecoder {
     this._q = (both ? second : first) & LOW;
   }
 
-  /**
-   * Writes the next `count` symbols under a table to out[start ..].
-   *
-   * @param {import("./tables.js").Table} table @param {Int32Array} out @param {number} start @param {number} count
-   */
-  symbols({ cum, index }, out, start, count) {
-    if (cum.length === 2) {
-      out.fill(0, start, start + count); // a table of one symbol does not change the state
+  /** Writes the next symbols under a prior to out[start .. end - 1]. @param {import("./tables.js").Prior} prior
+   * @param {Int32Array} out @param {number} start @param {number} end */
+  symbols({ kmin, n, cum, index }, out, start, end) {
+    if (n === 1) {
+      out.fill(kmin, start, end); // a table of one symbol does not change the state
       return;
     }
     const words = this._words;
@@ -44,7 +41,7 @@ export class AnsDecoder {
     let th = this._th;
     let tl = this._tl;
     let q = this._q;
-    for (let i = start; i < start + count; i++) {
+    for (let i = start; i < end; i++) {
       const bucket = q >>> INDEX_SHIFT;
       let s = index[bucket];
       let last = index[bucket + 1];
@@ -54,7 +51,7 @@ export class AnsDecoder {
         else last = middle - 1;
       }
       while (cum[s + 1] <= q) s++;
-      out[i] = s;
+      out[i] = kmin + s;
       const f = cum[s + 1] - cum[s];
       const r = q - cum[s];
       q = (Math.imul(tl, f) + r) & LOW;

@@ -5,7 +5,7 @@ import { limitExceeded, malformed } from "./errors.js";
 /** The largest varint: five bytes of seven bits. */
 export const MAX_VARINT = 2 ** 35 - 1;
 
-/** Reads a section front to back. Bytes that end early are Malformed: the chunk around them is whole (clause 15). */
+/** Reads codes front to back. Where they end early they are Malformed: the chunk around them is whole (clause 15). */
 export class ByteReader {
   /** @param {Uint8Array} bytes */
   constructor(bytes) {
@@ -21,7 +21,7 @@ export class ByteReader {
 
   /** A u8. @param {string} what names it in messages */
   byte(what) {
-    if (this.offset >= this.bytes.length) throw malformed(`the section ends before ${what}`);
+    if (this.offset >= this.bytes.length) throw malformed(`the codes end before ${what}`);
     return this.bytes[this.offset++];
   }
 
@@ -52,16 +52,5 @@ export class ByteReader {
     const value = code % 2 ? -(code + 1) / 2 : code / 2;
     if (value > limit || -value > limit) throw limitExceeded(`${what}: ${value}, limit ${limit} in magnitude`);
     return value;
-  }
-
-  /** The next `size` bytes. @param {number} size @param {string} what names their end in messages */
-  take(size, what) {
-    if (size > this.remaining) throw malformed(`the section ends before ${what}`);
-    return this.bytes.subarray(this.offset, (this.offset += size));
-  }
-
-  /** All bytes that are left. */
-  rest() {
-    return this.take(this.remaining, "its end");
   }
 }

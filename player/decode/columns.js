@@ -20,23 +20,28 @@ export class Column {
     return /** @type {A} */ (this._room.subarray(0, this.rows * this._width));
   }
 
-  /** @param {ArrayLike<number>} values of whole rows @param {number} growth about how many times as many there will be */
-  append(values, growth) {
-    const start = this.rows * this._width;
-    const end = start + values.length;
-    this.rows = end / this._width;
-    if (end > this._room.length) {
-      const old = this._room.subarray(0, start);
-      this._room = this._allocated(growth);
-      this._room.set(old);
-    }
-    this._room.set(values, start);
+  /** Makes room for so many more rows. @param {number} count @param {number} growth about how many times as many as with
+   * these there will be */
+  reserve(count, growth) {
+    const rows = this.rows + count;
+    if (rows * this._width <= this._room.length) return;
+    const { values } = this;
+    this._room = this._allocated(rows, growth);
+    this._room.set(values);
+  }
+
+  /** @param {ArrayLike<number>} values of whole rows @param {number} [growth] as in reserve */
+  append(values, growth = 1) {
+    const count = values.length / this._width;
+    this.reserve(count, growth);
+    this._room.set(values, this.rows * this._width);
+    this.rows += count;
   }
 
   /** Sorts the rows from `first` on, in a copy. @param {number} first @param {Uint32Array} order @param {number} growth */
   reorder(first, order, growth) {
     const { _width: width, values } = this;
-    this._room = this._allocated(growth);
+    this._room = this._allocated(this.rows, growth);
     this._room.set(values.subarray(0, first * width));
     let at = first * width;
     for (const row of order) {
@@ -45,8 +50,8 @@ export class Column {
     }
   }
 
-  /** @param {number} growth */
-  _allocated(growth) {
-    return new this._type(Math.floor(this.rows * Math.min(growth, MOST_GROWTH)) * this._width);
+  /** @param {number} rows @param {number} growth */
+  _allocated(rows, growth) {
+    return new this._type(Math.floor(rows * Math.min(growth, MOST_GROWTH)) * this._width);
   }
 }

@@ -5,7 +5,7 @@ import { crc32, hex, sha256 } from "./digests.js";
 import { MAX_HEADER, MAX_PAYLOAD } from "./limits.js";
 
 const SIGNATURE = [0x89, 0x50, 0x44, 0x34, 0x0d, 0x0a, 0x1a, 0x0a];
-const MAJOR = 3;
+const MAJOR = 4;
 export const PREAMBLE_SIZE = 20;
 /** Bytes of preamble and the longest header. */
 export const LONGEST_HEADER = PREAMBLE_SIZE + MAX_HEADER;
@@ -44,7 +44,8 @@ export function readPreamble(bytes) {
   const view = viewOf(bytes);
   const major = view.getUint16(8, true);
   if (major !== MAJOR) {
-    const message = `format version ${major}.${view.getUint16(10, true)}, this decoder reads ${MAJOR}.x`;
+    const older = major < MAJOR ? ": drafts before it are no longer read, the scene has to be encoded again" : "";
+    const message = `format version ${major}.${view.getUint16(10, true)}, this decoder reads ${MAJOR}.x${older}`;
     throw new DecodeError("UnsupportedVersion", message, { offset: 8 });
   }
   const length = headerLength(bytes);

@@ -3,7 +3,7 @@
 import { LONGEST_HEADER, PREAMBLE_SIZE, headerLength } from "./container.js";
 import { DecodeError } from "./errors.js";
 import { Stream } from "./stream.js";
-/** @import { Scene } from "./scene.js" */
+/** @import { Scene } from "../kinds/index.js" */
 
 /** The file is not available, as opposed to one that cannot be decoded. */
 export class FetchError extends Error {

@@ -1,6 +1,7 @@
 // Typed, bounded access to what msgpack held. Every getter checks type and range (clauses 4 and 15).
 
 import { limitExceeded, malformed, unsupported } from "./errors.js";
+import { MAX_ID } from "./limits.js";
 import { Real } from "./msgpack.js";
 /** @import { Value } from "./msgpack.js" */
 
@@ -45,6 +46,24 @@ export function asList(value, where, length) {
   return value;
 }
 
+/** A list of least..limit items. @param {Value | undefined} value @param {number} least @param {number} limit
+ * @param {string} where */
+export function asItems(value, least, limit, where) {
+  const list = asList(value, where);
+  asInteger(list.length, least, limit, `${where}: length`);
+  return list;
+}
+
+/** @param {Value[]} list @param {number} least @param {number} limit @param {string} where */
+export const asIntegers = (list, least, limit, where) => list.map((item) => asInteger(item, least, limit, where));
+
+/** The next id of a list in which they ascend. @param {Value} value @param {number} last @param {string} where */
+export function asId(value, last, where) {
+  const id = asInteger(value, 0, MAX_ID, `${where}: id`);
+  if (id <= last) throw malformed(`${where}: id ${id} after ${last}, expected ascending ones`);
+  return id;
+}
+
 /** @param {Value | undefined} value @param {string} where @returns {number} an exact binary32 value */
 function asReal(value, where) {
   if (!(value instanceof Real)) throw malformed(`${where}: ${nameOf(value)}, expected a real`);
@@ -57,8 +76,9 @@ export function checkBytes(value, size, where) {
   if (value.length !== size) throw malformed(`${where}: ${value.length} bytes, expected ${size}`);
 }
 
-/** @param {number} step @param {string} where */
-export function checkStep(step, where) {
+/** A step: a real that is positive and normal. @param {Value | undefined} value @param {string} where */
+export function asStep(value, where) {
+  const step = asReal(value, where);
   if (!(step >= SMALLEST_NORMAL)) throw malformed(`${where}: ${step}, expected a positive normal binary32 value`);
   return step;
 }

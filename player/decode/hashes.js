@@ -1,11 +1,13 @@
 // Clause 12.4: digests of what a file decodes to.
 
+import { channelsOf } from "./channels.js";
+import { Column } from "./columns.js";
 import { hex, sha256 } from "./digests.js";
-import { channelCount } from "./header.js";
 import { readAll } from "./reader.js";
+import { widthOf } from "./rows.js";
 import { mortonOrder } from "./voxels.js";
-/** @import { LayerSymbols } from "./layer.js" */
-/** @import { Scene } from "./scene.js" */
+/** @import { Slice } from "./slice.js" */
+/** @import { Tensors } from "./tensors.js" */
 
 /** In hexadecimal. @typedef {{layer: number, symbols: string, tensors: string}} LayerHashes */
 
@@ -13,69 +15,72 @@ const LITTLE_ENDIAN = new Uint8Array(Uint16Array.of(1).buffer)[0] === 1;
 
 /** @param {(Int32Array | Float32Array)[]} arrays */
 function digest(arrays) {
-  const bytes = joined(arrays.map((array) => new Uint8Array(array.buffer, array.byteOffset, array.byteLength)));
+  const bytes = joined(Uint8Array, arrays.map(({ buffer, byteOffset, byteLength }) => {
+    return new Uint8Array(buffer, byteOffset, byteLength);
+  }));
   if (!LITTLE_ENDIAN) for (let at = 0; at < bytes.length; at += 4) bytes.subarray(at, at + 4).reverse();
   return hex(sha256(bytes));
 }
 
-/** One behind the other. @template {Uint8Array | Int32Array} A @param {A[]} arrays at least one @returns {A} */
-function joined(arrays) {
-  const type = /** @type {new (length: number) => A} */ (arrays[0].constructor);
-  const all = new type(arrays.reduce((sum, { length }) => sum + length, 0));
-  let at = 0;
-  for (const array of arrays) {
-    all.set(array, at);
-    at += array.length;
-  }
-  return all;
+/** One behind the other, from `first` on in another order if given. @template {Uint8Array | Int32Array} A
+ * @param {new (length: number) => A} type @param {A[]} arrays @param {Uint32Array | null} [order] @param {number} [first]
+ * @returns {A} */
+function joined(type, arrays, order = null, first = 0) {
+  const all = new Column(type, 1);
+  all.reserve(arrays.reduce((sum, { length }) => sum + length, 0), 1);
+  for (const array of arrays) all.append(array);
+  if (order) all.reorder(first, order, 1);
+  return all.values;
 }
 
 /**
  * Per layer the SHA-256 of its integers and of its float32 values, of a complete file, of its layers up to maxLayer,
- * or, if allowPartial, of the slices that a cut file has. Raises as `decode` does.
+ * or, if allowPartial, of the slices that a cut file has. Raises as `decodeTensors` does.
  *
  * @param {Uint8Array} bytes @param {{maxLayer?: number | null, allowPartial?: boolean}} [options]
  * @returns {LayerHashes[]}
  */
-export function hashes(bytes, { maxLayer = null, allowPartial = false } = {}) {
-  /** @type {LayerSymbols[]} */
+export function hashes(bytes, options = {}) {
+  /** @type {Slice[]} */
   const slices = [];
-  const scene = readAll(bytes, maxLayer, allowPartial, (slice) => slices.push(slice));
-  return scene.layers.map((layer, i) => ({
-    layer,
-    symbols: digest(symbolsOf(scene, i, slices.filter(({ kind }) => kind.layer === layer))),
-    tensors: digest(tensorsOf(scene, i)),
-  }));
-}
-
-/** @param {Scene} scene @param {number} i index of the layer @param {LayerSymbols[]} slices of it */
-function symbolsOf(scene, i, slices) {
-  const [{ kind, rises, planes, weights }] = slices;
-  const order = slices.length > 1 ? mortonOrder(joined(slices.map(({ voxels }) => voxels))) : null;
-  /** A channel of all slices. @param {(slice: LayerSymbols) => Int32Array} of */
-  const rows = (of) => {
-    const all = joined(slices.map(of));
-    return order ? Int32Array.from(order, (row) => all[row]) : all;
-  };
-  const first = scene.rows[i - 1] ?? 0;
-  const codes = Int32Array.from(scene.mask[i].subarray(first));
-  const classes = kind.stepClasses ? [rows((slice) => slice.stepClasses)] : [];
-  const channels = Array.from({ length: channelCount(kind.widths) }, (_, c) =>
-    rows((slice) => slice.attributes.subarray(c * slice.codes.length, (c + 1) * slice.codes.length)),
-  );
-  const voxels = scene.anchorQ.subarray(3 * first, 3 * scene.rows[i]);
-  return [voxels, rises, codes, ...classes, ...channels, ...planes, ...weights];
-}
-
-/** @param {Scene} scene @param {number} i index of the layer */
-function tensorsOf(scene, i) {
-  const deformation = [null, scene.globalDeformation, scene.localDeformation][scene.layers[i]];
-  const networks = scene.layers[i] ? (deformation?.networks ?? {}) : scene.networks;
-  const all = scene.rows[scene.rows.length - 1];
-  const rows = [scene.anchor, scene.feature, scene.scalingLog, scene.offset].map((values) => {
-    const width = values.length / all;
-    return values.subarray(width * (scene.rows[i - 1] ?? 0), width * scene.rows[i]);
+  const tensors = readAll(bytes, options, null, (slice) => slices.push(slice));
+  let first = 0;
+  return tensors.layers.map(({ layer, codes: { length: end } }, i) => {
+    const symbols = symbolsOf(tensors, i, first, slices.filter((slice) => slice.layer === layer));
+    const values = valuesOf(tensors, i, first, end);
+    first = end;
+    return { layer, symbols: digest(symbols), tensors: digest(values) };
   });
-  const planes = deformation?.planes.flatMap((scale) => Object.values(scale).map(({ data }) => data)) ?? [];
-  return [...rows, ...planes, ...Object.values(networks).flat().flatMap(({ weight, bias }) => [weight, bias])];
+}
+
+/** @param {Tensors} tensors @param {number} i index of the layer @param {number} first row of its own
+ * @param {Slice[]} slices of it */
+function symbolsOf({ header: { width }, voxels, layers }, i, first, slices) {
+  const order = slices.length > 1 ? mortonOrder(joined(Int32Array, slices.map((slice) => slice.voxels))) : null;
+  const [{ rises, stepClasses, planes, weights }] = slices;
+  const { codes, rowTensors } = layers[i];
+  /** Channels of all slices, which first have so many rows of earlier layers. @param {number} count
+   * @param {(slice: Slice) => Int32Array} of @param {number} [earlier] */
+  const channels = (count, of, earlier = 0) => {
+    const parts = slices.map((slice) => channelsOf(of(slice), count));
+    return Array.from({ length: count }, (_, c) => joined(Int32Array, parts.map((part) => part[c]), order, earlier));
+  };
+  const classes = stepClasses ? channels(1, (slice) => /** @type {Int32Array} */ (slice.stepClasses)) : [];
+  const rows = channels(width, (slice) => slice.rows);
+  const layerRows = channels(widthOf(rowTensors), (slice) => slice.layerRows, first);
+  const own = [voxels.subarray(3 * first, 3 * codes.length), rises, Int32Array.from(codes.subarray(first))];
+  return [...own, ...classes, ...rows, ...layerRows, ...planes, ...weights];
+}
+
+/** @param {Tensors} tensors @param {number} i index of the layer @param {number} first row of its own
+ * @param {number} end behind its rows */
+function valuesOf({ header, positions, rows, layers }, i, first, end) {
+  const { rows: layerRows, grids, chains } = layers[i];
+  const own = rows.map((values, k) => {
+    const { channels } = header.rows[k];
+    return values.subarray(channels * first, channels * end);
+  });
+  const planes = grids.flatMap((grid) => grid.planes.map(({ data }) => data));
+  const weights = chains.flatMap(({ network }) => network.flatMap(({ weight, bias }) => [weight, bias]));
+  return [positions.subarray(3 * first, 3 * end), ...own, ...layerRows, ...planes, ...weights];
 }

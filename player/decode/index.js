@@ -6,6 +6,7 @@
  * @module
  */
 
+import { RULES, sceneOf } from "../kinds/index.js";
 import { readAll } from "./reader.js";
 import { Stream } from "./stream.js";
 
@@ -13,28 +14,41 @@ export { DecodeError } from "./errors.js";
 export { hashes } from "./hashes.js";
 export { Stream } from "./stream.js";
 
-/** @typedef {import("./scene.js").Scene} Scene */
-/** @typedef {import("./scene.js").Info} Info */
-/** @typedef {import("./scene.js").Camera} Camera */
-/** @typedef {import("./scene.js").Steps} Steps */
-/** @typedef {import("./scene.js").Network} Network */
-/** @typedef {import("./scene.js").Deformation} Deformation */
-/** @typedef {import("./scene.js").Plane} Plane */
+/** @typedef {import("../kinds/index.js").Scene} Scene */
+/** @typedef {import("../kinds/index.js").Deformation} Deformation */
+/** @typedef {import("./tensors.js").Tensors} Tensors */
+/** @typedef {import("./tensors.js").Info} Info */
+/** @typedef {import("./tensors.js").Camera} Camera */
+/** @typedef {import("./tensors.js").Network} Network */
+/** @typedef {import("./tensors.js").Plane} Plane */
 /** @typedef {import("./errors.js").ErrorKind} ErrorKind */
 
+/** maxLayer: bytes behind the layers up to it are not looked at. allowPartial: a cut file, which raises Truncated, yields
+ * its longest prefix of complete slices, at least one.
+ * @typedef {{maxLayer?: number | null, allowPartial?: boolean}} Options */
+
+/** @param {Uint8Array | ArrayBuffer} bytes */
+const viewOf = (bytes) => (bytes instanceof Uint8Array ? bytes : new Uint8Array(bytes));
+
 /**
- * The scene of a file, or of its layers up to maxLayer (bytes behind them are not looked at).
+ * The scene of a file, or of a prefix. Raises DecodeError, also where a kind is unknown or its tensors break its rules
+ * (clause 13.1).
  *
- * A cut file raises Truncated, or yields its longest prefix of complete slices if allowPartial, which still needs the
- * first; the scene then ends early. Other faults raise the other kinds of DecodeError.
- *
- * @param {Uint8Array | ArrayBuffer} bytes
- * @param {{maxLayer?: number | null, allowPartial?: boolean}} [options]
+ * @param {Uint8Array | ArrayBuffer} bytes @param {Options} [options]
  * @returns {Scene}
  */
-export function decode(bytes, { maxLayer = null, allowPartial = false } = {}) {
-  const data = bytes instanceof Uint8Array ? bytes : new Uint8Array(bytes);
-  return readAll(data, maxLayer, allowPartial);
+export function decode(bytes, options = {}) {
+  return sceneOf(readAll(viewOf(bytes), options, RULES));
+}
+
+/**
+ * The tensors of a file, or of a prefix, whatever their kinds are. Raises DecodeError.
+ *
+ * @param {Uint8Array | ArrayBuffer} bytes @param {Options} [options]
+ * @returns {Tensors}
+ */
+export function decodeTensors(bytes, options = {}) {
+  return readAll(viewOf(bytes), options, null);
 }
 
 /**

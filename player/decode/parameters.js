@@ -1,108 +1,95 @@
-// Clause 6: the parameters of a slice and the sections behind them.
+// Clause 6: the parameters of a slice, and the shapes of the tensors that it codes.
 
 import { limitExceeded, malformed } from "./errors.js";
-import { Fields, asInteger, asList, asRegistered, checkStep } from "./fields.js";
-import { channelCount } from "./header.js";
-import { headsOf } from "./heads.js";
-import { INSTANTS, MAX_CHANNELS, MAX_FIELDS, MAX_LINEAR_LAYERS, MAX_PAYLOAD } from "./limits.js";
-import { MAX_PLANE_CELLS, MAX_ROWS, MAX_SCALES, MAX_SIDE, MAX_WIDTH } from "./limits.js";
+import { Fields, asId, asInteger, asIntegers, asItems, asList, asRegistered, asStep } from "./fields.js";
+import { readKind, readRows } from "./header.js";
+import { MAX_AXES, MAX_CHAINS, MAX_CHANNELS, MAX_FIELDS, MAX_GRIDS } from "./limits.js";
+import { MAX_LINEAR_LAYERS, MAX_PAYLOAD, MAX_PLANE_CELLS, MAX_ROWS, MAX_SIDE, MAX_WIDTH } from "./limits.js";
 import { unpack } from "./msgpack.js";
-import { PREDICTORS } from "./planes.js";
-import { PLANES } from "./scene.js";
+import { PREDICTORS } from "./grids.js";
+import { widthOf } from "./rows.js";
+/** @import { Value } from "./msgpack.js" */
+/** @import { RowTensor } from "./tensors.js" */
 
-/**
- * The properties of a layer that follow from its number and the header.
- *
- * @typedef {object} LayerKind
- * @property {number} layer
- * @property {[string, number | null][]} networks name and outputs by id; null: any number of outputs
- * @property {number[]} inputs by id, of layer 0's networks
- * @property {number[]} classes of the error bounds of its steps, in their order (5.4)
- * @property {import("./header.js").Widths} widths
- * @property {boolean} stepClasses whether anchors have step classes (11.2)
- */
+/** The keys of a slice's parameters (6.2), and those that a later slice of a layer lacks. */
+const KEYS = [1, 2, 3, 4, 5, 6, 7];
+const FIRST_KEYS = [4, 5, 6, 7];
 
-/** @param {number} layer @param {import("./header.js").Header} header @returns {LayerKind} */
-export function layerKind(layer, { widths, centres }) {
-  const { feature: D, slots: G, views } = widths;
-  /** @type {[string, number | null][]} */
-  const networks = [["trunk", null]];
-  if (layer === 0) networks.splice(0, 1, ["opacity", G], ["covariance", 7 * G], ["color", 3 * G]);
-  else for (const { name, outputs } of headsOf(widths)) networks.push([name, outputs]);
-  const classes = layer ? [2 + 2 * layer, 3 + 2 * layer] : [3];
-  const inputs = [0, 1, 2].map((id) => D + (views & (1 << id) ? 3 : 0));
-  return { layer, networks, inputs, classes, widths, stepClasses: centres !== null };
-}
+/** @typedef {{channels: number, height: number, width: number, predictor: number}} PlaneShape */
+/** @typedef {{id: number, channels: number, sides: number[], planes: PlaneShape[]}} GridShape */
+/** linears: from the input side. @typedef {{id: number, linears: {inputs: number, outputs: number}[]}} ChainShape */
 
-/** Sections of mode ans by number (6.4). */
-const SECTIONS = /** @type {const} */ (["positions", "masks", "attributes", "planes", "weights", "symbols"]);
-/** The keys of a layer's parameters (6.1). */
-const KEYS = [1, 2, 3, 4, 5, 6];
+/** Tensors of one form and their step. @template T @typedef {{step: number, list: T[]}} Stepped */
 
-/** @typedef {{name: string, channels: number, height: number, width: number, predictor: number}} PlaneShape */
-/** Layers from the input side. @typedef {{name: string, layers: {inputs: number, outputs: number}[]}} NetworkShape */
+/** Totals of slices (6.5): rows, symbols, bytes of payloads. @typedef {{rows: number, symbols: number, bytes: number}}
+ * Declared */
 
 /**
  * @typedef {object} Parameters
  * @property {number} rows
- * @property {number[]} steps of the weights in layer 0, else of planes and weights; empty without a deformation
- * @property {PlaneShape[][]} scales each with its planes
- * @property {NetworkShape[]} networks
- * @property {number | null} key instant of the deformation, normalised time, if there is one
- * @property {Partial<Record<(typeof SECTIONS)[number], Uint8Array>>} sections
+ * @property {number} rises one for each row of the layers before, in a later slice none
+ * @property {number[] | null} fill the colour behind a prefix that ends here, 0..255
+ * @property {Stepped<GridShape>} grids
+ * @property {Stepped<ChainShape>} chains
+ * @property {number[] | null} kind of the deformation: its number, then its parameters
+ * @property {RowTensor[]} layerRows those of the layer, with a row for each rise and each own row
+ * @property {Uint8Array} codes
+ * @property {Uint8Array} stream
+ * @property {number} symbols so many as 6.5 counts for this slice
  * @property {Declared} declared by the slices so far, this one included
  */
 
-/** Totals of slices: rows, symbols, bytes of payloads (6.5). scales: the channels of each scale of their planes.
- * @typedef {{rows: number, symbols: number, bytes: number, scales: number[]}} Declared */
-
 /**
- * The parameters of a slice's payload, with its sections; all counts are held against the limits and the payload.
+ * The parameters of a slice's payload; all counts are held against the limits and the payload.
  *
- * @param {Uint8Array} payload @param {LayerKind} kind @param {Declared} before by the slices before
- * @param {boolean} later whether slices of the layer came before: this one holds anchors alone
+ * @param {Uint8Array} payload @param {Pick<import("./header.js").Header, "width" | "centres">} header
+ * @param {Declared} before by the slices before @param {RowTensor[] | null} known the layer's own tensors of rows if slices
+ * of it came before: this one holds rows alone @param {string} where
  * @returns {Parameters}
  */
-export function readParameters(payload, kind, before, later) {
-  const rises = later ? 0 : before.rows;
-  const where = `layer ${kind.layer}`;
+export function readParameters(payload, { width, centres }, before, known, where) {
   if (payload.length < 4) throw malformed(`${where}: a payload of ${payload.length} bytes, expected at least 4`);
   const length = new DataView(payload.buffer, payload.byteOffset).getUint32(0, true);
   if (length > MAX_FIELDS) throw limitExceeded(`${where}: parameters of ${length} bytes, limit ${MAX_FIELDS}`);
-  if (length > payload.length - 4) {
-    throw malformed(`${where}: parameters of ${length} bytes, expected at most ${payload.length - 4}`);
-  }
+  const rest = payload.length - 4 - length;
+  if (rest < 0) throw malformed(`${where}: parameters of ${length} bytes, expected at most ${payload.length - 4}`);
   const fields = new Fields(unpack(payload.subarray(4, 4 + length), where).value, where, KEYS);
   const rows = asInteger(fields.get(1), 0, MAX_ROWS - before.rows, `${where}: own rows`);
-  const lengths = new Fields(fields.get(2), `${where}: sections`, [...SECTIONS.keys()]);
-  if (later) for (const key of [3, 4, 5, 6]) if (fields.has(key)) throw malformed(`${where}: key ${key} in a later slice`);
-  const scales = readScales(fields, kind, where, before.scales);
-  const networks = later ? [] : readNetworks(fields, kind, where, scales, before.scales);
-  const steps = readSteps(fields, kind, where, networks.length > 0);
-  const key = readKey(fields, kind, where, networks.length > 0);
-  const planes = scales.flat();
-  const sections = cutSections(payload, 4 + length, lengths, where);
-  const cells = planes.reduce((sum, { channels, height, width }) => sum + channels * height * width, 0);
-  const linears = networks.flatMap(({ layers }) => layers);
+  const size = asInteger(fields.get(2), 0, MAX_PAYLOAD, `${where}: length of the codes`);
+  if (size > rest) throw malformed(`${where}: codes of ${size} bytes, expected at most ${rest}`);
+  for (const key of FIRST_KEYS) if (known && fields.has(key)) throw malformed(`${where}: key ${key} in a later slice`);
+  const grids = readStepped(fields, 4, MAX_GRIDS, `${where}: a grid`, readGrid);
+  const chains = readStepped(fields, 5, MAX_CHAINS, `${where}: a chain`, readChain);
+  const layerRows = known ?? (fields.has(7) ? readRows(fields.get(7), where) : []);
+  const planes = grids.list.flatMap((grid) => grid.planes);
+  const linears = chains.list.flatMap((chain) => chain.linears);
+  const cells = planes.reduce((sum, plane) => sum + plane.channels * plane.height * plane.width, 0);
+  if (cells > MAX_PLANE_CELLS) throw limitExceeded(`${where}: ${cells} plane samples, limit ${MAX_PLANE_CELLS}`);
   const weights = linears.reduce((sum, { inputs, outputs }) => sum + (inputs + 1) * outputs, 0);
-  const perRow = channelCount(kind.widths) + (kind.stepClasses ? 1 : 0);
-  if (cells > MAX_PLANE_CELLS) throw limitExceeded(`${where}: ${cells} plane cells, limit ${MAX_PLANE_CELLS}`);
+  const rises = known ? 0 : before.rows;
+  const own = (width + (centres ? 5 : 4)) * rows;
+  const symbols = rises + own + widthOf(layerRows) * (rises + rows) + cells + weights;
   const declared = {
     rows: before.rows + rows,
-    symbols: before.symbols + rises + (perRow + 4) * rows + cells + weights,
+    symbols: before.symbols + symbols,
     bytes: before.bytes + payload.length,
-    scales: [...before.scales, ...scales.map(([{ channels }]) => channels)],
   };
   checkDeclared(where, "rows", declared.rows, 2 ** 13, 2, declared.bytes);
   checkDeclared(where, "symbols", declared.symbols, 2 ** 22, 256, declared.bytes);
-  const counts = [rows, rises + rows, rows * perRow, cells, weights, 0];
-  SECTIONS.forEach((name, i) => {
-    if (name in sections !== counts[i] > 0) {
-      const found = name in sections ? "present" : "missing";
-      throw malformed(`${where}: section ${name} is ${found} for ${counts[i]} symbols`);
-    }
-  });
-  return { rows, steps, scales, networks, key, sections, declared };
+  const fill = `${where}: fill`;
+  return {
+    rows,
+    rises,
+    fill: fields.has(3) ? asIntegers(asList(fields.get(3), fill, 3), 0, 255, fill) : null,
+    grids,
+    chains,
+    kind: fields.has(6) ? readKind(fields.get(6), `${where}: kind of the deformation`) : null,
+    layerRows,
+    codes: payload.subarray(4 + length, 4 + length + size),
+    stream: payload.subarray(4 + length + size),
+    symbols,
+    declared,
+  };
 }
 
 /** Clause 6.5. @param {string} where @param {string} what @param {number} count @param {number} free
@@ -112,94 +99,43 @@ function checkDeclared(where, what, count, free, each, bytes) {
   if (count > most) throw limitExceeded(`${where}: ${count} ${what} in ${bytes} bytes, limit ${most}`);
 }
 
-/** @param {Uint8Array} payload @param {number} at @param {Fields} lengths @param {string} where */
-function cutSections(payload, at, lengths, where) {
-  /** @type {Parameters["sections"]} */
-  const sections = {};
-  SECTIONS.forEach((name, number) => {
-    if (!lengths.has(number)) return;
-    const start = at;
-    at += asInteger(lengths.get(number), 1, MAX_PAYLOAD, `${where}: length of section ${name}`);
-    sections[name] = payload.subarray(start, at); // shorter if the payload ends: the sum is checked below
-  });
-  if (at !== payload.length) throw malformed(`${where}: sections up to byte ${at} of a payload of ${payload.length}`);
-  return sections;
-}
-
-/** Key 3. @param {Fields} fields @param {LayerKind} kind @param {string} where @param {boolean} expected */
-function readSteps(fields, kind, where, expected) {
-  if (fields.has(3) !== expected) throw malformed(`${where}: steps ${expected ? "are missing" : "without networks"}`);
-  if (!expected) return [];
-  return fields.reals(3, kind.classes.length, "steps").map((step) => checkStep(step, `${where}: step`));
-}
-
-/** Key 6. @param {Fields} fields @param {LayerKind} kind @param {string} where @param {boolean} deformed */
-function readKey(fields, kind, where, deformed) {
-  if (!fields.has(6)) return null;
-  if (!deformed || kind.layer === 0) throw malformed(`${where}: a key instant, expected only in a deformation`);
-  return Math.fround(asInteger(fields.get(6), 0, INSTANTS, `${where}: key instant`) / INSTANTS);
-}
-
-/** Key 4: the planes of each scale. @param {Fields} fields @param {LayerKind} kind @param {string} where
- * @param {number[]} below channels of each scale of the layers before */
-function readScales(fields, kind, where, below) {
-  if (!fields.has(4)) return [];
-  if (kind.layer === 0) throw malformed(`${where}: planes, expected none`);
-  const rows = asList(fields.get(4), `${where}: scales`);
-  asInteger(rows.length, 1, MAX_SCALES, `${where}: number of scales`);
-  let [expected] = below;
-  return rows.map((row) => {
-    const entry = asList(row, `${where}: a scale`, 11);
-    const channels = asInteger(entry[0], 1, MAX_CHANNELS, `${where}: channels of a scale`);
-    const [x, y, z, t] = entry.slice(1, 5).map((side) => asInteger(side, 1, MAX_SIDE, `${where}: side of a plane`));
-    const predictors = entry.slice(5).map((p) => asRegistered(p, PREDICTORS, `${where}: predictor`));
-    expected ??= channels;
-    if (channels !== expected) {
-      throw malformed(`${where}: a scale of ${channels} channels, expected ${expected} as in the first scale`);
-    }
-    const side = { x, y, z, t };
-    return PLANES.map((name, i) => ({
-      name,
-      channels,
-      height: side[/** @type {keyof typeof side} */ (name[1])],
-      width: side[/** @type {keyof typeof side} */ (name[0])],
-      predictor: predictors[i],
-    }));
-  });
-}
-
-/** Key 5. @param {Fields} fields @param {LayerKind} kind @param {string} where @param {PlaneShape[][]} scales
- * @param {number[]} below as in readScales @returns {NetworkShape[]} */
-function readNetworks(fields, kind, where, scales, below) {
-  const deformation = kind.layer > 0;
-  if (!fields.has(5)) {
-    if (!deformation || scales.length) throw malformed(`${where}: networks are missing`);
-    return [];
-  }
-  const rows = asList(fields.get(5), `${where}: networks`);
-  if (!rows.length) throw malformed(`${where}: an empty list of networks`);
-  if (deformation && !scales.length) throw malformed(`${where}: a deformation without planes`);
-  let inputs = scales.length && (below.length + scales.length) * scales[0][0].channels;
+/**
+ * A list of a step and shapes, which may be absent.
+ *
+ * @template T
+ * @param {Fields} fields @param {number} key @param {number} limit of shapes @param {string} where
+ * @param {(id: number, rest: Value[], where: string) => T} read
+ * @returns {Stepped<T>}
+ */
+function readStepped(fields, key, limit, where, read) {
+  if (!fields.has(key)) return { step: 0, list: [] };
+  const [step, ...shapes] = asItems(fields.get(key), 2, 1 + limit, `${where} of key ${key}`);
   let last = -1;
-  const networks = rows.map((row) => {
-    const [id, ...widths] = asList(row, `${where}: a network`);
-    const number = asRegistered(id, kind.networks.length, `${where}: id of a network`);
-    if (number <= last) throw malformed(`${where}: network ${number} after ${last}, expected ascending ids`);
-    const [name, outputs] = kind.networks[number];
-    if (deformation && last < 0 && number > 0) throw malformed(`${where}: no trunk, expected one`);
-    last = number;
-    asInteger(widths.length, 1, MAX_LINEAR_LAYERS, `${where}: linear layers of ${name}`);
-    let width = deformation ? inputs : kind.inputs[number];
-    const layers = widths.map((value) => {
-      const layer = { inputs: width, outputs: asInteger(value, 1, MAX_WIDTH, `${where}: width of ${name}`) };
-      width = layer.outputs;
-      return layer;
-    });
-    if (outputs === null) inputs = width; // the heads take the trunk's outputs
-    else if (width !== outputs) throw malformed(`${where}: ${width} outputs of ${name}, expected ${outputs}`);
-    return { name, layers };
+  const list = shapes.map((shape) => {
+    const [id, ...rest] = asItems(shape, 1, Infinity, where);
+    last = asId(id, last, where);
+    return read(last, rest, where);
   });
-  const least = deformation ? 2 : kind.networks.length;
-  if (networks.length < least) throw malformed(`${where}: ${networks.length} networks, expected at least ${least}`);
-  return networks;
+  return { step: asStep(step, `${where}: step`), list };
+}
+
+/** @param {number} id @param {Value[]} rest @param {string} where @returns {GridShape} */
+function readGrid(id, rest, where) {
+  const [channelCount, sideList, predictorList] = asList(rest, where, 3);
+  const channels = asInteger(channelCount, 1, MAX_CHANNELS, `${where}: channels`);
+  const sides = asIntegers(asItems(sideList, 1, MAX_AXES, `${where}: sides`), 1, MAX_SIDE, `${where}: a side`);
+  // a grid of one side is a plane of one row
+  const pairs = sides.length === 1 ? [[sides[0], 1]] : sides.flatMap((a, i) => sides.slice(i + 1).map((b) => [a, b]));
+  const predictors = asList(predictorList, `${where}: predictors`, pairs.length);
+  const planes = pairs.map(([width, height], i) => {
+    const predictor = asRegistered(predictors[i], PREDICTORS, `${where}: predictor`);
+    return { channels, height, width, predictor };
+  });
+  return { id, channels, sides, planes };
+}
+
+/** @param {number} id @param {Value[]} rest @param {string} where @returns {ChainShape} */
+function readChain(id, rest, where) {
+  const widths = asIntegers(asItems(rest, 2, 1 + MAX_LINEAR_LAYERS, `${where}: widths`), 1, MAX_WIDTH, `${where}: a width`);
+  return { id, linears: widths.slice(1).map((outputs, i) => ({ inputs: widths[i], outputs })) };
 }

@@ -1,9 +1,10 @@
-// Clause 10: the positions section, an octree, level by level.
+// Clause 10: positions, an octree, level by level.
 
-import { ByteReader } from "./bytes.js";
-import { decodeChannels } from "./channels.js";
 import { limitExceeded, malformed } from "./errors.js";
 import { MAX_COUNT, MAX_VOXEL } from "./limits.js";
+/** @import { ByteReader } from "./bytes.js" */
+/** @import { ChannelReader } from "./channels.js" */
+/** @import { Prior } from "./tables.js" */
 
 const MAX_DEPTH = 21;
 /** Children of a full node, whose pattern needs no symbol. */
@@ -20,17 +21,16 @@ for (let byte = 0; byte < 256; byte++) {
 /** Nodes of a level, and those of them with one child. @typedef {{nodes: number, single: number}} Level */
 
 /**
- * @param {Uint8Array} bytes the section @param {number} rows at least 1
- * @param {import("./channels.js").Prior[]} known see decodeChannels
+ * @param {ChannelReader} channels @param {number} rows at least 1 @param {Prior[]} priors see ChannelReader
  * @returns {Int32Array} [rows, 3] voxel indices, in Morton order of their offsets from the minimum
  */
-export function decodePositions(bytes, rows, known) {
-  const reader = new ByteReader(bytes);
-  const minimum = [0, 1, 2].map(() => reader.zigzag(MAX_VOXEL, "the minimum of the voxel indices"));
-  const depth = reader.byte("the depth of the octree");
+export function decodePositions(channels, rows, priors) {
+  const { codes } = channels;
+  const minimum = [0, 1, 2].map(() => codes.zigzag(MAX_VOXEL, "the minimum of the voxel indices"));
+  const depth = codes.byte("the depth of the octree");
   if (depth > MAX_DEPTH) throw limitExceeded(`a depth of ${depth}, limit ${MAX_DEPTH}`);
-  const levels = readLevels(reader, depth, rows);
-  const patterns = rows > 1 ? readPatternCounts(reader, levels) : [];
+  const levels = readLevels(codes, depth, rows);
+  const counts = rows > 1 ? readPatternCounts(codes, levels) : [];
   const lengths = [];
   let only = 0;
   for (const { nodes, single } of levels) {
@@ -38,9 +38,11 @@ export function decodePositions(bytes, rows, known) {
     else lengths.push(single);
     only = single;
   }
-  lengths.push(...patterns);
-  const symbols = decodeChannels(reader.rest(), lengths, known);
-  return placed(grow(levels, patterns, symbols, rows), minimum, depth);
+  const symbols = channels.read(lengths, priors, 0, ALL - 1, "a symbol of the octree");
+  const patterns = PATTERNS.map(({ length }, k) => {
+    return channels.read([counts[k - 2] ?? 0], priors, 0, length - 1, "a pattern of children");
+  });
+  return placed(grow(levels, symbols, patterns, rows), minimum, depth);
 }
 
 /** 10.2, level by level. @param {ByteReader} reader @param {number} depth @param {number} rows @returns {Level[]} */
@@ -76,67 +78,49 @@ function readPatternCounts(reader, levels) {
 }
 
 /**
- * The offsets of all anchors along x, y, z.
+ * The offsets of all anchors along x, y, z. Where the tree is not as its counts say, a level takes symbols that are none,
+ * and is refused at its end.
  *
- * @param {Level[]} levels @param {number[]} patterns @param {Int32Array} symbols @param {number} rows
+ * @param {Level[]} levels @param {Int32Array} symbols of all levels @param {Int32Array[]} patterns of k children
+ * @param {number} rows
  */
-function grow(levels, patterns, symbols, rows) {
+function grow(levels, symbols, patterns, rows) {
   let parents = [0, 1, 2].map(() => new Int32Array(rows));
   let children = [0, 1, 2].map(() => new Int32Array(rows));
   let parentAlone = new Uint8Array(rows); // 1 where a node is its parent's only child
   let childAlone = new Uint8Array(rows);
-  // index in `symbols` of the next pattern of k children, and the end of these patterns
-  const next = new Array(ALL).fill(0);
-  const ends = new Array(ALL).fill(symbols.length);
-  let at = symbols.length;
-  for (let k = ALL - 1; k >= 2; k--) {
-    ends[k] = at;
-    next[k] = at -= patterns[k - 2] ?? 0;
-  }
-  at = 0;
+  const used = patterns.map(() => 0);
+  let at = 0;
   let only = 0;
-  for (let l = 0; l < levels.length; l++) {
-    const { nodes, single } = levels[l];
-    const after = l + 1 < levels.length ? levels[l + 1].nodes : rows;
+  levels.forEach(({ nodes, single }, l) => {
     const branches = nodes < rows;
     let ofOnly = at;
-    let ofOthers = ofOnly + only;
+    let ofOthers = at + only;
     let ofChild = branches ? at + nodes : at;
-    const end = ofChild + single;
+    at = ofChild + single;
+    only = single;
     let made = 0;
     for (let i = 0; i < nodes; i++) {
-      const count = branches ? 1 + within(symbols[parentAlone[i] ? ofOnly++ : ofOthers++], ALL) : 1;
+      const count = branches ? 1 + symbols[parentAlone[i] ? ofOnly++ : ofOthers++] : 1;
       let pattern = 255;
-      if (count === 1) {
-        if (ofChild === end) throw malformed("more nodes with one child than stated");
-        pattern = 1 << within(symbols[ofChild++], ALL);
-      } else if (count < ALL) {
-        if (next[count] === ends[count]) throw malformed(`more nodes with ${count} children than stated`);
-        pattern = PATTERNS[count][within(symbols[next[count]++], PATTERNS[count].length)];
-      }
-      if (made + count > after) throw malformed("more children than stated");
+      if (count === 1) pattern = 1 << symbols[ofChild++];
+      else if (count < ALL) pattern = PATTERNS[count][patterns[count][used[count]++]];
       for (let child = 0; child < ALL; child++) {
         if (!((pattern >> child) & 1)) continue;
         for (let axis = 0; axis < 3; axis++) children[axis][made] = 2 * parents[axis][i] + ((child >> axis) & 1);
         childAlone[made++] = count === 1 ? 1 : 0;
       }
     }
-    if (ofChild !== end || made !== after) throw malformed("fewer children than stated");
+    const after = levels[l + 1]?.nodes ?? rows;
+    if (made !== after) throw malformed(`${made} nodes behind level ${l} of the octree, stated are ${after}`);
+    if (ofChild !== at) throw malformed(`more or fewer nodes with one child than stated, in level ${l} of the octree`);
     [parents, children] = [children, parents];
     [parentAlone, childAlone] = [childAlone, parentAlone];
-    at = end;
-    only = single;
-  }
-  for (let k = 2; k < ALL; k++) {
-    if (next[k] !== ends[k]) throw malformed(`fewer nodes with ${k} children than stated`);
-  }
+  });
+  patterns.forEach(({ length }, k) => {
+    if (used[k] !== length) throw malformed(`${used[k]} nodes with ${k} children, stated are ${length}`);
+  });
   return parents;
-}
-
-/** @param {number} symbol @param {number} size */
-function within(symbol, size) {
-  if (symbol < 0 || symbol >= size) throw malformed(`a symbol of ${symbol} in the octree, expected 0..${size - 1}`);
-  return symbol;
 }
 
 /** 10.1: the voxels at these offsets. @param {Int32Array[]} offsets @param {number[]} minimum @param {number} depth */

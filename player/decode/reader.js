@@ -1,27 +1,46 @@
-// Clause 12: a file's chunks in order, slice by slice, to scenes.
+// Clause 12: a file's chunks in order, slice by slice, to tensors.
 
 import { Column } from "./columns.js";
 import { CHUNK_OVERHEAD, PREAMBLE_SIZE, readChunk, readPreamble } from "./container.js";
 import { DecodeError, limitExceeded, malformed, unsupported } from "./errors.js";
 import { LAYER_TYPES, readHeader } from "./header.js";
-import { MOST_CODE, decodeLayer, dequantise, transposed } from "./layer.js";
-import { layerKind } from "./parameters.js";
+import { dequantise, rowsOf } from "./rows.js";
+import { MOST_CODE, chainsOf, decodeSlice, gridsOf } from "./slice.js";
 import { VoxelTable, mortonOrder } from "./voxels.js";
 /** @import { Header } from "./header.js" */
-/** @import { Continuation, LayerSymbols } from "./layer.js" */
-/** @import { Declared, NetworkShape, PlaneShape } from "./parameters.js" */
-/** @import { Deformation, Network, Scale, Scene, Steps } from "./scene.js" */
+/** @import { Declared } from "./parameters.js" */
+/** @import { Priors, Slice } from "./slice.js" */
+/** @import { LayerTensors, Tensors } from "./tensors.js" */
+
+/**
+ * The rules of kinds, which tensors do not need: raise where the header, or the last one of these layers, breaks one.
+ *
+ * @typedef {object} Rules
+ * @property {(header: Header) => void} checkHeader
+ * @property {(header: Header, layers: LayerTables[]) => void} checkLayer
+ */
+
+/** @typedef {Omit<LayerTensors, "codes" | "fill" | "rows">} LayerTables */
+
+/**
+ * A layer as far as it has been read: `first` row of its own; codes of the mask, of all rows up to its own, and its own
+ * tensors of rows; `sorted`, whether its rows are.
+ *
+ * @typedef {Omit<LayerTensors, "codes" | "rows"> & {slices: number, first: number, sorted: boolean,
+ *   codes: Column<Uint8Array>, rows: Column<Float32Array>[], priors: Priors}} Layer
+ */
 
 /**
  * Reads a whole file, or its layers up to maxLayer; of a cut file, if allowPartial, the slices that are there, at least
  * one. Raises DecodeError.
  *
- * @param {Uint8Array} bytes @param {number | null} maxLayer @param {boolean} allowPartial
- * @param {(slice: LayerSymbols) => void} [take] is given each slice
- * @returns {Scene}
+ * @param {Uint8Array} bytes @param {{maxLayer?: number | null, allowPartial?: boolean}} options
+ * @param {Rules | null} rules null: tensors of any kind are taken
+ * @param {(slice: Slice) => void} [take] is given each slice
+ * @returns {Tensors}
  */
-export function readAll(bytes, maxLayer, allowPartial, take) {
-  const reader = new LayerReader(maxLayer);
+export function readAll(bytes, { maxLayer = null, allowPartial = false }, rules, take) {
+  const reader = new TensorReader(maxLayer, rules);
   try {
     for (let slice; (slice = reader.next(bytes.subarray(reader.offset))); ) take?.(slice);
   } catch (error) {
@@ -29,17 +48,18 @@ export function readAll(bytes, maxLayer, allowPartial, take) {
     if (!cut || !allowPartial || !reader.count) throw error;
   }
   reader.sort();
-  return reader.scene();
+  return reader.tensors();
 }
 
 /** Reads a file slice by slice. It keeps no bytes but the header's: every call gets what follows those it consumed. */
-export class LayerReader {
-  /** @param {number | null} maxLayer layers above it are not read; null: all are */
-  constructor(maxLayer) {
+export class TensorReader {
+  /** @param {number | null} maxLayer layers above it are not read; null: all are @param {Rules | null} rules */
+  constructor(maxLayer, rules) {
     if (maxLayer !== null && !(Number.isInteger(maxLayer) && maxLayer >= 0)) {
       throw new RangeError(`maxLayer is ${maxLayer}, expected 0 or more`);
     }
     this.maxLayer = maxLayer;
+    this._rules = rules;
     /** @type {Header | null} */
     this.header = null;
     /** Each slice's layer with the end of its chunk in the file, in file order; empty until the header is there.
@@ -49,20 +69,23 @@ export class LayerReader {
     this.end = null;
     /** Of the next chunk, or of the header before it is read. */
     this.offset = 0;
-    /** What the layers read so far hold. @type {LayerParts[]} */
-    this._layers = [];
-    /** What all rows hold. @type {Record<string, Column<any>>} */
-    this._columns = {};
+    /** How many slices have been read. */
+    this.count = 0;
     this._index = 0;
     /** By chunk, the layer of the first slice behind those before it; null if there is none. @type {(number | null)[]} */
     this._following = [];
     /** By chunk, the part of all slices' bytes that has come with it. @type {number[]} */
     this._share = [];
-    /** How many slices have been read. */
-    this.count = 0;
-    /** By those slices. @type {Declared} */
-    this._declared = { rows: 0, symbols: 0, bytes: 0, scales: [] };
-    this._voxels = new VoxelTable();
+    /** By the slices read so far. @type {Declared} */
+    this._declared = { rows: 0, symbols: 0, bytes: 0 };
+    /** @type {Layer[]} */
+    this._layers = [];
+    this._voxels = new Column(Int32Array, 3);
+    this._positions = new Column(Float32Array, 3);
+    /** By tensor of the header's. @type {Column<Float32Array>[]} */
+    this._rows = [];
+    this._classes = new Column(Uint8Array, 1);
+    this._taken = new VoxelTable();
     /** Voxels that are not in the table yet: of one slice nothing is looked up. @type {Int32Array[]} */
     this._loose = [];
   }
@@ -74,12 +97,24 @@ export class LayerReader {
     return (this._following[this._index] ?? Infinity) > this.maxLayer;
   }
 
+  /** Whether the layer of the latest slice has no further ones. */
+  get whole() {
+    return this._following[this._index] !== this._layers[this._layers.length - 1].layer;
+  }
+
+  /** What all rows hold. @returns {Column<any>[]} */
+  get _columns() {
+    return [this._voxels, this._positions, ...this._rows, ...(this.header?.centres ? [this._classes] : [])];
+  }
+
   /** Reads the header. Raises Truncated, with nothing consumed, if `bytes` end before. @param {Uint8Array} bytes */
   _begin(bytes) {
     const packed = readPreamble(bytes);
     const header = readHeader(packed);
+    this._rules?.checkHeader(header);
     this.header = header;
     this.offset = PREAMBLE_SIZE + packed.length;
+    this._rows = header.rows.map(({ channels }) => new Column(Float32Array, channels));
     this._following = [null];
     for (const { type } of [...header.chunks].reverse()) {
       this._following.unshift(type < LAYER_TYPES ? type : this._following[0]);
@@ -94,16 +129,7 @@ export class LayerReader {
     });
     this.end = end;
     this._share = sums.map((sum) => sum / come);
-    const { feature, slots } = header.widths;
-    const widths = { anchor: 3, feature, scalingLog: 6, offset: 3 * slots };
-    this._columns = { voxels: new Column(Int32Array, 3) };
-    for (const [name, width] of Object.entries(widths)) this._columns[name] = new Column(Float32Array, width);
     return header;
-  }
-
-  /** Whether the layer of the latest slice has no further ones. */
-  get whole() {
-    return this._following[this._index] !== this._layers[this._layers.length - 1].layer;
   }
 
   /**
@@ -113,7 +139,7 @@ export class LayerReader {
    * bytes behind the last chunk are Malformed.
    *
    * @param {Uint8Array} bytes the file from byte `offset` of it on, where this reader stands
-   * @returns {LayerSymbols | null}
+   * @returns {Slice | null}
    */
   next(bytes) {
     const start = this.offset;
@@ -135,13 +161,11 @@ export class LayerReader {
     const { offset, _index: index } = this;
     const listed = header.chunks[index];
     const chunk = readChunk(bytes, { listed, sceneId: header.sceneId, offset, index });
-    const undo = this._mark();
     let slice = null;
     try {
       if (listed.type < LAYER_TYPES) slice = this._readSlice(chunk, listed.type, header);
       else if (!chunk.ancillary) throw unsupported(`critical chunk of unknown type ${listed.type}`);
     } catch (error) {
-      undo();
       // What an engine says where it cannot allocate an array.
       const full = error instanceof RangeError && /allocation|array length|buffer length/i.test(error.message);
       const fault = full ? limitExceeded(`layer ${listed.type} takes more memory than there is`) : error;
@@ -153,190 +177,113 @@ export class LayerReader {
     return slice;
   }
 
-  /** A slice, which is added to its layer. Offsets in its faults count from the chunk.
-   * @param {ReturnType<typeof readChunk>} chunk @param {number} layer @param {Header} header */
+  /** A slice, which is added to its layer; if it is refused, nothing is: it may be fetched again. Offsets in its faults
+   * count from the chunk. @param {ReturnType<typeof readChunk>} chunk @param {number} layer @param {Header} header */
   _readSlice({ ancillary, more, number, payload }, layer, header) {
     if (ancillary) throw malformed(`layer ${layer} is flagged ancillary`);
     const latest = this._layers[this._layers.length - 1];
-    const later = latest?.layer === layer;
-    const expected = later ? latest.slices : 0;
+    const had = latest?.layer === layer ? latest : null;
     const next = this._following[this._index + 1];
     const flagged = (/** @type {string} */ reason) => new DecodeError("Malformed", reason, { offset: 2 });
-    if (number !== expected) throw flagged(`slice ${number}, expected ${expected}`);
+    if (number !== (had?.slices ?? 0)) throw flagged(`slice ${number}, expected ${had?.slices ?? 0}`);
     if (next !== null && more !== (next === layer)) {
       throw flagged(`layer ${layer} ${more ? "announces a further slice" : "ends"}, but layer ${next} follows`);
     }
-    const continuation = later ? latest.continuation : { positions: [], masks: [], attributes: [] };
-    const symbols = decodeLayer(payload, layerKind(layer, header), this._declared, continuation, later);
-    this._accept(symbols, continuation, later, header);
-    this._declared = symbols.parameters.declared;
-    this.count++;
-    return symbols;
+    const lists = had ? Object.values(had.priors) : [];
+    const lengths = lists.map(({ length }) => length);
+    try {
+      const before = { declared: this._declared, classes: this._classes.values, layer: had };
+      const slice = decodeSlice(payload, layer, header, before);
+      this._accept(slice, had, header);
+      return slice;
+    } catch (error) {
+      lists.forEach((list, i) => (list.length = lengths[i]));
+      throw error;
+    }
   }
 
-  /** The rules of 12.1 that need header and earlier slices, then dequantisation.
-   * @param {LayerSymbols} symbols @param {Continuation} continuation @param {boolean} later @param {Header} header */
-  _accept(symbols, continuation, later, header) {
-    const { kind, parameters, voxels, rises } = symbols;
-    const { steps, scales, networks, key } = parameters;
-    const where = `layer ${kind.layer}`;
-    const latest = this._layers[this._layers.length - 1];
-    const before = rises.length ? latest.codes.values : rises; // of a whole layer, in order
+  /** The rules of 12.1 that need earlier slices, dequantisation, the rules of kinds; then the slice is added.
+   * @param {Slice} slice @param {Layer | null} had its layer, null if this is the first slice @param {Header} header */
+  _accept(slice, had, header) {
+    const { layer: number, parameters, voxels, rises, stepClasses } = slice;
+    const own = slice.codes.length;
     const earlier = Uint8Array.from(rises);
+    const before = this._layers[this._layers.length - 1]?.codes.values; // of a whole layer, in order
     for (let i = 0; i < rises.length; i++) {
       const code = before[i] + rises[i];
-      if (code > MOST_CODE) throw malformed(`${where}: a mask code of ${code}, limit ${MOST_CODE}`);
+      if (code > MOST_CODE) throw malformed(`layer ${number}: a mask code of ${code}, limit ${MOST_CODE}`);
       earlier[i] = code;
     }
     this._checkVoxels(voxels);
-    const rows = { voxels, anchor: dequantise(voxels, header.info.voxelSize), ...attributesOf(symbols, header) };
-    const tensors = {
-      planes: symbols.planes.map((plane) => dequantise(plane, steps[0])),
-      weights: symbols.weights.map((weight) => dequantise(weight, steps[steps.length - 1])),
-    };
-    for (const number of steps.length ? kind.classes : []) {
-      if (!header.bounds.has(number)) throw malformed(`${where}: the header has no error bound of class ${number}`);
-    }
-    this._loose.push(voxels);
+    const rows = [voxels, dequantise(voxels, header.info.voxelSize), ...rowsOf(header.rows, slice.rows, own)];
+    if (stepClasses) rows.push(stepClasses);
+    const layerRows = rowsOf(parameters.layerRows, slice.layerRows, rises.length + own);
+    const layer = had ?? this._begun(slice);
+    if (!had) this._rules?.checkLayer(header, [...this._layers, layer]);
     const following = this._following[this._index + 1];
     const growth = following === null ? 1 : Math.max(1.5, 1.25 / this._share[this._index]);
-    if (!later) {
-      const codes = new Column(Uint8Array, 1);
-      codes.append(earlier, (growth * (earlier.length + symbols.codes.length)) / Math.max(1, earlier.length));
-      const none = { slices: 0, first: this._columns.voxels.rows, sorted: true };
-      this._layers.push({ layer: kind.layer, ...none, steps, scales, networks, key, tensors, codes, continuation });
-    }
-    const layer = this._layers[this._layers.length - 1];
+    for (const column of this._columns) column.reserve(own, growth);
+    for (const column of [layer.codes, ...layer.rows]) column.reserve(rises.length + own, growth);
+    // from here on nothing fails, but for want of memory to sort
+    if (!had) this._layers.push(layer);
+    this._columns.forEach((column, i) => column.append(rows[i]));
+    layer.rows.forEach((column, i) => column.append(layerRows[i]));
+    layer.codes.append(earlier);
+    layer.codes.append(slice.codes);
     layer.slices++;
-    layer.codes.append(symbols.codes, growth);
-    for (const [name, values] of Object.entries(rows)) this._columns[name].append(values, growth);
-    layer.sorted = !later || (layer.sorted && !voxels.length);
-    if (following !== kind.layer) this.sort(growth);
+    layer.sorted = !had || (layer.sorted && !voxels.length);
+    layer.fill = parameters.fill?.map((c) => c / 255) ?? header.info.background;
+    this._loose.push(voxels);
+    this._declared = parameters.declared;
+    this.count++;
+    if (following !== number) this.sort(growth);
   }
 
-  /** Returns a function that undoes a slice, of which a part may have been added: it may be fetched again. */
-  _mark() {
-    const latest = this._layers[this._layers.length - 1];
-    const lists = [this._layers, ...Object.values(latest?.continuation ?? {})];
-    const lengths = lists.map(({ length }) => length);
-    const columns = [...Object.values(this._columns), ...this._layers.map(({ codes }) => codes)];
-    const counts = columns.map(({ rows }) => rows);
-    const loose = [...this._loose];
-    return () => {
-      lists.forEach((list, i) => (list.length = lengths[i]));
-      columns.forEach((column, i) => (column.rows = counts[i]));
-      this._loose = loose;
-    };
+  /** A layer without rows. @param {Slice} slice its first @returns {Layer} */
+  _begun(slice) {
+    const { layer, parameters: { kind, layerRows: rowTensors }, priors } = slice;
+    const rows = rowTensors.map(({ channels }) => new Column(Float32Array, channels));
+    const made = { grids: gridsOf(slice), chains: chainsOf(slice), codes: new Column(Uint8Array, 1), rowTensors, rows };
+    return { layer, kind, ...made, fill: [], slices: 0, first: this._voxels.rows, sorted: true, priors };
   }
 
   /** Puts the rows of the latest layer in the order of 12.2. @param {number} [growth] as in Column */
   sort(growth = 1) {
     const layer = this._layers[this._layers.length - 1];
     if (!layer || layer.sorted) return;
-    const order = mortonOrder(this._columns.voxels.values.subarray(3 * layer.first));
-    for (const column of [...Object.values(this._columns), layer.codes]) column.reorder(layer.first, order, growth);
+    const order = mortonOrder(this._voxels.values.subarray(3 * layer.first));
+    for (const column of [...this._columns, layer.codes, ...layer.rows]) column.reorder(layer.first, order, growth);
     layer.sorted = true;
   }
 
   /** Malformed if an earlier slice has one of these voxels. @param {Int32Array} voxels of a slice, distinct */
   _checkVoxels(voxels) {
     if (!voxels.length) return;
-    for (const part of this._loose) this._voxels.add(part);
+    for (const part of this._loose) this._taken.add(part);
     this._loose = [];
     for (let i = 0; i < voxels.length; i += 3) {
       const x = voxels[i], y = voxels[i + 1], z = voxels[i + 2];
-      if (this._voxels.has(x, y, z)) throw malformed(`voxel ${x} ${y} ${z} holds more than one anchor`);
+      if (this._taken.has(x, y, z)) throw malformed(`voxel ${x} ${y} ${z} holds more than one anchor`);
     }
   }
 
   /**
-   * The scene of the slices read so far, at least one. Its arrays are views of those of later scenes, which leave these
-   * rows as they are; those of a layer that is not whole stand as they came, unless `sort` was called.
+   * The tensors of the slices read so far, at least one. Arrays of rows are views of those of later tensors, which leave
+   * these rows as they are; those of a layer that is not whole stand as they came, unless `sort` was called.
    *
-   * @returns {Scene}
+   * @returns {Tensors}
    */
-  scene() {
-    const header = this.header;
-    if (!header || !this._layers.length) throw new TypeError("no layer has been read");
-    const [first, ...later] = this._layers;
-    const [feature, scalingLog, offset] = header.steps;
-    /** @type {Steps} */
-    const steps = { feature, scalingLog, offset, weightsScaffold: first.steps[0] };
-    /** @type {(Deformation | null)[]} */
-    const deformations = [null, null];
-    for (const layer of later) {
-      const [ofPlanes, ofWeights] = layer.steps;
-      if (ofPlanes === undefined) continue;
-      deformations[layer.layer - 1] = { planes: planesOf(layer), networks: networksOf(layer), key: layer.key };
-      if (layer.layer === 1) Object.assign(steps, { planesGlobal: ofPlanes, weightsGlobal: ofWeights });
-      else Object.assign(steps, { planesLocal: ofPlanes, weightsLocal: ofWeights });
-    }
-    const { voxels, ...columns } = this._columns;
-    const masks = this._layers.map(({ codes }) => codes.values);
+  tensors() {
+    if (!this.header || !this._layers.length) throw new TypeError("no layer has been read");
     return {
-      info: header.info,
-      widths: header.widths,
-      steps,
-      layers: this._layers.map(({ layer }) => layer),
-      rows: masks.map(({ length }) => length),
-      anchorQ: voxels.values,
-      anchor: columns.anchor.values,
-      feature: columns.feature.values,
-      scalingLog: columns.scalingLog.values,
-      offset: columns.offset.values,
-      mask: masks,
-      networks: /** @type {Scene["networks"]} */ (networksOf(first)),
-      globalDeformation: deformations[0],
-      localDeformation: deformations[1],
+      header: this.header,
+      layers: this._layers.map(({ layer, codes, fill, grids, chains, kind, rowTensors, rows }) => {
+        const arrays = { codes: codes.values, rows: rows.map(({ values }) => values) };
+        return { layer, ...arrays, fill, grids, chains, kind, rowTensors };
+      }),
+      voxels: this._voxels.values,
+      positions: this._positions.values,
+      rows: this._rows.map(({ values }) => values),
     };
   }
-}
-
-/**
- * A layer as far as it has been read.
- *
- * @typedef {object} LayerParts
- * @property {number} layer
- * @property {number} slices read so far
- * @property {number[]} steps
- * @property {PlaneShape[][]} scales
- * @property {NetworkShape[]} networks
- * @property {number | null} key
- * @property {{planes: Float32Array[], weights: Float32Array[]}} tensors
- * @property {number} first row of its own
- * @property {boolean} sorted whether its rows are
- * @property {Column<Uint8Array>} codes of the mask, of all rows up to its own
- * @property {Continuation} continuation
- */
-
-/** The attributes of a slice's rows. @param {LayerSymbols} symbols @param {Header} header */
-function attributesOf({ kind, parameters: { rows }, stepClasses, attributes }, header) {
-  const { feature: D, slots: G } = kind.widths;
-  let first = 0;
-  const [feature, scalingLog, offset] = [D, 6, 3 * G].map((width, i) => {
-    const centres = header.centres?.slice(first, first + width);
-    const symbols = attributes.subarray(first * rows, (first += width) * rows);
-    return transposed(symbols, rows, width, header.steps[i], centres ? { centres, stepClasses } : null);
-  });
-  return { feature, scalingLog, offset };
-}
-
-/** @param {LayerParts} layer */
-function networksOf({ networks, tensors }) {
-  let at = 0;
-  /** @type {Record<string, Network>} */
-  const named = {};
-  for (const { name, layers } of networks) {
-    named[name] = layers.map((shape) => ({ ...shape, weight: tensors.weights[at++], bias: tensors.weights[at++] }));
-  }
-  return named;
-}
-
-/** @param {LayerParts} layer */
-function planesOf({ scales, tensors }) {
-  let at = 0;
-  return scales.map((scale) => {
-    const planes = scale.map(({ name, predictor, ...sizes }) => [name, { data: tensors.planes[at++], ...sizes }]);
-    return /** @type {Scale} */ (Object.fromEntries(planes));
-  });
 }

@@ -1,8 +1,9 @@
 // Clause 12.3: bytes as they arrive, to scenes.
 
+import { RULES, sceneOf } from "../kinds/index.js";
 import { DecodeError } from "./errors.js";
-import { LayerReader } from "./reader.js";
-/** @import { Scene } from "./scene.js" */
+import { TensorReader } from "./reader.js";
+/** @import { Scene } from "../kinds/index.js" */
 
 const SMALLEST_BUFFER = 1 << 16;
 
@@ -10,7 +11,7 @@ const SMALLEST_BUFFER = 1 << 16;
 export class Stream {
   /** @param {{maxLayer?: number | null}} [options] layers above maxLayer are not looked at */
   constructor({ maxLayer = null } = {}) {
-    this._reader = new LayerReader(maxLayer);
+    this._reader = new TensorReader(maxLayer, RULES);
     this._buffer = new Uint8Array(0);
     /** The bytes of the file from `consumed` on stand here in the buffer. */
     this._start = 0;
@@ -62,7 +63,7 @@ export class Stream {
     try {
       while (this._next()) {
         pending = !this._reader.whole;
-        if (!pending) scenes.push(this._reader.scene());
+        if (!pending) scenes.push(sceneOf(this._reader.tensors()));
       }
     } catch (error) {
       if (!(error instanceof DecodeError)) throw error;
@@ -72,7 +73,7 @@ export class Stream {
         if (!scenes.length && !pending) throw error;
       }
     }
-    if (pending) scenes.push(this._reader.scene());
+    if (pending) scenes.push(sceneOf(this._reader.tensors()));
     return scenes;
   }
 

@@ -20,13 +20,10 @@ export const T = /* @__PURE__ */ (() => {
 /** M of 7.3. */
 export const M = /* @__PURE__ */ Float64Array.from({ length: 64 }, (_, j) => Math.round(2 ** (31 - j / 64)));
 
-/**
- * The C(0..n-2) of 7.3: a Gaussian of mean mu8/256 and standard deviation 2^(si/64), in units of 2^-28.
- *
- * @param {number} n @param {number} mu8 @param {number} si -640..1280
- * @returns {Float64Array} [n - 1]
- */
-function distribution(n, mu8, si) {
+/** Mean mu8/256, standard deviation 2^(si/64), si -640..1280. @typedef {{mu8: number, si: number}} Normal */
+
+/** The C(0..n-2) of 7.3, in units of 2^-28. @param {number} n @param {Normal} normal @returns {Float64Array} [n - 1] */
+function distribution(n, { mu8, si }) {
   const out = new Float64Array(n - 1);
   const e = si >> 6;
   const narrow = Math.max(0, e - 8);
@@ -44,52 +41,45 @@ function distribution(n, mu8, si) {
   return out;
 }
 
-/** The table of a distribution function over n symbols. @param {Float64Array} c [n - 1] */
-function tableOf(c) {
-  const n = c.length + 1;
+/**
+ * NormTable, 7.3, or the table of a mixture of two Gaussians, 7.4.
+ *
+ * @param {number} n symbols @param {Normal} first @param {Normal} [second] @param {number} [weight] of the second in 256
+ * @returns {Int32Array} cum [n + 1]
+ */
+export function normTable(n, first, second, weight = 0) {
+  const c = distribution(n, first);
+  const other = second ? distribution(n, second) : c;
   const cum = new Int32Array(n + 1);
   const spread = TOTAL - n * FLOOR;
-  for (let q = 1; q < n; q++) cum[q] = Math.floor((c[q - 1] * spread) / 2 ** 28) + FLOOR * q;
+  for (let q = 1; q < n; q++) {
+    const mixed = Math.floor(((256 - weight) * c[q - 1] + weight * other[q - 1]) / 256);
+    cum[q] = Math.floor((mixed * spread) / 2 ** 28) + FLOOR * q;
+  }
   cum[n] = TOTAL;
   return cum;
-}
-
-/** NormTable, 7.3. @param {number} n @param {number} mu8 @param {number} si */
-export function normTable(n, mu8, si) {
-  return tableOf(distribution(n, mu8, si));
-}
-
-/**
- * A mixture of two Gaussians, 7.4.
- *
- * @param {number} n @param {{mu8: number, si: number}} first @param {{mu8: number, si: number}} second
- * @param {number} weight 1..255, of the second in 256
- */
-export function mixtureTable(n, first, second, weight) {
-  const c = distribution(n, first.mu8, first.si);
-  const other = distribution(n, second.mu8, second.si);
-  for (let k = 0; k < n - 1; k++) c[k] = Math.floor(((256 - weight) * c[k] + weight * other[k]) / 256);
-  return tableOf(c);
 }
 
 /** Bits of the state that select an entry of a table's index. */
 const INDEX_BITS = 9;
 export const INDEX_SHIFT = 24 - INDEX_BITS;
 
-/** A frequency table. index: the symbol at the first state of each value of the upper INDEX_BITS bits. */
-export class Table {
-  /** @param {Int32Array} cum [n + 1], 7.2 */
-  constructor(cum) {
+/** A frequency table for the symbols from kmin on. index: the entry at the first state of each value of the upper
+ * INDEX_BITS bits; the table of one symbol needs none. */
+export class Prior {
+  /** @param {number} kmin @param {Int32Array} [cum] [n + 1], 7.2, default: of one symbol */
+  constructor(kmin, cum = ONE) {
+    this.kmin = kmin;
+    this.n = cum.length - 1;
     this.cum = cum;
-    const index = new Uint16Array((1 << INDEX_BITS) + 1);
+    this.index = cum === ONE ? NONE : new Uint16Array((1 << INDEX_BITS) + 1).fill(this.n - 1);
+    if (cum === ONE) return;
     for (let bucket = 0, s = 0; bucket < 1 << INDEX_BITS; bucket++) {
       while (cum[s + 1] <= bucket << INDEX_SHIFT) s++;
-      index[bucket] = s;
+      this.index[bucket] = s;
     }
-    index[1 << INDEX_BITS] = cum.length - 2;
-    this.index = index;
   }
 }
 
-/** The table of one symbol. */
-export const CONSTANT = /* @__PURE__ */ new Table(Int32Array.of(0, TOTAL));
+const ONE = /* @__PURE__ */ Int32Array.of(0, TOTAL);
+const NONE = /* @__PURE__ */ new Uint16Array(0);

@@ -1,6 +1,7 @@
 // Cameras: pinhole, axes x right, y down, z forward, as the format has them.
 
-/** @import { Camera, Info, Scene } from "../decode/scene.js" */
+/** @import { Camera, Info } from "../decode/tensors.js" */
+/** @import { Scene } from "../kinds/index.js" */
 
 /** @typedef {[number, number, number]} Vector */
 

@@ -1,29 +1,32 @@
 // The evaluator without a GPU, in a worker: for machines that cannot render to float textures, for networks that
-// shaders do not take, and for other programs' renderers.
+// shaders do not take, for scenes of splats, and for other programs' renderers.
 
 import { Remote } from "./remote.js";
 import { WORKERS } from "./workers.js";
-/** @import { Scene } from "../decode/scene.js" */
-/** @import { State } from "./level.js" */
-
-/**
- * Gaussians as texels, [4, height, width, 4], of which the first `count` are filled: columns 4·b to 4·b + 3 of a record
- * in block b.
- *
- * @typedef {{count: number, data: Float32Array, width: number, height: number}} Packed
- */
+/** @import { Scene } from "../kinds/index.js" */
+/** @import { State, Texels } from "./level.js" */
 
 export class CpuEvaluator extends Remote {
   constructor() {
     super(WORKERS.evaluate);
     /** What the worker has. @type {Scene | null} */
     this._scene = null;
+    /** The data of the latest result. @type {Float32Array | null} */
+    this._data = null;
   }
 
-  /** @param {State} state @returns {Promise<Packed>} */
-  evaluate({ scene, level, t, eye }) {
+  /**
+   * The Gaussians of a state. The next call takes `data` back, so that memory stays as it is.
+   *
+   * @param {State} state @returns {Promise<Texels & {means: Float32Array}>} means: [count, 4], mean and opacity
+   */
+  async evaluate({ scene, level, t, eye }) {
     const next = scene === this._scene ? null : scene;
+    const { _data: spare } = this;
     this._scene = scene;
-    return this.call("evaluate", [level, t, eye, next]);
+    this._data = null;
+    const texels = await this.call("evaluate", [level, t, eye, next, spare], spare ? [spare.buffer] : []);
+    this._data = texels.data;
+    return texels;
   }
 }

@@ -1,12 +1,13 @@
-// Clauses 13.2 to 13.4 without a GPU: the Gaussians of a level at a time, for a camera's centre. For Spark, for
+// Clauses 13.3 and 13.4 without a GPU: the Gaussians of a level at a time, for a camera's centre. For Spark, for
 // machines whose GPU is missing or slow, and the reference of the evaluator on the GPU.
 
 import { Column } from "../decode/columns.js";
-import { anchorColumns } from "../decode/heads.js";
 import { Arena } from "./kernel.js";
 import { cellsOf, eachAttribute, GAUSSIAN_COLUMNS as COLUMNS, headsIn, levelOf } from "./level.js";
 import { MIN_OPACITY, SPATIAL, sliceAt } from "./level.js";
-/** @import { Deformation, Network, Scale, Scene } from "../decode/scene.js" */
+import { anchorColumns } from "./record.js";
+/** @import { Network } from "../decode/tensors.js" */
+/** @import { Deformation, Scale, AnchorScene } from "../kinds/index.js" */
 
 /**
  * The visible Gaussians in ascending order of their slot, anchor · slots + i. records: [count, GAUSSIAN_COLUMNS], all
@@ -87,12 +88,13 @@ class Sampler {
   }
 }
 
-/** Spatial planes with their channels last, by scale: levels share scales. @type {WeakMap<object, Sampler[]>} */
+/** Spatial planes with their channels last, by the first of a scale: levels share planes.
+ * @type {WeakMap<object, Sampler[]>} */
 const transposed = new WeakMap();
 
 /** @param {Scale} planes */
 function spatialPlanes(planes) {
-  let samplers = transposed.get(planes);
+  let samplers = transposed.get(planes.xy);
   if (!samplers) {
     samplers = SPATIAL.map(([name]) => {
       const { data, channels, height, width } = planes[name];
@@ -101,14 +103,14 @@ function spatialPlanes(planes) {
       for (let c = 0; c < channels; c++) for (let i = 0; i < cells; i++) out[i * channels + c] = data[c * cells + i];
       return new Sampler(out, width, height, channels);
     });
-    transposed.set(planes, samplers);
+    transposed.set(planes.xy, samplers);
   }
   return samplers;
 }
 
 /** A deformation in an arena: planes, trunk, and heads that add to anchors' records. */
 class Field {
-  /** @param {Arena} arena @param {Deformation} deformation @param {Scene} scene */
+  /** @param {Arena} arena @param {Deformation} deformation @param {AnchorScene} scene */
   constructor(arena, deformation, scene) {
     this._arena = arena;
     this._deformation = deformation;
@@ -119,7 +121,7 @@ class Field {
     this._channels = deformation.planes[0].xy.channels;
     this._width = this._channels * this._spatial.length;
     this._features = arena.take(BATCH * this._width);
-    this._trunk = new Chain(arena, deformation.networks.trunk, true);
+    this._trunk = new Chain(arena, deformation.trunk, true);
     this._stride = anchorColumns(scene.widths);
     this._heads = headsIn(deformation, scene).map(({ network, columns, unit }) => {
       return { chain: new Chain(arena, network), columns: Int32Array.from(columns), unit };
@@ -191,11 +193,12 @@ function normaliseQuaternion(q, at) {
   for (let k = 0; k < 4; k++) q[at + k] = norm > 0 ? q[at + k] / norm : k === 0 ? 1 : 0;
 }
 
-/** A deformation, and the attributes of the anchors to which it adds. @typedef {{field: Field, rest: Scene}} Motion */
+/** A deformation, and the attributes of the anchors to which it adds.
+ * @typedef {{field: Field, rest: AnchorScene}} Motion */
 
 /** A scene's networks in an arena, whose content they replace. */
 class Evaluator {
-  /** @param {Scene} scene @param {Arena} arena */
+  /** @param {AnchorScene} scene @param {Arena} arena */
   constructor(scene, arena) {
     arena.reset();
     this.scene = scene;
@@ -243,7 +246,7 @@ class Evaluator {
     return motion;
   }
 
-  /** The scene with its attributes without F(x, t*). @param {Field} field @param {number} key t* @returns {Scene} */
+  /** The scene with its attributes without F(x, t*). @param {Field} field @param {number} key t* @returns {AnchorScene} */
   _withoutStill(field, key) {
     const { scene, _anchors: records, _anchorStride: wide } = this;
     const attributes = [scene.anchor, scene.feature, scene.offset, scene.scalingLog];
@@ -356,7 +359,7 @@ let current = null;
 /**
  * The Gaussians of a level.
  *
- * @param {Scene} scene @param {number} level 0, 1 or 2 @param {number} t normalised time
+ * @param {AnchorScene} scene @param {number} level 0, 1 or 2 @param {number} t normalised time
  * @param {number[]} eye the camera's centre, scene units
  * @param {Arena} [arena] to work in, which is then the thread's; by default one is made
  * @returns {Gaussians}

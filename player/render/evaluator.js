@@ -1,16 +1,17 @@
-// Clauses 13.2 to 13.4 on the GPU, as fragment passes into float textures.
+// Clauses 13.3 and 13.4 on the GPU, as fragment passes into float textures.
 //
 // Per anchor, when time changes: the deformation; the features' share of the scaffold's first layers. Per anchor, when
 // the camera's centre changes: opacities. They tell which Gaussians are visible, about a fifth of all, and only these
 // are evaluated further, when time or the camera's centre changes. Opacities and shapes that do not take the view
 // direction change with time alone.
 
-import { anchorColumns } from "../decode/heads.js";
 import { FieldPass } from "./field.js";
 import { blocksOf, Linear, pack, repeat, targets, TooLarge } from "./layers.js";
 import { eachAttribute, GAUSSIAN_COLUMNS, levelOf } from "./level.js";
+import { anchorColumns } from "./record.js";
 import { ANCHOR_BITS, NO_ENTRY } from "./sort.js";
-/** @import { Deformation, Network, Scene } from "../decode/scene.js" */
+/** @import { Network } from "../decode/tensors.js" */
+/** @import { Deformation, AnchorScene } from "../kinds/index.js" */
 /** @import { Field, Gpu } from "./gl.js" */
 /** @import { List, Lister } from "./sort.js" */
 
@@ -102,7 +103,7 @@ export class GpuEvaluator {
   /**
    * Throws TooLarge where the scene's networks or planes are larger than shaders take.
    *
-   * @param {Gpu} gpu @param {Scene} scene
+   * @param {Gpu} gpu @param {AnchorScene} scene
    */
   constructor(gpu, scene) {
     this._gpu = gpu;

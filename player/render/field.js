@@ -1,9 +1,10 @@
 // A deformation on the GPU: planes, trunk and heads at points that lie in a texture.
 
-import { anchorColumns } from "../decode/heads.js";
 import { blocksOf, Linear, repeat, targets, TooLarge } from "./layers.js";
 import { cellsOf, headsIn, sliceAt, SPATIAL } from "./level.js";
-/** @import { Deformation, Network, Scale, Scene } from "../decode/scene.js" */
+import { anchorColumns } from "./record.js";
+/** @import { Network } from "../decode/tensors.js" */
+/** @import { Deformation, Scale, AnchorScene } from "../kinds/index.js" */
 /** @import { Field, Gpu } from "./gl.js" */
 
 /** Source of the functions that sample planes. */
@@ -25,7 +26,7 @@ vec4 row(int y, int a, int b, float f, int z) {
 `;
 
 export class FieldPass {
-  /** @param {Gpu} gpu @param {Deformation} deformation @param {Scene} scene */
+  /** @param {Gpu} gpu @param {Deformation} deformation @param {AnchorScene} scene */
   constructor(gpu, deformation, scene) {
     this._gpu = gpu;
     this._deformation = deformation;
@@ -33,7 +34,7 @@ export class FieldPass {
     const { channels } = deformation.planes[0].xy;
     this._scales = deformation.planes.length;
     this._channelBlocks = blocksOf(channels);
-    const { trunk } = deformation.networks;
+    const { trunk } = deformation;
     // a scale's channels are padded to whole blocks; so are the columns that take them
     const first = padInputs(trunk[0], channels, this._scales);
     const layers = [first, ...trunk.slice(1), joinHeads(deformation, scene)];
@@ -215,7 +216,7 @@ function padInputs(layer, channels, scales) {
 /**
  * All heads as one layer, whose outputs are the columns of an anchor's record.
  *
- * @param {Deformation} deformation @param {Scene} scene
+ * @param {Deformation} deformation @param {AnchorScene} scene
  * @returns {Network[number]}
  */
 function joinHeads(deformation, scene) {

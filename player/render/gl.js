@@ -142,11 +142,14 @@ export class Gpu {
     return this.field(width, height, blocks, null, format);
   }
 
-  /** Overwrites a field of floats. @param {Field} field @param {Float32Array} data [blocks, height, width, 4] */
-  write({ texture, width, height, blocks }, data) {
+  /** Overwrites the first `rows` rows of a field of floats. @param {Field} field @param {Float32Array} data [blocks,
+   * height, width, 4] @param {number} [rows] default: all */
+  write({ texture, width, height, blocks }, data, rows = height) {
     const { gl } = this;
     gl.bindTexture(gl.TEXTURE_2D_ARRAY, texture);
-    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, 0, width, height, blocks, gl.RGBA, gl.FLOAT, data);
+    gl.pixelStorei(gl.UNPACK_IMAGE_HEIGHT, height);
+    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, 0, width, rows, blocks, gl.RGBA, gl.FLOAT, data);
+    gl.pixelStorei(gl.UNPACK_IMAGE_HEIGHT, 0);
   }
 
   /**

@@ -1,7 +1,7 @@
 // Linear layers as shader source and uniform blocks. A fragment computes four outputs per target, so weights are stored
 // as 4 × 4 matrices: block b of the outputs takes block k of the inputs through matrix b · K + k.
 
-/** @import { Network } from "../decode/scene.js" */
+/** @import { Network } from "../decode/tensors.js" */
 /** @import { Field, Gpu } from "./gl.js" */
 
 /** Matrices of one shader, about: compilers unroll them, and take longer than in proportion. */

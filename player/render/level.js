@@ -1,40 +1,43 @@
-// The parts of a scene that a level shows (clause 13.4), in the forms that both evaluators take.
+// The parts of a scene that a level shows (clauses 13.4 and 13.6), in the forms that both evaluators take.
 
-import { columnsOf, headsOf } from "../decode/heads.js";
-/** @import { Deformation, Scale, Scene } from "../decode/scene.js" */
+import { columnsOf, quantitiesOf } from "./record.js";
+/** @import { AnchorScene, Deformation, Scale, Scene } from "../kinds/index.js" */
 
 /**
  * One level of a scene: the highest layer that is there and at most the requested one. It has the first `rows` anchors.
- * codes: their gates times 255. motion: what moves them, the planes of all layers up to this one with the networks and
- * the key instant of the highest that has a deformation; null if none has one, else the same object at every call.
+ * codes: their gates times 255. fill: the colour behind the Gaussians. motion: what moves it, null if nothing does.
  *
- * @typedef {{number: number, rows: number, codes: Uint8Array, motion: Deformation | null}} Level
+ * @template {Scene} S
+ * @typedef {{number: number, rows: number, codes: Uint8Array, fill: number[], motion: S["motion"][number]}} Level
  */
-
-/** Of scenes with two deformations, that of layer 2. @type {WeakMap<Scene, Deformation>} */
-const motions = new WeakMap();
 
 /** Columns of a Gaussian's record: mean and opacity; scale, 0; quaternion w x y z; colour, 0. In scene units. */
 export const GAUSSIAN_COLUMNS = 16;
 
+/**
+ * Gaussians as texels, [4, height, width, 4], of which the first `count` are filled: columns 4·b to 4·b + 3 of a record
+ * in block b.
+ *
+ * @typedef {{count: number, data: Float32Array, width: number, height: number}} Texels
+ */
+
+/** Room for Gaussians. @param {number} most @param {Float32Array | null} spare data of others, to take if it fits
+ * @returns {Texels} */
+export function texelsFor(most, spare) {
+  const width = 2 ** Math.max(4, Math.ceil(Math.log2(Math.sqrt(most + 1))));
+  const height = Math.max(1, Math.ceil(most / width));
+  const length = GAUSSIAN_COLUMNS * width * height;
+  return { count: 0, data: spare?.length === length ? spare : new Float32Array(length), width, height };
+}
+
 /** Lower opacities never reach a pixel: a picture has 255 steps. */
 export const MIN_OPACITY = 1 / 255;
 
-/** @param {Scene} scene @param {number} level 0, 1 or 2 @returns {Level} */
+/** @template {Scene} S @param {S} scene @param {number} level 0, 1 or 2 @returns {Level<S>} */
 export function levelOf(scene, level) {
   const i = scene.layers.filter((layer) => layer <= level).length - 1;
-  const number = scene.layers[i];
-  return { number, rows: scene.rows[i], codes: scene.mask[i], motion: motionOf(scene, number) };
-}
-
-/** @param {Scene} scene @param {number} level */
-function motionOf(scene, level) {
-  const lower = level >= 1 ? scene.globalDeformation : null;
-  const upper = level >= 2 ? scene.localDeformation : null;
-  if (!lower || !upper) return upper ?? lower;
-  let motion = motions.get(scene);
-  if (!motion) motions.set(scene, (motion = { ...upper, planes: [...lower.planes, ...upper.planes] }));
-  return motion;
+  const { layers, rows, mask, fill, motion } = scene;
+  return { number: layers[i], rows: rows[i], codes: mask[i], fill: fill[i], motion: motion[i] };
 }
 
 /** The unit of the head position: a quarter of the longest side of the box, scene units. @param {Scene} scene */
@@ -43,27 +46,23 @@ export function deformationUnit({ info: { box } }) {
 }
 
 /** The heads that a deformation has, with the columns of an anchor's record that they add to, and the unit of their
- * outputs. @param {Deformation} deformation @param {Scene} scene */
-export function headsIn({ networks }, scene) {
+ * outputs. @param {Deformation} deformation @param {AnchorScene} scene */
+export function headsIn({ heads }, scene) {
   const unit = deformationUnit(scene);
-  const heads = headsOf(scene.widths).filter(({ name }) => networks[name]);
-  return heads.map((head) => {
-    return { network: networks[head.name], columns: columnsOf(head), unit: head.length ? unit : 1 };
+  return quantitiesOf(scene.widths).flatMap((quantity, i) => {
+    const network = heads[i];
+    return network ? [{ network, columns: columnsOf(quantity), unit: quantity.length ? unit : 1 }] : [];
   });
 }
 
 /**
  * Calls `put` for each attribute of the anchors.
  *
- * @param {Scene} scene @param {(values: Float32Array, width: number, columns: number[]) => void} put values: [anchors,
- * width]. columns: those of an anchor's record that take them
+ * @param {AnchorScene} scene @param {(values: Float32Array, width: number, columns: number[]) => void} put values:
+ * [anchors, width]. columns: those of an anchor's record that take them
  */
 export function eachAttribute(scene, put) {
-  const sources = { position: scene.anchor, feature: scene.feature, offset: scene.offset, scaling: scene.scalingLog };
-  for (const head of headsOf(scene.widths)) {
-    const values = sources[/** @type {keyof typeof sources} */ (head.name)];
-    put(values, head.outputs, columnsOf(head));
-  }
+  for (const quantity of quantitiesOf(scene.widths)) put(scene[quantity.values], quantity.outputs, columnsOf(quantity));
 }
 
 /** Planes without time, and their two axes. */
@@ -109,13 +108,14 @@ const EYE_TOLERANCE = 1e-5;
 /**
  * @param {Scene} scene @param {number} level the highest to show @param {number} seconds of the scene's time
  * @param {number[]} eye the camera's centre, scene units
- * @returns {State} with a time only where something moves
+ * @returns {State} with a time only where something moves, and a centre only where colours or shapes depend on it
  */
 export function stateOf(scene, level, seconds, eye) {
   const { number, motion } = levelOf(scene, level);
   const [start, end] = scene.info.timeRange;
-  const t = (seconds - start) / (end - start); // clause 13.1; no number where the range is empty
-  return { scene, level: number, t: motion && t > 0 ? Math.min(t, 1) : 0, eye };
+  const t = (seconds - start) / (end - start); // clause 13.4; no number where the range is empty
+  const sees = scene.kind === "splats" ? scene.harmonics : scene.widths.views;
+  return { scene, level: number, t: motion && t > 0 ? Math.min(t, 1) : 0, eye: sees ? eye : [0, 0, 0] };
 }
 
 /** @param {State} a @param {State} b */

@@ -2,7 +2,7 @@
 
 import { SceneSource } from "../decode/fetch.js";
 import { serve, tell } from "./remote.js";
-/** @import { Scene } from "../decode/scene.js" */
+/** @import { Scene } from "../kinds/index.js" */
 
 /** Between two messages about progress, milliseconds. */
 const PROGRESS_MS = 100;
@@ -13,7 +13,7 @@ const REST = 4;
  * A message while a scene loads. arrived and decoded: milliseconds since the epoch.
  *
  * @typedef {object} News
- * @property {import("../decode/scene.js").Scene} [scene]
+ * @property {import("../kinds/index.js").Scene} [scene]
  * @property {number} arrived when the last byte of the scene came
  * @property {number} decoded when it was decoded
  * @property {number} bytes
@@ -63,26 +63,40 @@ function flush() {
   const start = performance.now();
   const { scene, ...times } = newest;
   newest = null;
-  report(own(scene), times);
+  /** @type {Transferable[]} */
+  const transfer = [];
+  report(own(scene, transfer), transfer, times);
   const now = performance.now();
   free = now + REST * (now - start);
 }
 
-/** The scene with arrays of its rows that are its own, where messages copy all that a view is a part of.
- * @param {Scene} scene */
-function own(scene) {
-  const { anchorQ, anchor, feature, scalingLog, offset } = scene;
-  const columns = Object.entries({ anchorQ, anchor, feature, scalingLog, offset });
-  const copies = Object.fromEntries(columns.map(([name, values]) => [name, values.slice()]));
-  return { ...scene, ...copies, mask: scene.mask.map((codes) => codes.slice()) };
+/** The scene with arrays that are its own, where messages copy all that a view is a part of; their buffers go to
+ * `transfer`. @param {Scene} scene @param {Transferable[]} transfer @returns {Scene} */
+function own(scene, transfer) {
+  /** @type {Map<object, any>} */
+  const made = new Map(); // levels share what moves them
+  /** @param {any} value @returns {any} */
+  const copy = (value) => {
+    if (typeof value !== "object" || value === null) return value;
+    if (!made.has(value)) made.set(value, anew(value));
+    return made.get(value);
+  };
+  /** @param {any} value */
+  const anew = (value) => {
+    if (Array.isArray(value)) return value.map(copy);
+    if (!ArrayBuffer.isView(value)) return Object.fromEntries(Object.entries(value).map(([k, part]) => [k, copy(part)]));
+    const whole = value.byteLength === value.buffer.byteLength;
+    const part = whole ? value : /** @type {Float32Array} */ (value).slice();
+    if (!whole) transfer.push(part.buffer);
+    return part;
+  };
+  return copy(scene);
 }
 
-/** @param {Scene} [scene] whose rows the page takes over @param {{arrived: number, decoded: number}} [times] */
-function report(scene, times = { arrived, decoded: epochNow() }) {
+/** @param {Scene} [scene] @param {Transferable[]} [transfer] of it @param {{arrived: number, decoded: number}} [times] */
+function report(scene, transfer, times = { arrived, decoded: epochNow() }) {
   const { received: bytes, total, decoder } = source;
-  const rows = scene ? [scene.anchorQ, scene.anchor, scene.feature, scene.scalingLog, scene.offset, ...scene.mask] : [];
-  const news = { ...(scene && { scene }), bytes, total, ends: decoder.layerEnds, ...times };
-  tell({ told: news }, rows.map(({ buffer }) => buffer));
+  tell({ told: { ...(scene && { scene }), bytes, total, ends: decoder.layerEnds, ...times } }, transfer);
   told = performance.now();
 }
 

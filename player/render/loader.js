@@ -2,7 +2,7 @@
 
 import { Remote } from "./remote.js";
 import { WORKERS } from "./workers.js";
-/** @import { Scene } from "../decode/scene.js" */
+/** @import { Scene } from "../kinds/index.js" */
 /** @import { News } from "./loader-worker.js" */
 
 /**

@@ -2,7 +2,8 @@
 
 import { centreOf, cross, downOf, dot, forwardOf, goesOn, lookAlong, magnification } from "./camera.js";
 import { middleOf, plus, project, turn, unit } from "./camera.js";
-/** @import { Camera, Scene } from "../decode/scene.js" */
+/** @import { Camera } from "../decode/tensors.js" */
+/** @import { Scene } from "../kinds/index.js" */
 /** @import { Vector } from "./camera.js" */
 /** @import { Player } from "./player.js" */
 

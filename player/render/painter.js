@@ -1,7 +1,7 @@
 // Clause 13.5: Gaussians as quads, blended back to front in display space.
 
 import { MIN_OPACITY } from "./level.js";
-/** @import { Camera } from "../decode/scene.js" */
+/** @import { Camera } from "../decode/tensors.js" */
 /** @import { Splats } from "./evaluator.js" */
 /** @import { Field, Gpu } from "./gl.js" */
 

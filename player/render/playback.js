@@ -5,7 +5,7 @@ import { centreOf } from "./camera.js";
 import { CpuEvaluator } from "./cpu.js";
 import { levelOf, sameState, stateOf } from "./level.js";
 import { Clip } from "./loader.js";
-/** @import { Camera } from "../decode/scene.js" */
+/** @import { Camera } from "../decode/tensors.js" */
 /** @import { State } from "./level.js" */
 
 /**
@@ -19,10 +19,10 @@ import { Clip } from "./loader.js";
 
 /**
  * The Gaussians of a state, each array [count, 4]: mean and opacity; scales, scene units; quaternions w x y z; colours,
- * RGB in display space. All are finite and can be seen.
+ * RGB in display space. All are finite and can be seen. fill: the colour behind them, RGB.
  *
  * @typedef {{count: number, means: Float32Array, scales: Float32Array, quaternions: Float32Array,
- *   colors: Float32Array}} Gaussians
+ *   colors: Float32Array, fill: number[]}} Gaussians
  */
 
 /**
@@ -73,6 +73,12 @@ export class Playback extends Clip {
       this._resolve = () => resolve(this);
       this._reject = reject;
     });
+  }
+
+  /** The colour behind the Gaussians that the renderer has, or will have first, RGB. */
+  get fill() {
+    const { scene, level } = this._shown ?? { scene: this._sceneThere(), level: this.level ?? Infinity };
+    return levelOf(scene, level).fill;
   }
 
   /** The layers that have arrived. */
@@ -139,7 +145,8 @@ export class Playback extends Clip {
         if (this.closed) return;
         const at = data.length / 4;
         const [means, scales, quaternions, colors] = [0, 1, 2, 3].map((b) => data.subarray(b * at, b * at + 4 * count));
-        await this._fill({ count, means, scales, quaternions, colors });
+        const { fill } = levelOf(state.scene, state.level);
+        await this._fill({ count, means, scales, quaternions, colors, fill });
         if (this.closed) return;
         this._tell(state, count);
         this._shown = state;

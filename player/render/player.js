@@ -10,7 +10,8 @@ import { Pace } from "./pace.js";
 import { Painter } from "./painter.js";
 import { Remote } from "./remote.js";
 import { WORKERS } from "./workers.js";
-/** @import { Camera, Scene } from "../decode/scene.js" */
+/** @import { Camera } from "../decode/tensors.js" */
+/** @import { AnchorScene, Scene } from "../kinds/index.js" */
 /** @import { Evaluated, Splats } from "./evaluator.js" */
 /** @import { State } from "./level.js" */
 
@@ -500,7 +501,7 @@ export class Player extends Clip {
   _onCpu(gpu, scene) {
     const { evaluator } = this._options;
     const few = gpu.software && scene.anchor.length <= 3 * SOFTWARE_ANCHORS;
-    return evaluator === "cpu" || this._unfit || !gpu.floats || (few && evaluator !== "gpu");
+    return scene.kind === "splats" || evaluator === "cpu" || this._unfit || !gpu.floats || (few && evaluator !== "gpu");
   }
 
   /** @param {Gpu} gpu @param {State} state @param {Splats | null} into what may be overwritten
@@ -514,12 +515,12 @@ export class Player extends Clip {
     }
     if (onCpu) {
       this._cpu ??= new CpuEvaluator();
-      const { count, data, width, height } = await this._cpu.evaluate(state);
+      const { count, data, means, width, height } = await this._cpu.evaluate(state);
       const field = gpu.renewed(into?.field, width, height, SPLAT_BLOCKS);
-      gpu.write(field, data);
-      return { splats: { field }, means: data.slice(0, 4 * count) };
+      gpu.write(field, data, Math.ceil(count / width));
+      return { splats: { field }, means };
     }
-    this._evaluator ??= new GpuEvaluator(gpu, scene);
+    this._evaluator ??= new GpuEvaluator(gpu, /** @type {AnchorScene} */ (scene));
     return this._evaluator.evaluate(level, t, eye, into, (opacities, ...rest) =>
       this._sorter.call("list", [opacities, ...rest], [opacities.buffer]),
     );
@@ -604,9 +605,9 @@ export class Player extends Clip {
   _draw(eyes, target) {
     const { camera, _painter: painter, _front: front } = this;
     if (!camera || !painter || !front) return false;
-    const { info } = front.state.scene;
+    const { scene, level } = front.state;
     const views = eyes ?? [fitted(camera, this.canvas.width, this.canvas.height, this.fit)];
-    painter.draw(front.splats, views, info.background, info.near, target);
+    painter.draw(front.splats, views, levelOf(scene, level).fill, scene.info.near, target);
     return true;
   }
 

@@ -1,7 +1,7 @@
 // A player in a headset (WebXR): a picture for each eye, of Gaussians that are evaluated and sorted for the head.
 
 import { centreOf, dot, forwardOf, lookAlong, middleOf, plus, unit } from "./camera.js";
-/** @import { Camera, Info } from "../decode/scene.js" */
+/** @import { Camera, Info } from "../decode/tensors.js" */
 /** @import { Player } from "./player.js" */
 
 /** Metres from the head to the middle of a scene whose unit is unknown. */

@@ -7,6 +7,7 @@ import { GpuEvaluator } from "../render/evaluator.js";
 import { Gpu } from "../render/gl.js";
 import { ANCHOR_BITS, listGaussians, NO_ENTRY } from "../render/sort.js";
 import { base64, cameraOf } from "./pictures.js";
+/** @import { AnchorScene } from "../kinds/index.js" */
 
 /** Columns of a Gaussian's record. */
 const QUANTITIES = { mean: [0, 1, 2], opacity: [3], scale: [4, 5, 6], quaternion: [8, 9, 10, 11], color: [12, 13, 14] };
@@ -19,7 +20,7 @@ const QUANTITIES = { mean: [0, 1, 2], opacity: [3], scale: [4, 5, 6], quaternion
  * @param {string} url @param {{level: number, t: number, eye: number[]}[]} cases @param {number} bandPoints
  */
 async function compare(url, cases, bandPoints) {
-  const scene = decode(await (await fetch(url)).arrayBuffer());
+  const scene = /** @type {AnchorScene} */ (decode(await (await fetch(url)).arrayBuffer()));
   const canvas = document.createElement("canvas");
   const gl = /** @type {WebGL2RenderingContext} */ (canvas.getContext("webgl2"));
   const gpu = new Gpu(gl);

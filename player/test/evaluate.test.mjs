@@ -3,13 +3,12 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { decode } from "../decode/index.js";
 import { fitted } from "../render/camera.js";
 import { evaluate } from "../render/evaluate.js";
 import { Arena } from "../render/kernel.js";
 import { Pace, SCALES } from "../render/pace.js";
 import { DepthSort, listGaussians } from "../render/sort.js";
-import { readVector } from "../testing/vectors.mjs";
+import { readScaffold } from "../testing/vectors.mjs";
 
 /** Numbers in -1..1 that are the same in every run. @param {number} count */
 function numbers(count) {
@@ -62,7 +61,7 @@ test("a value that is no number stays none", () => {
 });
 
 test("both evaluate a scene alike, at every level", () => {
-  const scene = decode(readVector("valid/layers-0-1-2"));
+  const scene = readScaffold("valid/layers-0-1-2");
   for (const level of scene.layers) {
     const [fast, plain] = [true, false].map((wasm) => evaluate(scene, level, 0.4, [0, 0, -3], new Arena(wasm)));
     assert.ok(fast.count > 0);
@@ -74,13 +73,14 @@ test("both evaluate a scene alike, at every level", () => {
 
 for (const [name, key] of /** @type {[string, number][]} */ ([["least", 0], ["largest", 1]])) {
   test(`layer 1 changes nothing at its key instant, the ${name}`, () => {
-    const file = decode(readVector(`uncommon/key-instant-${name}`));
+    const file = readScaffold(`uncommon/key-instant-${name}`);
     const rows = file.rows.map(() => file.anchor.length / 3); // the levels have the same anchors
     const scene = { ...file, rows, mask: rows.map((count) => new Uint8Array(count).fill(255)) };
-    for (const { data } of scene.globalDeformation?.planes.flatMap((planes) => Object.values(planes)) ?? []) {
+    const motion = scene.motion[1];
+    for (const { data } of motion?.planes.flatMap((planes) => Object.values(planes)) ?? []) {
       data.set(numbers(data.length).map((v) => 1 + v)); // and layer 1 moves them
     }
-    scene.globalDeformation?.networks.trunk[0].bias.fill(1);
+    motion?.trunk[0].bias.fill(1);
     const [still, same, other] = [[0, 0.4], [1, key], [1, 0.4]].map(([level, t]) => {
       return evaluate(scene, level, t, [0, 0, -3]).records;
     });

@@ -8,7 +8,7 @@ import { crc32 as zlibCrc32 } from "node:zlib";
 
 import { AnsDecoder } from "../decode/ans.js";
 import { crc32, hex, sha256 } from "../decode/digests.js";
-import { M, T, Table, mixtureTable, normTable } from "../decode/tables.js";
+import { M, Prior, T, normTable } from "../decode/tables.js";
 
 const TEXT = readFileSync(new URL("../../spec/format.md", import.meta.url), "utf8");
 
@@ -37,9 +37,9 @@ test("T and M are those of appendix B, far from where rounding could turn", () =
 
 test("NormTable gives the table of 7.3", () => {
   const [, numbers] = /** @type {RegExpExecArray} */ (
-    /Check: n = 7, mu8 = 832, si = 0 gives ([\d, ]+), 2\^24\./.exec(TEXT)
+    /Check:\s+n = 7, mu8 = 832, si = 0 gives ([\d, ]+), 2\^24\./.exec(TEXT)
   );
-  assert.deepEqual([...normTable(7, 832, 0)], [...numbers.split(", ").map(Number), 2 ** 24]);
+  assert.deepEqual([...normTable(7, { mu8: 832, si: 0 })], [...numbers.split(", ").map(Number), 2 ** 24]);
 });
 
 test("tables ascend strictly from 0 to 2^24", () => {
@@ -51,8 +51,8 @@ test("tables ascend strictly from 0 to 2^24", () => {
       si: Math.floor(draw() * 1921) - 640,
     });
     const first = normal();
-    const mixed = mixtureTable(n, first, normal(), 1 + Math.floor(draw() * 255));
-    for (const cum of [normTable(n, first.mu8, first.si), mixed]) {
+    const mixed = normTable(n, first, normal(), 1 + Math.floor(draw() * 255));
+    for (const cum of [normTable(n, first), mixed]) {
       assert.equal(cum.length, n + 1);
       assert.equal(cum[0], 0);
       assert.equal(cum[n], 2 ** 24);
@@ -68,7 +68,8 @@ test("ANS decodes as the recurrence of 7.5 does in whole numbers", () => {
     if (words.length) words[0] = Math.max(words[0], 1);
     const bytes = new Uint8Array(Uint32Array.from(words).buffer);
     const n = 2 + Math.floor(draw() * (round % 2 ? 4000 : 30));
-    const cum = normTable(n, 128 * n, Math.floor(draw() * 800) - 200);
+    const cum = normTable(n, { mu8: 128 * n, si: Math.floor(draw() * 800) - 200 });
+    const kmin = Math.floor(draw() * 100) - 50;
     let x = 0n;
     let at = 0;
     const refill = () => {
@@ -82,14 +83,15 @@ test("ANS decodes as the recurrence of 7.5 does in whole numbers", () => {
     const stream = new AnsDecoder(bytes);
     const count = 50 + words.length * 2;
     const symbols = new Int32Array(count);
-    stream.symbols(new Table(cum), symbols, 0, count);
-    for (const s of symbols) {
+    stream.symbols(new Prior(kmin, cum), symbols, 0, count);
+    for (const symbol of symbols) {
+      const s = symbol - kmin;
       const q = Number(x & 0xffffffn);
       assert.ok(cum[s] <= q && q < cum[s + 1]);
       step(cum[s], cum[s + 1]);
     }
     const numbers = new Int32Array(10);
-    stream.symbols(new Table(Int32Array.from({ length: 33 }, (_, i) => i << 19)), numbers, 0, 10);
+    stream.symbols(new Prior(0, Int32Array.from({ length: 33 }, (_, i) => i << 19)), numbers, 0, 10);
     for (const number of numbers) {
       assert.equal(number, Number(x & 0xffffffn) >> 19);
       step(number << 19, (number + 1) << 19);

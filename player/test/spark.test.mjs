@@ -7,7 +7,7 @@ import "../testing/threads.mjs";
 import { decode } from "../decode/index.js";
 import { evaluate } from "../render/evaluate.js";
 import { Pd4Splats } from "../spark.js";
-import { addressOf, readVector } from "../testing/vectors.mjs";
+import { addressOf, readScaffold, readVector } from "../testing/vectors.mjs";
 
 const BYTES = readVector("valid/layers-0-1-2");
 const ADDRESS = addressOf(BYTES);
@@ -115,7 +115,7 @@ const detailOf = (target, name) =>
 
 /** What the mesh must hold. @param {number} level @param {number} t @param {number[]} eye */
 function expected(level, t, eye) {
-  const { count, records } = evaluate(decode(BYTES), level, t, eye);
+  const { count, records } = evaluate(readScaffold("valid/layers-0-1-2"), level, t, eye);
   return Array.from({ length: count }, (_, i) => {
     const g = Array.from(records.subarray(16 * i, 16 * i + 16));
     return [...g.slice(0, 3), ...g.slice(4, 7), ...g.slice(8, 12), g[3], ...g.slice(12, 15)];

@@ -1,19 +1,32 @@
 // Decodes the file that each line on stdin holds as base64, for programs that compare, and answers with a line of JSON:
-// {"hashes": [...]}, {"error": kind, "message", "offset", "chunk"}, or {"crash": stack} of any other exception.
+// {"hashes": [...], "scene": null} where tensors and scene decode, with "scene": {"error": kind, "message", "offset",
+// "chunk"} where the tensors alone do; else {"error": kind, ...}, or {"crash": stack} of any other exception.
 
 import { createInterface } from "node:readline";
 
-import { DecodeError, hashes } from "../decode/index.js";
+import { DecodeError, decode, hashes } from "../decode/index.js";
+
+/** The fault of a function as the answer has it, or null. @param {() => void} run */
+function faultOf(run) {
+  try {
+    run();
+  } catch (error) {
+    if (!(error instanceof DecodeError)) throw error;
+    const { kind, message, offset, chunk } = error;
+    return { error: kind, message, offset, chunk };
+  }
+  return null;
+}
 
 for await (const line of createInterface({ input: process.stdin })) {
+  const bytes = Buffer.from(line, "base64");
   let answer;
   try {
-    answer = { hashes: hashes(Buffer.from(line, "base64")) };
+    /** @type {object} */
+    let found = {};
+    answer = faultOf(() => (found = { hashes: hashes(bytes) })) ?? { ...found, scene: faultOf(() => decode(bytes)) };
   } catch (error) {
-    if (error instanceof DecodeError) {
-      const { kind, message, offset, chunk } = error;
-      answer = { error: kind, message, offset, chunk };
-    } else answer = { crash: error instanceof Error ? error.stack : String(error) };
+    answer = { crash: error instanceof Error ? error.stack : String(error) };
   }
   process.stdout.write(JSON.stringify(answer) + "\n");
 }

@@ -22,7 +22,7 @@ function clock() {
 
 /** @param {Scene[]} scenes */
 function held(scenes) {
-  const arrays = scenes.flatMap((s) => [s.anchorQ, s.anchor, s.feature, s.scalingLog, s.offset, ...s.mask]);
+  const arrays = scenes.flatMap((s) => [...Object.values(s), ...s.mask].filter((values) => ArrayBuffer.isView(values)));
   return [...new Set(arrays.map(({ buffer }) => buffer))].reduce((sum, { byteLength }) => sum + byteLength, 0);
 }
 

@@ -3,18 +3,19 @@
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 
-import { openStream } from "../decode/index.js";
+import { decode, openStream } from "../decode/index.js";
 
 const FOLDER = new URL("../../spec/vectors/", import.meta.url);
 
 /**
- * error: the expected kind, null if the file decodes. layers: the hashes of all layers that decode. slices: the layer
- * of each slice that decodes.
+ * error: the expected kind, null if the tensors decode. scene: that of making a scene of them, null if one is made.
+ * layers: the hashes of all layers that decode. slices: the layer of each slice that decodes.
  *
  * @typedef {object} Vector
  * @property {string} file
  * @property {Uint8Array} bytes
  * @property {string | null} error
+ * @property {string | null} scene
  * @property {number | null} chunk
  * @property {number | null} offset null if it is not fixed
  * @property {import("../decode/hashes.js").LayerHashes[]} layers
@@ -25,19 +26,26 @@ const FOLDER = new URL("../../spec/vectors/", import.meta.url);
 export function readVectors() {
   const manifest = JSON.parse(readFileSync(new URL("manifest.json", FOLDER), "utf8"));
   return manifest.vectors.map((/** @type {any} */ row) => {
-    const { file, error = null, chunk = null, offset = null, layers } = row;
+    const { file, error = null, scene = null, chunk = null, offset = null, layers } = row;
     const bytes = new Uint8Array(readFileSync(new URL(file, FOLDER)));
     if (row.ans_only === "UnsupportedFeature") {
-      return { file, bytes, error: row.ans_only, chunk: null, offset: null, layers: [], slices: [] };
+      return { file, bytes, error: row.ans_only, scene: null, chunk: null, offset: null, layers: [], slices: [] };
     }
     const slices = row.slices ?? layers.map((/** @type {{layer: number}} */ { layer }) => layer);
-    return { file, bytes, error, chunk, offset, layers, slices };
+    return { file, bytes, error, scene, chunk, offset, layers, slices };
   });
 }
 
 /** One vector's bytes. @param {string} name without the ending */
 export function readVector(name) {
   return new Uint8Array(readFileSync(new URL(`${name}.pd4`, FOLDER)));
+}
+
+/** The scene of a vector that is a scaffold. @param {string} name */
+export function readScaffold(name) {
+  const scene = decode(readVector(name));
+  assert.ok(scene.kind === "scaffold");
+  return scene;
 }
 
 /** Each slice's layer with its end in a whole file. @param {Uint8Array} bytes */

@@ -1,10 +1,12 @@
 """encode, decode and info, as their users call them."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from strategies import make_scene
+from tiny import disc
 
 from pd4dgs_codec.cli import options
 from pd4dgs_codec.format.decoder import decode
@@ -106,7 +108,7 @@ def test_partial_input_exits_3_only_when_allowed(cli, scene_pd4, tmp_path):
 def test_info_states_layers_and_first_frame(cli, scene_pd4):
     result = cli("info", scene_pd4, "--json", "--check", "--at", "500k,2M,1G,1e9,64k")
     report, size = result.json, scene_pd4.stat().st_size
-    assert report["format_version"] == "3.0" and report["bytes"] == size and report["checked"] is True
+    assert report["format_version"] == "4.0" and report["bytes"] == size and report["checked"] is True
     assert report["layers"][-1]["end"] == size
     end = report["layers"][0]["end"]
     rates = {"500k": 5e5, "2M": 2e6, "1G": 1e9, "1e9": 1e9, "64k": 64e3}
@@ -133,7 +135,7 @@ def test_info_tells_where_the_bytes_are(cli, scene_pd4):
     assert f"{rows['attributes']['bytes']:,}" in text and "share" in text
     assert "parts" not in cli("info", scene_pd4, "--json").json
     cut = cli("info", "-", "--bytes", stdin=scene_pd4.read_bytes()[: report["layers"][1]["end"] - 1])
-    assert cut.code == 1 and "layer 1 is truncated" in cut.err
+    assert cut.code == 1 and "truncated in a chunk" in cut.err
 
 
 def test_metadata_is_written_shown_and_kept(cli, scene_pd4, tmp_path):
@@ -184,9 +186,17 @@ def test_max_bytes_and_a_truncated_file_stop_at_a_slice(cli, tmp_path):
 
 
 def test_a_file_says_where_the_0_of_a_moved_scene_lies(cli, model_pt, tmp_path):
-    moved, out = tmp_path / "moved.pt", tmp_path / "m.pd4"
-    checkpoint.save(moved, checkpoint.load(model_pt)[0], {"place": "0 is 465000, 5243000, 0 of the data"})
-    for given, said in (((), ""), (("--source", "a square"), "a square; ")):
-        assert cli("encode", moved, "-o", out, "-f", "--effort", 1, *given).code == 0
-        told = cli("info", out, "--json").json["metadata"]["source"]
-        assert told == f"{said}0 is 465000, 5243000, 0 of the data"
+    moved, out, again = tmp_path / "moved.pt", tmp_path / "m.pd4", tmp_path / "again.pd4"
+    shift, mine = (465000.0, 5243000.0, 0.0), ("--source", "a square")
+    place = replace(disc(), shift=shift).place
+    assert place == "0 is 465000, 5243000, 0 of the data"
+    checkpoint.save(moved, checkpoint.load(model_pt)[0], {"place": place})
+    for source, file, given, told in (
+        (moved, out, mine, f"a square; {place}"),
+        (moved, out, (), place),
+        (out, again, (), place),
+        (out, again, mine, f"a square; {place}"),  # encoded again
+        (again, out, ("--source", "a park"), f"a park; {place}"),
+    ):
+        assert cli("encode", source, "-o", file, "-f", "--effort", 1, *given).code == 0
+        assert cli("info", file, "--json").json["metadata"]["source"] == told

@@ -19,7 +19,7 @@ def _count(path) -> int:
 
 def test_one_instant_as_ply(cli, scene_pd4, tmp_path):
     out = tmp_path / "scene.ply"
-    command = ("export", scene_pd4, "-o", out, "--sh", 1, "--refine", 2, "--json")
+    command = ("export", scene_pd4, "-o", out, "--sh", 1, "--json")
     result = cli(*command, "--time", 0.5)
     assert result.code == 0, result.err
     assert result.json["gaussians"] == _count(out) > 20 and result.json["bytes"] == out.stat().st_size
@@ -31,24 +31,16 @@ def test_one_instant_as_ply(cli, scene_pd4, tmp_path):
     assert cli(*command, "--time", 0, "-f", "--level", 0, "-v").json["level"] == 0
 
 
-def test_gaussians_whose_colours_alone_depend_on_the_view_are_not_refined(cli, scene, tmp_path):
-    file = tmp_path / "scene.pd4"
-    file.write_bytes(encode(sighted(scene, "color"), effort=1))
-    assert cli("info", file, "--json").json["view_dependent"] == ["color"]
-    result = cli("export", file, "-o", tmp_path / "scene.ply", "--to", "ply", "--json")
-    assert result.json["refine"] == 0 and result.json["gaussians"] > 20
-
-
 def test_a_level_that_the_file_lacks_is_told(cli, scene, tmp_path):
     file = tmp_path / "still.pd4"
     file.write_bytes(encode(scene.prefix(0), effort=1))
-    done = cli("export", file, "-o", tmp_path / "a.ply", "--to", "ply", "--refine", 0, "--sh", 0, "--level", 2)
+    done = cli("export", file, "-o", tmp_path / "a.ply", "--to", "ply", "--sh", 0, "--level", 2)
     assert done.code == 0 and "a.ply: level 0, " in done.err
 
 
 def test_the_whole_time_as_a_folder_of_plys(cli, scene_pd4, tmp_path):
     out = tmp_path / "frames"
-    command = ("export", scene_pd4, "-o", out, "--to", "ply-seq", "--sh", 1, "--refine", 0, "--json")
+    command = ("export", scene_pd4, "-o", out, "--to", "ply-seq", "--sh", 1, "--json")
     result = cli(*command, "--fps", 2)  # the scene takes two seconds
     assert result.code == 0, result.err
     frames = sorted(out.iterdir())
@@ -60,13 +52,39 @@ def test_the_whole_time_as_a_folder_of_plys(cli, scene_pd4, tmp_path):
     assert sorted(path.name for path in out.iterdir()) == ["00000.ply", "00001.ply", "00002.ply"]
 
 
+def faint(scene, bias: float):
+    """The scene with lower opacities."""
+    *rest, (weight, offset) = scene.networks["opacity"]
+    return sighted(replace(scene, networks=scene.networks | {"opacity": (*rest, (weight, offset - bias))}))
+
+
+def test_a_frame_may_be_empty_but_not_all(cli, scene, tmp_path):
+    fourdgs = pytest.importorskip("fourdgs")
+    file, frames, moving = tmp_path / "scene.pd4", tmp_path / "frames", tmp_path / "scene.4dgs"
+    file.write_bytes(encode(faint(scene, 2.8), effort=1))
+    seen = [1, 0, 1, 1, 1]
+    for out, kind in ((frames, "ply-seq"), (moving, "4dgs")):
+        result = cli("export", file, "-o", out, "--to", kind, "--fps", 2, "--sh", 1, "--json")
+        assert result.code == 0 and result.json["frames"] == 5 and result.json["gaussians"] == 1, result.err
+    assert [_count(path) for path in sorted(frames.iterdir())] == seen
+    state_at = fourdgs.read(moving.read_bytes()).state_at
+    assert [len(state_at(i / 2)["indices"]) for i in range(5)] == seen
+
+    result = cli("export", file, "-o", tmp_path / "a.ply", "--time", 0.25)
+    assert result.code == 1 and "has no visible Gaussians at this level and this time, expected some" in result.err
+    file.write_bytes(encode(faint(scene, 9), effort=1))
+    for kind in ("ply-seq", "4dgs"):
+        result = cli("export", file, "-o", tmp_path / "none", "--to", kind, "--fps", 2)
+        assert result.code == 1 and "at this level and any time" in result.err and not (tmp_path / "none").exists()
+
+
 def test_the_number_of_frames_is_limited(scene):
     with pytest.raises(DataError, match="10000 seconds at 30 frames per second are 300001 frames, expected at most"):
         frame_times(replace(scene.info, time_range=(0.0, 1e4)), 30.0)
 
 
 def test_the_cost_is_printed(cli, scene_pd4, shared_dataset, tmp_path):
-    command = ("export", scene_pd4, "--to", "ply", "--refine", 0, "--sh", 0)
+    command = ("export", scene_pd4, "--to", "ply", "--sh", 0)
     result = cli(*command, "-o", tmp_path / "a.ply", "--data", shared_dataset, "--compare", shared_dataset, "--json")
     assert result.code == 0, result.err
     cost = result.json["cost"]
@@ -81,6 +99,6 @@ def test_other_kinds(cli, scene_pd4, tmp_path, kind):
         pytest.importorskip({"spz": "gaussforge", "4dgs": "fourdgs"}[kind])
     out = tmp_path / f"scene.{kind}"
     options = ("--fps", 2) if kind == "4dgs" else ("--time", 1)
-    result = cli("export", scene_pd4, "-o", out, "--refine", 0, "--json", *options)
+    result = cli("export", scene_pd4, "-o", out, "--json", *options)
     assert result.code == 0, result.err
     assert result.json["bytes"] == out.stat().st_size > 100

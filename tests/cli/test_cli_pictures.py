@@ -96,7 +96,7 @@ def test_truth_and_scene_have_the_background_of_the_file_or_the_option(cli, scen
     if given:
         behind, options = (0.0, 0.6, 1.0), [*options, "--background", given]
     (view,), level = load(str(transparent)).test, load_levels(file, 0)[-1]
-    level.model.info = replace(level.model.info, background=behind)
+    level.model.background = behind
     truth = np.broadcast_to(np.float32(behind), (HEIGHT, WIDTH, 3))
     expected = mpsnr(level.picture(view.camera, view.time), truth)
     assert cli("eval", file, transparent, *options).json["levels"][0]["mpsnr"] == pytest.approx(expected)

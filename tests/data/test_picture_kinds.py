@@ -1,7 +1,9 @@
 """Every pixel format of picture files is converted to sRGB or refused."""
 
 import io
+import random
 import struct
+import warnings
 import zlib
 from pathlib import Path
 
@@ -9,8 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image, ImageCms
 from PIL.PngImagePlugin import PngInfo
+from test_data_fuzz import damage_bytes
 
-from pd4dgs_codec.data.files import read_image
+from pd4dgs_codec.data.files import image_info, read_image, read_mask
 from pd4dgs_codec.errors import DataError
 
 RAMP = np.arange(256, dtype=np.uint8).reshape(16, 16)
@@ -155,3 +158,36 @@ def test_refused_kinds(tmp_path, name):
     with pytest.raises(DataError, match=f"{name}: .*{says}") as caught:
         read_image(tmp_path / name, (16, 16))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("compression", ["tiff_lzw", "tiff_adobe_deflate"])
+def test_a_damaged_tiff_is_one_line_and_none_of_libtiff(tmp_path, compression, capfd):
+    stream, path = io.BytesIO(), tmp_path / "a.tif"
+    Image.fromarray(COLOUR).save(stream, "tiff", compression=compression)
+    raw = bytearray(stream.getvalue())
+    raw[12:20] = b"\xff" * 8  # the pixels start at 8
+    path.write_bytes(raw)
+    for read in (read_image, read_mask):
+        with pytest.raises(DataError, match="(image|mask) data is broken: ") as caught:
+            read(path, (16, 16))
+        assert "\n" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize("kind", ["png", "jpeg", "webp", "bmp", "tiff"])
+def test_damaged_pictures_and_masks_are_read_or_refused_in_one_line(tmp_path, kind, capfd):
+    stream, path = io.BytesIO(), tmp_path / "a.bin"
+    Image.fromarray(COLOUR).save(stream, kind, **({"compression": "tiff_lzw"} if kind == "tiff" else {}))
+    whole, refused = stream.getvalue(), 0
+    for seed in range(150):
+        path.write_bytes(damage_bytes(whole, random.Random(seed)))
+        try:
+            with warnings.catch_warnings():  # as readers of folders do
+                warnings.simplefilter("ignore")
+                size = image_info(path)[:2]
+                assert read_image(path, size).shape == (*size[::-1], 3)
+                assert read_mask(path, size).shape == size[::-1]
+        except DataError as error:
+            assert str(path) in str(error) and "\n" not in str(error) and len(str(error)) < 300
+            refused += 1
+    assert refused > 20 and capfd.readouterr() == ("", "")

@@ -1,26 +1,32 @@
 """Inputs as users have them, made by the scripts of a folder `cases` beside the shared data, are read well."""
 
+import os
 import re
 import subprocess
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from http.server import ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import pytest
+from browser import ELEMENT, TIMEOUT_MS, launched, until
 from common import ROOT, SHARED
 from PIL import Image
-from strategies import assert_same_scene
+from strategies import assert_same_scene, make_scene
 
-from pd4dgs_codec import decode
+from pd4dgs_codec import decode, encode
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DamageWarning, DataError, Pd4Error
 from pd4dgs_codec.interchange.splats import read_splats
 from pd4dgs_codec.web.client import SceneClient
+from pd4dgs_codec.web.page import page
+from pd4dgs_codec.web.server import Server
 
 CASES = SHARED.parent / "cases"
 pytestmark = pytest.mark.skipif(not CASES.is_dir(), reason=f"{CASES} is not there (set PD4DGS_SHARED)")
@@ -116,7 +122,7 @@ REFUSED = {
     "list_in_vertex.ply": "unknown vertex property 'list uchar int neighbours', expected a scalar",
     "empty.ply": "none of 0 Gaussians is finite",
     "cut.ply": "40600 bytes of vertices, expected 41600",
-    "packed.ksplat": "is of no known kind, expected a PLY, SPZ, .splat or .4dgs file or a checkpoint of gsplat",
+    "packed.ksplat": "is a .ksplat file, expected a PLY, SPZ, .splat or .4dgs file or a checkpoint of gsplat",
 }
 DEGREE_0 = {"degree0.ply", "rgb.ply", "packed.splat"}
 
@@ -171,23 +177,31 @@ def test_15_names_are_found_or_named(made):
         assert len({view.time for view in data.train}) == (5 if place.name == "rig" else 10)
 
 
-@pytest.fixture(scope="module")
-def server() -> Iterator[tuple[str, bytes]]:
-    """The URL of the server of cases, and the file of 5 kB that it serves; lengths at which it cuts fit this size."""
-    file = ROOT / "spec" / "vectors" / "valid" / "lzma-two-deformations.pd4"
-    text = (CASES / "server.py").read_text()
-    for there, here in (("CAP = 20000", "CAP = 900"), ("[:30000]", "[:1500]"), ("[:50000]", "[:2600]")):
-        assert there in text
-        text = text.replace(there, here)
+@contextmanager
+def serving(file: Path) -> Iterator[str]:
+    """The URL of the server of cases, which serves a file; lengths at which it cuts fit the file's size."""
+    text, size = (CASES / "server.py").read_text(), file.stat().st_size
+    for there, length in (("CAP = {}", 20_000), ("[:{}]", 30_000), ("[:{}]", 50_000)):
+        assert there.format(length) in text
+        text = text.replace(there.format(length), there.format(length * size // 100_000))
     module: dict[str, Any] = {"__name__": "server"}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sys, "argv", ["server.py", str(file)])
         exec(compile(text, "server.py", "exec"), module)
     with ThreadingHTTPServer(("127.0.0.1", 0), module["H"]) as served:
         served.daemon_threads = True
+        served.handle_error = lambda *_: None  # of clients that have left
         threading.Thread(target=served.serve_forever, daemon=True).start()
-        yield f"http://127.0.0.1:{served.server_port}", file.read_bytes()
+        yield f"http://127.0.0.1:{served.server_port}"
         served.shutdown()
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[tuple[str, bytes]]:
+    """The URL of the server of cases, and the file of 5 kB that it serves."""
+    file = ROOT / "spec" / "vectors" / "valid" / "lzma-two-deformations.pd4"
+    with serving(file) as url:
+        yield url, file.read_bytes()
 
 
 SIGNED = "signed/a?X-Amz-Credential=AKIA%2F20251129%2Feu%2Fs3&sig=a%2Bb%3D"
@@ -218,3 +232,39 @@ def test_what_is_no_file_is_one_line(server, path, says):
     with SceneClient(f"{server[0]}/{path}", stall=2) as client, pytest.raises(Pd4Error, match=says) as error:
         list(client.scenes())
     assert "\n" not in str(error.value)
+
+
+@pytest.fixture(scope="module")
+def player(tmp_path_factory) -> Iterator[tuple[Any, str, str]]:
+    """A browser, the URL of the player's page, and that of the server of cases, which serves a scene of 18 kB."""
+    folder = tmp_path_factory.mktemp("player")
+    (folder / "index.html").write_text(page())
+    (folder / "a.pd4").write_bytes(encode(make_scene(7, anchors=250, kind="gaussian", extent=20), layers=2, effort=1))
+    try:
+        with launched() as browser, Server(folder) as own, own.running(), serving(folder / "a.pd4") as url:
+            context = browser.new_context(viewport={"width": 160, "height": 120})
+            context.set_default_timeout(TIMEOUT_MS)
+            yield context, own.url, url
+    except DataError as error:
+        (pytest.fail if os.environ.get("PD4DGS_REQUIRE_BROWSER") == "1" else pytest.skip)(str(error))
+
+
+#: What the player says in Chromium, which unpacks gzip by itself. Of an answer that is cut at once, a browser may lose
+#: all, so that the player gives up.
+SAYS = {
+    "spa/a": "not a .pd4 file: it begins with 3c21646f63",
+    "signed/a?sig=1": "answered 403",
+    "weak/cut": "no connection",
+}
+
+
+@pytest.mark.parametrize("path", [*WHOLE, SIGNED, "gzip/a", "gzipslow/a", "shifted/a", "spa/a", "signed/a?sig=1"])
+def test_the_player_plays_from_such_servers_or_says_why_not(player, path):
+    context, page_url, url = player
+    tab = context.new_page()
+    tab.goto(f"{page_url}?src={quote(f'{url}/{path}', safe='')}")
+    alert = f"{ELEMENT}.shadowRoot?.querySelector('[role=alert]').innerText"
+    until(tab, f"{ELEMENT}.player?.status.level === 2 || {alert}")
+    told = tab.evaluate(alert)
+    assert (SAYS[path] in told and "\n" not in told) if told else path not in ("spa/a", "signed/a?sig=1")
+    tab.close()

@@ -19,6 +19,7 @@ from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.model.model import from_scene
 from pd4dgs_codec.model.picture import render_image
+from pd4dgs_codec.quality.levels import level_of
 from pd4dgs_codec.scene import SCAFFOLD_NETWORKS, Camera, Deformation, Scene, Widths, instant
 
 KEYED = {"key": 40_000}
@@ -135,9 +136,16 @@ def test_where_shapes_do_not_take_the_direction_another_eye_evaluates_colours_al
 
 
 def test_scenes_without_gaussians_in_view_show_the_background():
-    scene = _scene()
-    picture = Player(scene).picture(camera_ahead(-1000.0, 40.0, 48, 36), 0.5)
-    np.testing.assert_array_equal(picture, np.broadcast_to(np.float32(scene.info.background), picture.shape))
+    """That of an incomplete file's level is its fill."""
+    scene, camera = replace(_scene(), fills=((51, 0, 255), None, None)), camera_ahead(-1000.0, 40.0, 48, 36)
+    for level, background in ((0, (0.2, 0.0, 1.0)), (1, scene.info.background), (2, scene.info.background)):
+        for picture in (
+            Player(scene.prefix(level)).picture(camera, 0.5),
+            render_image(from_scene(scene), level, 0.5, camera),
+            level_of(scene.prefix(level)).picture(camera, 0.5),
+        ):
+            np.testing.assert_array_equal(picture, np.broadcast_to(np.float32(background), picture.shape))
+        assert level_of(scene.prefix(level)).background == background
 
 
 def test_features_that_overflow_hide_their_gaussians():

@@ -268,7 +268,7 @@ VIEW = camera(40, 30)
     ],
 )
 def test_extreme_values_give_finite_pictures_and_gradients(name, value):
-    """Beside the values that `pd4dgs-bench stability` holds against the oracle."""
+    """Beside the values that `tests/stability` holds against the oracle."""
     found = draw_with_gradients(with_values(name, value), VIEW, "cpu", near_plane=NEAR)
     assert all(torch.isfinite(tensor).all() for key, tensor in found.items() if key != "meta")
     assert torch.isfinite(found["meta"]["means2d"]).all()

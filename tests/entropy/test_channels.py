@@ -1,4 +1,4 @@
-"""Channels <-> payload: round trips, size against the model rate, and bounds of tables."""
+"""Channels <-> codes and stream: round trips, size against the model rate, and bounds of tables."""
 
 import math
 
@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import assert_same_symbols
+from strategies import assert_same_symbols, coded, decoded
 
-from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
-from pd4dgs_codec.entropy.priors import FREE_ENTRIES, K_MAX, MAX_WINDOW, Const, Gauss, Mixture
+from pd4dgs_codec.entropy.channels import ChannelReader, ChannelWriter, split
+from pd4dgs_codec.entropy.priors import FREE_ENTRIES, K_MAX, MAX_WINDOW, MORE_ENTRIES, Const, Gauss, Mixture
 from pd4dgs_codec.entropy.varint import put_varint
 from pd4dgs_codec.errors import EncodeError, LimitExceeded
 
@@ -39,11 +39,10 @@ def prior_ids(known):
 def test_round_trip_and_best_is_never_a_word_larger(channels, effort):
     counts, sizes = [len(c) for c in channels], []
     for priors in ("gauss", "best"):
-        coded = encode_channels(channels, priors=priors, effort=effort, known=(known := []))
-        assert_same_symbols(decode_channels(coded.payload, counts), channels)
-        assert coded.payload_bits == 8 * len(coded.payload)
+        codes, stream = coded(channels, known := [], priors=priors, effort=effort)
+        assert_same_symbols(decoded(codes, stream, counts), channels)
         assert priors == "best" or prior_ids(known) <= {Const.id, Gauss.id}
-        sizes.append(len(coded.payload))
+        sizes.append(len(codes) + len(stream))
     assert sizes[1] < sizes[0] + 4  # it costs fewer bits, but the stream has whole words of four bytes
 
 
@@ -66,25 +65,33 @@ def mixed_channels(rows=15_000, channels=24):
     return out
 
 
+def bits_of(channels):
+    writer = ChannelWriter()
+    writer.write(channels, [])
+    return writer.finish()[2][0]
+
+
 def test_gaussian_data_costs_its_model_rate():
-    channels = gaussian_channels()
-    gauss = encode_channels(channels, priors="gauss")
-    assert 0.99 < gauss.payload_bits / gauss.rate_bits <= 1.002
-    assert_same_symbols(decode_channels(gauss.payload, [len(c) for c in channels]), channels)
+    writer, channels = ChannelWriter("gauss"), gaussian_channels()
+    rate_bits = writer.write(channels, [])
+    codes, stream, (bits,) = writer.finish()
+    assert 0.99 < bits / rate_bits <= 1.002
+    assert 0 <= 8 * (len(codes) + len(stream)) - bits < 32
+    assert_same_symbols(decoded(codes, stream, [len(c) for c in channels]), channels)
 
 
 def test_mixed_data_costs_less_than_its_model_rate():
-    coded = encode_channels(mixed_channels(), known=(known := []))
-    assert coded.payload_bits <= 0.96 * coded.rate_bits
+    writer = ChannelWriter()
+    rate_bits = writer.write(mixed_channels(), known := [])
+    assert writer.finish()[2][0] <= 0.96 * rate_bits
     assert Mixture.id in prior_ids(known)
 
 
 def test_small_similar_channels_share_a_prior():
     rng = np.random.default_rng(2)
     channels = [np.rint(rng.laplace(0, 1.5, 300)).astype(np.int32) for _ in range(40)]
-    shared, alone = encode_channels(channels), [encode_channels([c]) for c in channels]
-    apart = sum(c.payload_bits for c in alone) - 32 * len(channels)  # each has a stream of its own
-    assert shared.payload_bits < 0.98 * apart
+    shared, alone = bits_of(channels), [bits_of([c]) for c in channels]
+    assert shared < 0.98 * sum(alone)
 
 
 def test_outliers_are_listed_rather_than_widening_the_table():
@@ -92,8 +99,7 @@ def test_outliers_are_listed_rather_than_widening_the_table():
     plain = np.rint(rng.normal(0, 2, 4000)).astype(np.int32)
     wild = plain.copy()
     wild[[5, 2000, 3999]] = (-9_000_000, 4_000_000, 8_000_000)
-    extra = encode_channels([wild]).payload_bits - encode_channels([plain]).payload_bits
-    assert 0 < extra <= 8 * 24
+    assert 0 < bits_of([wild]) - bits_of([plain]) <= 8 * 24
 
 
 @pytest.mark.parametrize(
@@ -101,10 +107,10 @@ def test_outliers_are_listed_rather_than_widening_the_table():
 )
 def test_the_encoder_refuses(bad):
     with pytest.raises(EncodeError):
-        encode_channels([bad])
+        coded([bad])
     for options in ({"priors": "laplace"}, {"effort": 0}, {"effort": 10}):
         with pytest.raises(EncodeError):
-            encode_channels([], **options)
+            ChannelWriter(**options)
 
 
 def payload_of(*numbers: int) -> bytes:
@@ -114,16 +120,16 @@ def payload_of(*numbers: int) -> bytes:
     return bytes(out)
 
 
-def test_tables_of_a_section_are_bounded():
-    """Eight bytes define a table of 128 KiB; a section of 86 kB once took 1.6 GB."""
+def test_tables_of_a_slice_are_bounded():
+    """Eight bytes define a table of 128 KiB; 86 kB of them once took 1.6 GB."""
     wide = payload_of(2, 0, MAX_WINDOW - 2, 0, 1280)
-    most = FREE_ENTRIES // MAX_WINDOW
-    assert len(decode_channels(wide * most, [1] * most)) == most
-    with pytest.raises(LimitExceeded, match="entries"):
-        decode_channels(wide * (most + 1), [1] * (most + 1))
-    for count in (-1, (1 << 26) + 1, 10**11):
-        with pytest.raises(LimitExceeded):
-            decode_channels(b"\0\0", [count])
+    for later, free in ((False, FREE_ENTRIES), (True, MORE_ENTRIES)):
+        most = free // MAX_WINDOW
+        codes = wide * most + payload_of(2, 0, free % MAX_WINDOW + most - 1, 0, 1280)
+        reader = ChannelReader(codes + payload_of(0, 0), b"", most + 1, later)
+        assert reader.read([1] * (most + 1), []).size == most + 1
+        with pytest.raises(LimitExceeded, match=f"tables of {free + most + 2} entries in one slice"):
+            reader.read([1], [])
 
 
 def test_wide_channels_share_a_table_rather_than_pass_the_limit():
@@ -131,5 +137,23 @@ def test_wide_channels_share_a_table_rather_than_pass_the_limit():
     centres = rng.integers(-(2**23), 2**23, FREE_ENTRIES // MAX_WINDOW + 20)
     narrow = np.array([0, 1, 1, 2, 5], np.int32)
     channels = [narrow, *((c + rng.integers(-8000, 8000, 40)).astype(np.int32) for c in centres)]
-    coded = encode_channels(channels, effort=1)
-    assert_same_symbols(decode_channels(coded.payload, [len(c) for c in channels]), channels)
+    codes, stream = coded(channels, effort=1)
+    assert_same_symbols(decoded(codes, stream, [len(c) for c in channels]), channels)
+
+
+def test_all_batches_of_a_slice_keep_within_the_limit():
+    """However many entries the batches before have used, and in a later slice, where few are free."""
+    rng = np.random.default_rng(7)
+    batches = [[(rng.integers(-8000, 8000, 3)).astype(np.int32) for _ in range(30)] for _ in range(8)]
+    for later in (False, True):
+        writer = ChannelWriter(effort=1, later=later)
+        lists = [[], [], []]
+        for i, batch in enumerate(batches):
+            writer.write(batch, lists[i % 3])
+        codes, stream, bits = writer.finish()
+        assert len(bits) == 8 and 0 <= 8 * (len(codes) + len(stream)) - sum(bits) < 32
+        reader = ChannelReader(codes, stream, 8 * 90, later)
+        lists = [[], [], []]
+        for i, batch in enumerate(batches):
+            assert_same_symbols(split(reader.read([3] * 30, lists[i % 3]), [3] * 30), batch)
+        reader.finish()

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from strategies import coded
 
 from pd4dgs_codec.entropy import channels, fit_kernels, fitting
-from pd4dgs_codec.entropy.channels import encode_channels
 from pd4dgs_codec.entropy.fitting import fit_best, histogram, pool
 from pd4dgs_codec.entropy.priors import BIT
 
@@ -56,11 +56,11 @@ def test_fits_are_the_same_without_numba(interpreted):
         np.testing.assert_equal(fit_kernels.mixture(dense, 5), interpreted.mixture(dense, 5))
 
 
-def test_payloads_are_the_same_without_numba(interpreted, monkeypatch):
+def test_bytes_are_the_same_without_numba(interpreted, monkeypatch):
     channels = [symbols.astype(np.int32) for symbols in CHANNELS]
-    payload = encode_channels(channels, effort=3).payload
+    found = coded(channels, effort=3)
     monkeypatch.setattr(fitting, "loops", lambda: interpreted)
-    assert encode_channels(channels, effort=3).payload == payload
+    assert coded(channels, effort=3) == found
 
 
 def test_a_gaussian_is_as_cheap_as_its_neighbours():

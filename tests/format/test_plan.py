@@ -10,7 +10,7 @@ from strategies import make_scene
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format import encoder
 from pd4dgs_codec.format.decoder import decode
-from pd4dgs_codec.format.registry import LAYER_KINDS
+from pd4dgs_codec.kinds import NAMES
 from pd4dgs_codec.scene import HEADS, PLANES, Deformation, Widths
 
 encode, encode_with_report = (partial(f, effort=1) for f in (encoder.encode, encoder.encode_with_report))
@@ -62,7 +62,7 @@ def test_layers_go_with_their_deformation_and_the_highest_masks_stay(given_value
         assert active_codes(got, index) == active_codes(scene, layer)
     gone = {row["what"]: row for row in report.left_out}
     for layer, value in ((1, given_values[0]), (2, given_values[1])):
-        name = LAYER_KINDS[layer].name
+        name = NAMES[layer]
         assert (name in gone) == (value == 1e-8)
         if name in gone:
             assert gone[name]["bytes"] > 50 and "zero" in gone[name]["why"]
@@ -80,18 +80,18 @@ def test_a_layer_1_whose_planes_layer_2_reads_keeps_them_and_one_head(value):
     assert len(heads) == len(HEADS) - 1 and set(heads) <= {row["what"] for row in report.left_out}
 
 
-def test_a_layer_1_below_a_layer_2_needs_a_head():
+def test_a_deformation_needs_a_head():
     scene = scene_with(1.0, 1.0)
     field = scene.global_deformation
     without = replace(field, networks={"trunk": field.networks["trunk"]})
-    with pytest.raises(EncodeError, match="global_deformation has no head"):
+    with pytest.raises(EncodeError, match=r"chains \[0\], expected 0 \(trunk\) and at least one"):
         encode(replace(scene, global_deformation=without))
 
 
 def test_the_layers_have_equally_many_channels():
     scene = scene_with(1.0, 1.0)
     planes = tuple({name: np.tile(x, (2, 1, 1)) for name, x in s.items()} for s in scene.local_deformation.planes)
-    with pytest.raises(EncodeError, match="local_deformation scale 0: 2 channels, expected 1 as in the first scale"):
+    with pytest.raises(EncodeError, match="layer 2 grid 0: 4 sides and 2 channels, expected 4 and 1"):
         encode(replace(scene, local_deformation=replace(scene.local_deformation, planes=planes)))
 
 

@@ -14,11 +14,12 @@ from pd4dgs_codec import decode, encode, open_stream
 from pd4dgs_codec.errors import BadSignature, ChecksumMismatch, DecodeError, Malformed, Truncated
 from pd4dgs_codec.format.canonical import unpack
 from pd4dgs_codec.format.container import read_preamble
-from pd4dgs_codec.format.decoder import decode_partial, read_layers
+from pd4dgs_codec.format.decoder import decode_partial
 from pd4dgs_codec.format.header import pack_header
 from pd4dgs_codec.format.info import hashes, info
 from pd4dgs_codec.format.options import EncodeOptions
-from pd4dgs_codec.format.payload import write_layer
+from pd4dgs_codec.format.payload import write_slice
+from pd4dgs_codec.format.reader import decode_tensors, read_layers
 
 
 @given(scenes())
@@ -95,7 +96,7 @@ def streamed(data):
 
 def faults_by_every_door(data):
     """(class, message, chunk, offset) of what each entry point raises."""
-    for door in (streamed, decode, partial(decode, allow_partial=True), read_layers, hashes):
+    for door in (streamed, decode, partial(decode, allow_partial=True), decode_tensors, hashes):
         with pytest.raises(DecodeError) as caught:
             door(data)
         yield type(caught.value), str(caught.value), caught.value.chunk, caught.value.offset
@@ -105,16 +106,16 @@ def faults_by_every_door(data):
 def test_of_two_faults_every_door_names_that_of_the_earlier_layer(first):
     """Values that are not finite, sums of masks and voxels taken twice, which a payload alone does not show; the file
     is whole, cut, or damaged in its last layer."""
-    header, symbols = read_layers(small_file())
-    layers, steps, which = list(symbols.layers), header.grid.steps, 1
+    header, layers = read_layers(small_file())
+    rows, which = header.table.tensors, 1
     if first == "value":
-        steps, which = {**steps, "offset": 2.0**127}, 0
+        rows, which = (*rows[:2], replace(rows[2], step=2.0**127)), 0
     elif first == "mask code":
-        layers[1] = replace(layers[1], mask_increase=np.full_like(layers[1].mask_increase, 255))
+        layers[1] = replace(layers[1], rises=np.full_like(layers[1].rises, 255))
     else:
         layers[1] = replace(layers[1], anchor_q=layers[0].anchor_q[: len(layers[1].anchor_q)])
-    fields = unpack(pack_header(replace(header, grid=replace(header.grid, steps=steps))))
-    chunks = [Chunk(i, 0, write_layer(layer, EncodeOptions(effort=1))[0]) for i, layer in enumerate(layers)]
+    fields = unpack(pack_header(replace(header, table=replace(header.table, tensors=rows))))
+    chunks = [Chunk(i, 0, write_slice(layer, EncodeOptions(effort=1))[0]) for i, layer in enumerate(layers)]
     whole = put_together(Parts(fields, chunks))
     offset = info(whole[: read_preamble(whole).size])["layers"][which]["offset"]
     for data in (whole, whole[:-9], flipped(whole, -9)):

@@ -21,12 +21,12 @@ SLICES, ROWS = 120, 64
 @cache
 def many_slices():
     """Layer 0 in many slices, and layer 1, whose rises are in the order of all of them."""
-    k = np.resize(pattern(68, 7), (68, ROWS))
-    first = make_layer(0, line(ROWS, z=900), attributes=k)
-    rest = [later(0, line(ROWS, z=(7 * i) % SLICES), attributes=k) for i in range(1, SLICES)]
+    k, widths = np.resize(pattern(68, 7), (68, ROWS)), (32, 6, 30)
+    first = make_layer(0, line(ROWS, z=900), rows=k, widths=widths)
+    rest = [later(0, line(ROWS, z=(7 * i) % SLICES), rows=k, widths=widths) for i in range(1, SLICES)]
     anchors = SLICES * ROWS
     rises = (np.arange(anchors) % 50).tolist()
-    return make_file(first, *rest, make_layer(1, line(3, z=-5), before=anchors, rises=rises)).data()
+    return make_file(first, *rest, make_layer(1, line(3, z=-5), before=anchors, rises=rises, widths=widths)).data()
 
 
 @cache

@@ -188,7 +188,7 @@ def test_import_says_how_to_learn_from_them(tmp_path, cli, kind):
     run = kind(make_splats()).save(tmp_path / "run", make_splats())
     result = cli("import_model", run, "-o", tmp_path / "model.pt")
     assert result.code == 1 and len(result.error_lines) == 1 and not (tmp_path / "model.pt").exists()
-    assert f"train with pd4dgs-train teacher:{run}" in result.err
+    assert f"-o FILE.pd4 packs it, pd4dgs-train teacher:{run} learns from it" in result.err
 
 
 def test_teaching(tmp_path, cli, monkeypatch):

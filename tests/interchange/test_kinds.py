@@ -11,8 +11,8 @@ from test_splats import gsplat_state, make_splats
 from pd4dgs_codec.data.files import read_ply
 from pd4dgs_codec.errors import DamageWarning, DataError
 from pd4dgs_codec.interchange.splats import (
-    Splats,
     fourdgs_bytes,
+    glb_bytes,
     ply_bytes,
     properties,
     quiet,
@@ -20,6 +20,7 @@ from pd4dgs_codec.interchange.splats import (
     spz_bytes,
 )
 from pd4dgs_codec.interchange.teacher import read_model
+from pd4dgs_codec.kinds.splats import Splats
 
 SPLATS = make_splats(60, 1)
 NAMES = properties(1)
@@ -210,8 +211,13 @@ POINTS = {name: COLUMNS[name] for name in "xyz"}
         (ply(head=("element vertex -1",)), "found 'element vertex -1', expected a name and a count"),
         (ply().replace(b"element vertex", b"element point"), "and no element vertex; expected ascii"),
         (ply(head=("comment " + "x" * 70_000,)), "has no line end_header, expected 'ply' and a header of 65,536 bytes"),
-        (packed("ksplat"), r"begins with b'\\x00\\x01.*' and is of no known kind, expected a PLY, SPZ, .splat or"),
-        (packed("sog"), "expected one of 2,097,152 bytes at most; expected tensors alone"),
+        (packed("ksplat"), r"a\.bin: is a \.ksplat file, expected a PLY, SPZ, \.splat or .*: convert it to PLY first"),
+        (packed("sog"), r"is a \.sog file, expected a PLY, SPZ"),
+        (glb_bytes(SPLATS), "is a glTF file, expected a PLY, SPZ"),
+        (
+            b"\0\1\0\0" + bytes(60),
+            r"begins with b'\\x00\\x01.*' and is of no known kind, expected a PLY, SPZ, .splat or",
+        ),
         (b"", "begins with b'' and is of no known kind"),
         (bytes(64), "is of no known kind"),
         (np.random.default_rng(0).bytes(3200), "is of no known kind"),

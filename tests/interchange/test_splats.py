@@ -16,18 +16,8 @@ from tiny import camera_ahead
 
 from pd4dgs_codec.data.view import rotation_matrix
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.interchange.splats import (
-    SH_C0,
-    Splats,
-    fourdgs_bytes,
-    glb_bytes,
-    harmonics,
-    picture,
-    ply_bytes,
-    quaternions,
-    spz_bytes,
-    unit,
-)
+from pd4dgs_codec.interchange.splats import fourdgs_bytes, glb_bytes, picture, ply_bytes, quaternions, spz_bytes
+from pd4dgs_codec.kinds.splats import SH_C0, Splats, harmonics, unit
 
 
 def test_harmonics_are_the_real_ones_with_the_condon_shortley_phase():
@@ -204,6 +194,33 @@ def test_fourdgs_reads_moving_gaussians():
         goal[:20] += np.float32(moved)
         distance = np.abs(centres[:, None] - goal[None]).max(axis=2)
         assert distance.min(axis=0).max() < 0.01 and distance.min(axis=1).max() < 0.01
+
+
+@pytest.mark.parametrize("fps", [24, 30, 240])
+def test_fast_gaussians_are_where_they_should_be_in_a_4dgs_file(fps):
+    """fourdgs rounds to 4 ms the instant that a moving Gaussian's position is of."""
+    fourdgs = pytest.importorskip("fourdgs")
+    still, speed, slots = make_splats(60, 0), np.float32([20, -9, 4]), np.arange(60)
+    frames = [(i / fps, replace(still, means=still.means + speed * np.float32(i / fps)), slots) for i in range(8)]
+    back = fourdgs.read(fourdgs_bytes(frames, 8 / fps))
+    for t in (0, 0.5 / fps, 3 / fps, 6.99 / fps):
+        difference = (still.means + speed * np.float32(t))[:, None] - back.state_at(t)["centers"]
+        assert np.abs(difference).max(axis=2).min(axis=1).max() < 0.015  # 2 ms are 0.04
+
+
+def test_harmonics_that_are_0_stay_0_in_a_4dgs_file():
+    fourdgs = pytest.importorskip("fourdgs")
+    splats = make_splats(10, 3)
+    for degree in (3, 2, 1, 0):
+        splats.sh[:, (degree + 1) ** 2 :] = 0.015  # of all bytes, the nearest is further away than 0
+        back = fourdgs.read(fourdgs_bytes([(0.0, splats, np.arange(10))], 1.0))
+        assert back.gaussians.sh_degree == degree
+        if degree:
+            stored = np.sort(back.gaussians.sh.reshape(10, 3, -1) * (8 / 255) - 4, axis=0)
+            goal = np.sort(splats.sh[:, 1 : (degree + 1) ** 2].transpose(0, 2, 1), axis=0)
+            np.testing.assert_allclose(stored, goal, atol=4 / 255 + 1e-6)
+    assert back.gaussians.sh is None
+    assert back.header.attributes == {"color_space": "srgb-rec709-display", "visibility_profile": "box"}
 
 
 #: Of `npm install --ignore-scripts @playcanvas/splat-transform@3.7.0`, by default in the checkout's root.

@@ -16,15 +16,9 @@ from tiny import write_views
 
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.interchange.splats import (
-    Splats,
-    fourdgs_bytes,
-    picture,
-    ply_bytes,
-    read_splats,
-    spz_bytes,
-)
+from pd4dgs_codec.interchange.splats import fourdgs_bytes, picture, ply_bytes, read_splats, spz_bytes
 from pd4dgs_codec.interchange.teacher import load_source, read_model
+from pd4dgs_codec.kinds.splats import Splats
 
 
 def _same(found: Splats, expected: Splats, **tolerance: float) -> None:

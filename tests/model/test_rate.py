@@ -1,26 +1,17 @@
-"""R(a): sums, moments and the kernels beside the plain form; `pd4dgs-bench stability` holds it against mpmath."""
+"""R(a): the kernels beside the plain form, and their gradients; `tests/stability` holds them against mpmath."""
 
 import pytest
 import torch
+from trainer_rate import moments, plain_bits
 
-from pd4dgs_codec.model.rate import channel_moments, log_probability, rate_bits, row_bits
-
-
-def test_probabilities_of_all_symbols_sum_to_one():
-    k = torch.arange(-400, 401, dtype=torch.float64)
-    p = log_probability(k * 0.5, torch.tensor(0.13).double(), torch.tensor(7.0).double(), 0.5).exp()
-    assert abs(float(p.sum()) - 1) < 1e-12
+from pd4dgs_codec.model.rate import row_bits
 
 
 def test_gradient_through_the_moments_matches_finite_differences():
     torch.manual_seed(0)
     x = torch.randn(7, 2, dtype=torch.float64, requires_grad=True)
-
-    def total(values):
-        mu, sigma = channel_moments(values)
-        return -log_probability(values, mu, sigma, 0.3)
-
-    assert torch.autograd.gradcheck(total, (x,), atol=1e-7)
+    classes, rows = torch.zeros(7, dtype=torch.int8), torch.arange(7)
+    assert torch.autograd.gradcheck(lambda values: row_bits([(values, 0.3)], classes, rows), (x,), atol=1e-7)
 
 
 def row_bits_reference(parts, classes, rows):
@@ -30,8 +21,8 @@ def row_bits_reference(parts, classes, rows):
     for c in sorted(set(of_rows.tolist())):
         own = (of_rows == c).nonzero()[:, 0]
         for values, step in parts:
-            mu, sigma = channel_moments(values[classes == c])
-            bits = bits.index_add(0, own, rate_bits(values[rows[own]], mu, sigma, step * 2.0**c).sum(1))
+            mu, sigma = moments(values[classes == c])
+            bits = bits.index_add(0, own, plain_bits(values[rows[own]], mu, sigma, step * 2.0**c).sum(1))
     return bits
 
 

@@ -46,11 +46,11 @@ def test_the_decoders_own_tests_pass():
 
 def test_any_split_of_a_stream_costs_what_decoding_does(tmp_path):
     """One scene per slice once took 1.6 GiB for 13 kB, and a source twelve seconds."""
-    rows, slices = 9, 500
+    rows, slices, widths = 9, 500, (32, 6, 30)
     k = np.resize(pattern(68, 7), (68, rows))
-    rest = [later(0, line(rows, z=7 * i % slices), attributes=k) for i in range(1, slices)]
+    rest = [later(0, line(rows, z=7 * i % slices), widths=widths, rows=k) for i in range(1, slices)]
     path = tmp_path / "many.pd4"
-    path.write_bytes(make_file(make_layer(0, line(rows, z=slices), attributes=k), *rest).data())
+    path.write_bytes(make_file(make_layer(0, line(rows, z=slices), widths=widths, rows=k), *rest).data())
     for way, found in json.loads(run_node("testing/streams.mjs", path).stdout).items():
         assert found["time"] <= 3, way
         # all scenes together: decoding holds 2.25 times its scene, rows as they came, with room for more, and in order

@@ -162,7 +162,7 @@ def test_layers_meet_their_targets_and_the_loss_grows_as_they_shrink(scene):
         fitted, left_out, fits = Fitter(scene, targets, loss, error, EncodeOptions(**FAST)).fit()
         data, report = encode_with_report(fitted, **FAST, left_out=left_out)
         whole_file = encode(fitted, **FAST, omit="nothing")  # at coarser steps more may be left out
-        assert len(data) <= len(whole_file) + 1  # cells get values by an estimate of their bits
+        assert len(data) <= len(whole_file) + 4  # cells get values by an estimate of their bits
         sizes = added(whole_file)
         for row in fits:
             assert sizes[row.layer] <= row.bytes <= sizes[row.layer] + 16 and row.bytes <= row.target

@@ -25,7 +25,15 @@ def rows(title: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines[2:]]
 
 
-TABLES = ["Preamble and chunks", "Header", "Layer parameters", "Sections", "Coded channels", "Extension points"]
+TABLES = [
+    "Preamble and chunks",
+    "Header",
+    "Layer parameters",
+    "Channels",
+    "Coded channels",
+    "Kinds",
+    "Extension points",
+]
 
 
 @pytest.mark.parametrize("title", TABLES)
@@ -45,18 +53,30 @@ def numbers(text: str) -> set[int]:
     return {n for low, high in parts for n in range(int(low), int(high or low) + 1)}
 
 
-def test_each_registered_key_section_prior_and_predictor_has_a_row():
-    registries = section("17.1 Registries", FORMAT)
-    header, layer = re.search(r"header keys \| ([^(]*).*layer keys ([\d.]*)", registries).groups()
+def registry(name: str) -> str:
+    """What the registry of this name holds."""
+    (values,) = re.findall(rf"^\| {name} \| (.*) \|$", section("17.1 Registries", FORMAT), re.MULTILINE)
+    return values
+
+
+def test_each_registered_key_prior_predictor_and_kind_has_a_row():
+    header, layer = re.fullmatch(r"([\d.]*) .*layer keys ([\d.]*) .*", registry("header keys")).groups()
     assert {int(row[0]) for row in rows("Header")} == numbers(header)
     assert {int(row[0]) for row in rows("Layer parameters")} == numbers(layer)
-    (sections,) = re.findall(r"\| sections \| ([\d.]*)", registries)
-    assert {int(row[0]) for row in rows("Sections")} == numbers(sections)
     coded = "\n".join(row[0] for row in rows("Coded channels"))
-    (families,) = re.findall(r"\| prior families \| ([\d.]*)", registries)
-    (predictors,) = re.findall(r"\| predictors \| ([\d.]*)", registries)
-    assert set(map(int, re.findall(r"predictor (\d)", coded))) == numbers(predictors)
-    assert set(map(int, re.findall(r"prior family (\d)", coded))) == numbers(families)
+    for form in ("rows", "planes"):
+        found = set(map(int, re.findall(rf"predictor of {form} (\d)", coded)))
+        assert found == numbers(registry(f"predictors of {form}").split()[0])
+    assert set(map(int, re.findall(r"prior family (\d)", coded))) == numbers(registry("prior families").split()[0])
+    kinds = {
+        f"{role} {kind}" for role in ("scene", "deformation") for kind in registry(f"kinds of {role}s").split(", ")
+    }
+    assert {re.sub(",", "", row[0]) + f" ({row[1]})" for row in rows("Kinds")} == kinds
+
+
+def test_each_item_of_the_channels_has_a_row():
+    items = re.findall(r"^(\d)\. ", section("6.4 Channels", FORMAT), re.MULTILINE)
+    assert [row[0] for row in rows("Channels")] == items and len(items) == 8
 
 
 def test_each_clause_that_a_row_names_is_there():

@@ -18,6 +18,7 @@ from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.info import hashes
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, dequantise
+from pd4dgs_codec.kinds.splats import harmonics
 from pd4dgs_codec.morton import morton_order
 
 SPEC = Path(__file__).parents[2] / "spec"
@@ -39,11 +40,11 @@ def test_tensors_by_name_and_prefixes():
     scene, layers = decode(data), refdec.decode(data)
     assert [layer.number for layer in layers] == [0, 1, 2]
     own = slice(scene.rows[0], scene.rows[1])
-    for name in ("anchor", "feature", "scaling_log", "offset"):
-        assert layers[1].tensors[name] == getattr(scene, name)[own].ravel().tolist(), name
-    assert layers[1].tensors["planes.0.yt"] == scene.global_deformation.planes[0]["yt"].ravel().tolist()
-    assert layers[2].tensors["network.3.bias.0"] == scene.local_deformation.networks["offset"][0][1].tolist()
-    assert layers[0].symbols["anchor"] == scene.anchor_q[: scene.rows[0]].ravel().tolist()
+    for tensor, name in (("position", "anchor"), ("row.0", "feature"), ("row.1", "scaling_log"), ("row.2", "offset")):
+        assert layers[1].tensors[tensor] == getattr(scene, name)[own].ravel().tolist(), name
+    assert layers[1].tensors["plane.0.4"] == scene.global_deformation.planes[0]["yt"].ravel().tolist()
+    assert layers[2].tensors["bias.4.0"] == scene.local_deformation.networks["offset"][0][1].tolist()
+    assert layers[0].cells == list(map(tuple, scene.anchor_q[: scene.rows[0]].tolist()))
     prefix = refdec.decode(data, max_layer=1)
     assert [p.tensors for p in prefix] == [p.tensors for p in layers[:2]] and len(prefix) == 2
 
@@ -107,6 +108,27 @@ def test_the_tables_and_limits_of_the_specification():
     residuals, magnitudes = re.search(sentence, text).groups()
     found = refdec.relative_magnitude([[int(v.replace("−", "-")) for v in residuals.split(",")]], 4)
     assert found == [int(v) for v in magnitudes.split(",")]
+    sentence = r"predictor 1 and m = (\d+), symbols ([\d, −]+) of classes ([\d, ]+) give v = ([\d, ]+)\."
+    (m,), *lists = ([int(v.replace("−", "-")) for v in part.split(",")] for part in re.search(sentence, text).groups())
+    assert refdec.row_values(*lists[:2], m, 1) == lists[2]
+
+
+def test_the_formulas_of_harmonics():
+    block = TEXT.split("### 13.7 Splats")[1].split("```")[3]
+    formulas = dict(re.findall(r"H_(\d+) = (.*?)(?=\s+H_\d|\n)", block))
+    d = np.random.default_rng(1).normal(size=(20, 3))
+    d /= np.linalg.norm(d, axis=1)[:, None]
+    of_axes = dict(zip("xyz", d.T, strict=True))
+
+    def value(formula):
+        """Of each direction."""
+        formula = re.sub(r"√\((\d+)/(\d+)π\)", r"sqrt(\1/(\2*pi))", formula)
+        formula = re.sub(r"(\d)([xyz])", r"\1*\2", formula.replace("²", "**2"))
+        formula = formula.replace("−", "-").replace("·", "*")
+        return eval(formula, {"sqrt": np.sqrt, "pi": np.pi}, of_axes) * np.ones(len(d))
+
+    found = np.stack([value(formulas[str(j)]) for j in range(16)], axis=1)
+    assert np.abs(found - harmonics(d, 3)).max() < 1e-12
 
 
 def test_the_example_of_an_octree():
@@ -114,7 +136,7 @@ def test_the_example_of_an_octree():
     places = re.search(r"Four anchors at (.*?)\. The minimum", text)[1]
     cells = np.array([[int(v) for v in place.split(",")] for place in re.findall(r"\((.*?)\)", places)], np.int32)
     head, channels = position_channels(cells[morton_order(cells)])
-    assert head == bytes.fromhex(re.search(r"begins ((?:[0-9A-F]{2} ?)+);", text)[1])
+    assert head == bytes.fromhex(re.search(r"codes begin ((?:[0-9A-F]{2} ?)+);", text)[1])
     printed = re.search(r"that are not empty are ([\d ·]+) · 1,", text)[1] + " · 1"
     assert [c.tolist() for c in channels if len(c)] == [[int(v) for v in c.split()] for c in printed.split("·")]
 
@@ -132,5 +154,6 @@ def test_the_annotated_file():
     assert [found] == hashes(data)
     assert found["symbols"] in appendix and found["tensors"] in appendix
     (layer,) = refdec.decode(data)
-    assert layer.symbols["anchor"] == [-1, 0, 2] and layer.symbols["mask_own"] == [77]
-    assert set(layer.symbols["feature"] + layer.symbols["network.1.weight.0"]) == {2}
+    assert layer.cells == [(-1, 0, 2)] and layer.symbols["own"] == [[77]]
+    assert layer.symbols["row.1"] == [[2]] * 6 and layer.symbols["weight.1.0"] == [[2] * 14]
+    assert decode(data).anchor_q.tolist() == [[-1, 0, 2]]  # a scene of a registered kind

@@ -13,7 +13,7 @@ from strategies import LAYER_SETS, make_scene
 
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import DeliveryError, Malformed, Truncated
-from pd4dgs_codec.format import decoder
+from pd4dgs_codec.format import reader
 from pd4dgs_codec.format.container import read_preamble, write_chunk, write_preamble
 from pd4dgs_codec.format.header import pack_header, unpack_header
 from pd4dgs_codec.format.info import info
@@ -247,8 +247,8 @@ def test_a_rendered_video_is_packaged(cli, folder, tmp_path, monkeypatch):
     K = camera.K * [[0.1], [0.1], [1]]
     small = replace(camera, width=65, height=48, K=K.astype("float32"))
     (folder / "small.pd4").write_bytes(encode(replace(scene, info=replace(scene.info, camera=small)), effort=1))
-    read_layer, read = decoder.read_layer, []
-    monkeypatch.setattr(decoder, "read_layer", lambda *args: read.append(args[1].layer) or read_layer(*args))
+    read_slice, read = reader.read_slice, []
+    monkeypatch.setattr(reader, "read_slice", lambda *args: read.append(args[1]) or read_slice(*args))
     done = cli("package", folder / "small.pd4", "-o", tmp_path / "out", "--fps", 10, "--json")
     assert done.code == 0 and done.json["video"] is True, done.err
     assert read == [0, 1, 2]  # each layer is decoded once, for the check and for the video

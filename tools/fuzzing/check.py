@@ -1,7 +1,8 @@
 """The promises that hold for every input: the oracle of the fuzzer.
 
-Every entry point ends in a scene or in a DecodeError of one line, and all agree. Damage under a CRC never decodes. Time
-and memory stay within bounds. The three decoders accept the same files, with the same hashes.
+Every entry point ends in tensors, in a scene or in a DecodeError of one line, and all agree. Damage under a CRC never
+decodes. Time and memory stay within bounds. The three decoders accept the same files, with the same hashes of their
+tensors, and those that know kinds make scenes of the same tensors.
 """
 
 from __future__ import annotations
@@ -10,16 +11,16 @@ import base64
 import json
 import random
 import subprocess
-import sys
 import time
 import tracemalloc
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import refdec
 
 from pd4dgs_codec import decode, open_stream
 from pd4dgs_codec.errors import DecodeError
@@ -27,15 +28,10 @@ from pd4dgs_codec.format.container import CHUNK_OVERHEAD, read_chunk, read_pream
 from pd4dgs_codec.format.decoder import decode_partial
 from pd4dgs_codec.format.header import unpack_header
 from pd4dgs_codec.format.info import hashes, info
-from pd4dgs_codec.format.payload import Declared, read_parameters
-from pd4dgs_codec.format.registry import BY_CHUNK_TYPE
+from pd4dgs_codec.format.tables import Declared, read_parameters
 
+from . import ROOT
 from .mutate import Case
-
-ROOT = Path(__file__).resolve().parents[2]
-sys.path.append(str(ROOT / "spec"))  # one file that can be carried alone, in no package
-
-import refdec  # noqa: E402
 
 MAX_SECONDS = 2.0  #: of processor time, per input
 #: Peak memory of decoding is at most these times the symbols declared, the bytes given, and a constant, a larger one
@@ -52,6 +48,16 @@ class Finding(Exception):
     def __init__(self, kind: str, message: str):
         self.kind = kind
         super().__init__(message)
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What a decoder makes of a file: DECODED or the name of an error, and the hashes or the error. scene: the same
+    name for the scene; "" if its tensors do not decode, or the decoder knows no kinds."""
+
+    name: str
+    result: Any = None
+    scene: str = ""
 
 
 def outcome(function: Callable[..., Any], *args: Any, **options: Any) -> tuple[str, Any]:
@@ -87,7 +93,7 @@ def junk_in_new_memory() -> Iterator[None]:
         np.empty = empty
 
 
-# -- time, memory, entry points ----------------------------------------------------------------------------------------
+# -- the package -------------------------------------------------------------------------------------------------------
 
 
 def declared(data: bytes) -> tuple[int, bool]:
@@ -97,11 +103,11 @@ def declared(data: bytes) -> tuple[int, bool]:
     try:
         preamble = read_preamble(data)
         header, offset = unpack_header(preamble.header), preamble.size
+        scalars = header.table.channels + header.table.graded
         for number, length in header.chunks:
-            kind = BY_CHUNK_TYPE.get(number)
-            if kind is not None:
+            if number < 3:
                 payload = read_chunk(data, offset, length=length).payload
-                _, _, total = read_parameters(payload, kind, header.grid.widths, total, number in layers)
+                _, _, total = read_parameters(payload, number, scalars, total, number in layers)
                 layers.append(number)
             offset += CHUNK_OVERHEAD + length
     except DecodeError:
@@ -134,22 +140,28 @@ def streamed(data: bytes, rng: random.Random) -> tuple[int, ...]:
     return layers
 
 
-def check_package(case: Case, rng: random.Random) -> str:
-    """The outcome of decoding an input, by decode and one other entry point. Raises Finding for a broken promise."""
+def check_package(case: Case, rng: random.Random) -> Answer:
+    """What the package makes of an input, by `hashes`, `decode` and one other entry point. Raises Finding for a broken
+    promise."""
     with junk_in_new_memory(), warnings.catch_warnings():
         warnings.simplefilter("error")  # a warning is a line on somebody's terminal
         start = time.process_time()
-        name, result = outcome(decode, case.data)
-        seconds = time.process_time() - start
+        name, result = outcome(hashes, case.data)
+        between = time.process_time()
+        scene, found = outcome(decode, case.data)
+        seconds = max(between - start, time.process_time() - between)
         if seconds > MAX_SECONDS:
             raise Finding("time", f"{seconds:.2f} s of processor time, limit {MAX_SECONDS} s")
         if name == DECODED and not case.sealed and case.data not in case.origins:
             raise Finding("silent", "decoded a mutated file without an error, although its CRCs are wrong")
-        _other_entry_point(case.data, name, result, rng)
-    return name
+        if scene not in (name, "Malformed", "UnsupportedFeature") or (case.scene and scene != name):
+            raise Finding("disagreement", f"tensors end in {name}, the scene in {scene} ({found})")
+        _other_entry_point(case.data, scene, found, rng)
+    return Answer(name, result, scene if name == DECODED else "")
 
 
 def _other_entry_point(data: bytes, name: str, result: Any, rng: random.Random) -> None:
+    """name, result: of decode."""
     entry = rng.randrange(4)
     if entry == 0:
         other, found = outcome(streamed, data, rng)
@@ -170,25 +182,19 @@ def _other_entry_point(data: bytes, name: str, result: Any, rng: random.Random) 
         outcome(info, data)
 
 
-# -- the three decoders ------------------------------------------------------------------------------------------------
+# -- the other decoders ------------------------------------------------------------------------------------------------
 
 
-def python_decoder(data: bytes) -> tuple[str, Any]:
-    """(DECODED or the name of the error, the hashes or the error)."""
-    with junk_in_new_memory():
-        return outcome(hashes, data)
-
-
-def reference_decoder(data: bytes) -> tuple[str, Any] | None:
-    """That of the specification, as python_decoder; None for an input that would take long."""
+def reference_decoder(data: bytes) -> Answer | None:
+    """That of the specification; None for an input that would take long."""
     if declared(data)[0] > REFERENCE_SYMBOLS:
         return None
     try:
-        return DECODED, refdec.hashes(data)
+        return Answer(DECODED, refdec.hashes(data))
     except refdec.Fault as fault:
-        return fault.name, fault
+        return Answer(fault.name, fault)
     except Exception as error:
-        return f"crash, {type(error).__name__}: {error}", error
+        return Answer(f"crash, {type(error).__name__}: {error}", error)
 
 
 class JavaScript:
@@ -198,8 +204,8 @@ class JavaScript:
         command = ["node", str(ROOT / "player" / "testing" / "decoder_loop.mjs")]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
-    def __call__(self, data: bytes) -> tuple[str, Any] | None:
-        """As python_decoder; None for an input that it need not decode."""
+    def __call__(self, data: bytes) -> Answer | None:
+        """None for an input that it need not decode."""
         try:
             if unpack_header(read_preamble(data).header).mode != "ans":
                 return None
@@ -211,27 +217,31 @@ class JavaScript:
         line = self._process.stdout.readline()
         found = json.loads(line) if line else {"crash": f"the process ended with exit code {self._process.wait()}"}
         if "crash" in found:
-            return f"crash, {found['crash']}", None
-        return (found["error"], found["message"]) if "error" in found else (DECODED, found["hashes"])
+            return Answer(f"crash, {found['crash']}")
+        if "error" in found:
+            return Answer(found["error"], found["message"])
+        return Answer(DECODED, found["hashes"], found["scene"]["error"] if found["scene"] else DECODED)
 
 
-Decoder = Callable[[bytes], tuple[str, Any] | None]
+Decoder = Callable[[bytes], Answer | None]
 
 
-def compare(data: bytes, decoders: dict[str, Decoder], meaning: list[dict[str, Any]] | None = None) -> str | None:
-    """None if all decoders agree, or the two names that differ: a file with several faults may be refused for any of
-    them. Finding if one accepts a file that another refuses, for other hashes, or for a crash. meaning: the hashes of a
-    legal file."""
-    answers = {} if meaning is None else {"the writer": (DECODED, meaning)}
-    answers |= {name: answer for name, decoder in decoders.items() if (answer := decoder(data)) is not None}
-    (first, (expected, given)), *others = answers.items() or [("", ("", None))]
-    for name, (found, result) in others:
-        if found.startswith("crash"):
-            raise Finding("crash", f"{name}: {found[:300]}")
-        if DECODED in (found, expected) and found != expected:
-            raise Finding("disagreement", f"{first}: {expected} ({given}), {name}: {found} ({result})"[:600])
-        if found == DECODED and result != given:
+def compare(answers: Mapping[str, Answer]) -> str | None:
+    """None if all answers agree, or the two names that differ: a file with several faults may be refused for any of
+    them. Finding if one accepts a file that another refuses, for other hashes, or for a crash."""
+    (first, expected), *others = answers.items()
+    difference = None
+    for name, found in others:
+        both = f"{first}: {expected.name} ({expected.result}), {name}: {found.name} ({found.result})"
+        if found.name.startswith("crash"):
+            raise Finding("crash", f"{name}: {found.name[:300]}")
+        if DECODED in (found.name, expected.name) and found.name != expected.name:
+            raise Finding("disagreement", both[:600])
+        if found.name == DECODED and found.result != expected.result:
             raise Finding("disagreement", f"{first} and {name} give different hashes")
-        if found != expected:
-            return f"{name} {found}, {first} {expected}"
-    return None
+        scenes = {found.scene, expected.scene} - {""}
+        if len(scenes) > 1 and DECODED in scenes:
+            raise Finding("disagreement", f"the scene of {first}: {expected.scene}, of {name}: {found.scene}")
+        if found.name != expected.name or len(scenes) > 1:
+            difference = f"{name} {found.name} {found.scene}, {first} {expected.name} {expected.scene}"
+    return difference

@@ -14,23 +14,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from vectors.blocks import PLANE, varint
-
-from pd4dgs_codec.entropy.varint import VARINT_MAX, ByteReader
-from pd4dgs_codec.errors import DecodeError, EncodeError
-from pd4dgs_codec.format import canonical
-from pd4dgs_codec.format.container import read_chunk, read_preamble, write_chunk, write_preamble
-from pd4dgs_codec.format.deformation import unpack_parameters
-from pd4dgs_codec.format.header import scene_id_of
-from pd4dgs_codec.format.registry import LAYER_KINDS
-from pd4dgs_codec.scene import Widths
+import refdec
+from vectors.blocks import Chunk as Framed
+from vectors.blocks import pack, preamble, scene_id_of, varint
 
 from .legal import Seed, legal
 
-SECTIONS = 2  # key of the layer parameters
-_POWERS = (7, 8, 12, 14, 15, 16, 20, 21, 22, 23, 24, 26, 28, 31, 32)
+CODES = 2  # key of the parameters of a slice: the length of its codes
+VARINT_MAX = (1 << 35) - 1
+_POWERS = (7, 8, 9, 12, 14, 15, 16, 20, 21, 22, 23, 24, 26, 28, 31, 32)
 #: Around every limit of the format and every width of an integer.
-INTEGERS = (0, 1, 2, 3, 4, 5, 10, 30, 68, 70, *(v for p in _POWERS for v in ((1 << p) - 1, 1 << p, (1 << p) + 1)))
+INTEGERS = (0, 1, 2, 3, 4, 5, 10, 17, 64, 65, *(v for p in _POWERS for v in ((1 << p) - 1, 1 << p, (1 << p) + 1)))
 REALS = (0.0, -0.0, 1.0, -1.0, 0.5, 2.0**-149, 2.0**-126, 2.0**-20, 2.0**20, 2.0**127, -(2.0**127))
 LONGEST_BURST = 64
 LEGAL_SHARE = 0.2  #: of the inputs
@@ -40,13 +34,15 @@ SEALED_SHARE = 0.6  #: of the others
 @dataclass(frozen=True)
 class Case:
     """One input. sealed: whether lengths, ids and CRCs were made right after the mutation. recipe: what was done.
-    origins: the files that it was made from. meaning: the hashes that a legal file must have; None for any other."""
+    origins: the files that it was made from. meaning: the hashes that a legal file must have; None for any other.
+    scene: whether it is sure to make a scene."""
 
     data: bytes
     sealed: bool
     recipe: str
     origins: tuple[bytes, ...] = ()
     meaning: list[dict[str, Any]] | None = None
+    scene: bool = False
 
 
 # -- bytes -------------------------------------------------------------------------------------------------------------
@@ -142,20 +138,22 @@ def _other_value(rng: random.Random, value: Any) -> Any:
     return rng.choice(INTEGERS)
 
 
-def change_value(rng: random.Random, tree: dict[int, Any]) -> None:
+def change_value(rng: random.Random, tree: Any) -> None:
     """In place, one leaf of `tree` becomes another, or a random list or map gains or loses an entry."""
     containers = _containers(tree)
     places = [(c, key) for c in containers for key in (list(c) if isinstance(c, dict) else range(len(c)))]
     leaves = [(c, key) for c, key in places if not isinstance(c[key], (list, dict))]
     container, key = rng.choice(leaves or places) if places else (tree, None)
-    if places and rng.random() < 0.85:
+    if places and rng.random() < 0.75:
         container[key] = _other_value(rng, container[key])
         return
     container = rng.choice(containers)
     if len(container) and rng.random() < 0.5:
         del container[rng.choice(list(container) if isinstance(container, dict) else range(len(container)))]
     elif isinstance(container, dict):
-        container[rng.choice((0, 3, 6, 13, 63, 64, 1000, (1 << 32) - 1))] = rng.choice((0, 1.0, "later", [[[[0]]]]))
+        container[rng.choice((0, 3, 5, 6, 13, 63, 64, 1000, (1 << 32) - 1))] = rng.choice((0, 1.0, "x", [0], [[[[0]]]]))
+        for name in sorted(container):
+            container[name] = container.pop(name)
     else:
         again = copy.deepcopy(rng.choice(container)) if container else rng.choice(INTEGERS)
         container.insert(rng.randint(0, len(container)), again)
@@ -166,23 +164,22 @@ def change_value(rng: random.Random, tree: dict[int, Any]) -> None:
 
 @dataclass
 class Chunk:
-    """A chunk. meta, sections: parameters (the section map only with keys that stand for no bytes) and sections of a
-    layer, None for other chunks."""
+    """A chunk. meta: the parameters of a slice, without the length of its codes; None for other chunks, and for a slice
+    whose payload was changed as bytes."""
 
     type: int
     flags: int
     payload: bytes
     meta: dict[int, Any] | None = None
-    sections: dict[int, bytes] | None = None
+    codes: bytes = b""
+    stream: bytes = b""
 
     def packed(self) -> bytes:
         """The payload, written anew if it was taken apart."""
-        if self.meta is None or self.sections is None:
+        if self.meta is None:
             return self.payload
-        lengths = {number: len(data) for number, data in sorted(self.sections.items()) if data}
-        others = self.meta.get(SECTIONS)
-        meta = canonical.pack({**self.meta, SECTIONS: {**(others if isinstance(others, dict) else {}), **lengths}})
-        return b"".join([struct.pack("<I", len(meta)), meta, *(self.sections[number] for number in lengths)])
+        meta = pack(dict(sorted({**self.meta, CODES: len(self.codes)}.items())))
+        return b"".join([struct.pack("<I", len(meta)), meta, self.codes, self.stream])
 
 
 @dataclass
@@ -195,95 +192,74 @@ class Parts:
 
 def take_apart(data: bytes) -> Parts:
     """The parts of a valid file, each a copy."""
-    preamble = read_preamble(data)
-    header, chunks, offset = canonical.unpack(preamble.header), list[Chunk](), preamble.size
+    (size,) = struct.unpack_from("<I", data, 12)
+    header, chunks, offset = refdec.unpack(data[20 : 20 + size]), list[Chunk](), 20 + size
     while offset < len(data):
-        chunk = read_chunk(data, offset)
-        part = Chunk(chunk.type, chunk.flags, chunk.payload)
-        if chunk.type < 3:
-            (length,) = struct.unpack_from("<I", chunk.payload)
-            part.meta, at, part.sections = canonical.unpack(chunk.payload[4 : 4 + length]), 4 + length, {}
-            for number in sorted(n for n in part.meta[SECTIONS] if n < 64):
-                size = part.meta[SECTIONS].pop(number)
-                part.sections[number], at = chunk.payload[at : at + size], at + size
+        kind, flags, length = struct.unpack_from("<HHI", data, offset)
+        part = Chunk(kind, flags, data[offset + 16 : offset + 16 + length])
+        if kind < 3:
+            at = 4 + struct.unpack_from("<I", part.payload)[0]
+            part.meta = refdec.unpack(part.payload[4:at])
+            end = at + part.meta.pop(CODES)
+            part.codes, part.stream = part.payload[at:end], part.payload[end:]
         chunks.append(part)
-        offset = chunk.end
+        offset += 20 + length
     return Parts(header, chunks)
 
 
 def put_together(parts: Parts, header: bytes | None = None) -> bytes:
-    """The file of `parts`, or with other bytes for a header, which may be none. EncodeError if a value has no canonical
+    """The file of `parts`, or with other bytes for a header, which may be none. ValueError if a value has no canonical
     form."""
-    payloads = [chunk.packed() for chunk in parts.chunks]
-    if header is None:
+    try:
+        payloads = [chunk.packed() for chunk in parts.chunks]
         rows = [[chunk.type, len(payload)] for chunk, payload in zip(parts.chunks, payloads, strict=True)]
-        header = canonical.pack({**parts.header, 1: rows})
-    try:
-        scene_id = scene_id_of(header)
-    except (DecodeError, LookupError, TypeError):  # no header, or no chunk
-        scene_id = bytes(8)
-    framed = [write_chunk(c.type, c.flags, scene_id, p) for c, p in zip(parts.chunks, payloads, strict=True)]
-    return b"".join([write_preamble(header), *framed])
+        fields = {**parts.header, 1: rows}
+        header = pack(fields) if header is None else header
+    except (struct.error, IndexError, TypeError) as error:
+        raise ValueError("a value without a form") from error
+    scene_id = scene_id_of(header, fields)
+    framed = [Framed(c.type, p, c.flags).frame(scene_id) for c, p in zip(parts.chunks, payloads, strict=True)]
+    return b"".join([preamble(header), *framed])
 
 
-def stages_of(section: bytes, number: int, header: dict[int, Any], meta: dict[int, Any]) -> list[bytes]:
-    """The stages of a section, which is one itself unless it holds planes."""
-    if number != PLANE:
-        return [section]
-    reader = ByteReader(section)
-    fields, widths = canonical.Fields(meta, "layer", set(meta)), Widths(*header[15][:2])
-    shape, _ = unpack_parameters(fields, LAYER_KINDS[1], widths, (), False, "layer")
-    count = max(1, (shape.scales[0].channels - 1).bit_length())
-    lengths = (reader.varint(VARINT_MAX, "a length") for _ in range(count - 1))
-    bounds = list(itertools.accumulate(lengths, initial=0))
-    rest = bytes(reader.rest())
-    return [rest[start:end] for start, end in itertools.pairwise([*bounds, len(rest)])]
+def _slice(rng: random.Random, parts: Parts) -> Chunk | None:
+    slices = [chunk for chunk in parts.chunks if chunk.meta is not None]
+    return rng.choice(slices) if slices else None
 
 
-def _layer(rng: random.Random, parts: Parts) -> Chunk | None:
-    layers = [chunk for chunk in parts.chunks if chunk.sections]
-    return rng.choice(layers) if layers else None
-
-
-def section_bytes(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
-    """Bytes of a section or of one of its stages; lengths follow."""
-    chunk = _layer(rng, parts)
-    if chunk is None or chunk.sections is None or chunk.meta is None:
+def coded_bytes(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
+    """Bytes of the codes or of the stream of a slice; the length follows."""
+    chunk, donor = _slice(rng, parts), _slice(rng, other)
+    if chunk is None:
         return
-    number = rng.choice(list(chunk.sections))
-    section = chunk.sections[number]
-    try:
-        stages = stages_of(section, number, parts.header, chunk.meta)
-    except (DecodeError, LookupError, TypeError, ValueError):  # changed before
-        stages = [section]
-    at = rng.randrange(len(stages))
-    names.append(f"section {number}, stage {at}")
-    stages[at] = change_bytes(rng, stages[at], rng.choice(stages), names)
-    chunk.sections[number] = varint(*(len(s) for s in stages[:-1])) + b"".join(stages)
+    name = "stream" if rng.random() < 0.2 else "codes"
+    names.append(f"in {name}")
+    setattr(chunk, name, change_bytes(rng, getattr(chunk, name), getattr(donor or chunk, name), names))
 
 
-def section_swap(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
-    """A section comes from another layer or file, or is dropped, random, or of zeros."""
-    chunk, donor = _layer(rng, parts), _layer(rng, other if rng.random() < 0.6 else parts)
-    if chunk is None or chunk.sections is None or donor is None:
+def coded_swap(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
+    """Codes or a stream come from another layer or file, or are dropped, random, or of zeros; or the parameters do."""
+    chunk, donor = _slice(rng, parts), _slice(rng, other if rng.random() < 0.6 else parts)
+    if chunk is None or donor is None:
         return
-    number, size = rng.choice([*chunk.sections, rng.randrange(8)]), rng.randint(1, 200)
-    given = (donor.sections or {}).get(number, b"")
-    chunk.sections[number] = rng.choice((given, given, b"", rng.randbytes(size), bytes(size), b"\x10" * size))
-    names.append(f"section {number} from elsewhere")
+    name, size = rng.choice(("codes", "stream", "meta")), rng.randint(1, 200)
+    made = (b"", rng.randbytes(size), bytes(size), b"\x10" * size) if name != "meta" else ()
+    setattr(chunk, name, rng.choice((*[copy.deepcopy(getattr(donor, name))] * 2, *made)))
+    names.append(f"{name} from elsewhere")
 
 
 def parameters(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
-    """A value in the parameters of a layer."""
-    chunk = _layer(rng, parts)
+    """A value in the parameters of a slice."""
+    chunk = _slice(rng, parts)
     if chunk is not None and chunk.meta is not None:
         change_value(rng, chunk.meta)
-        names.append("a layer parameter")
+        names.append("a parameter")
 
 
 def header_value(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
-    """A value in the header; the chunk list is written anew."""
-    change_value(rng, parts.header)
+    """A value in the header, half of the time in its kind or its rows; the chunk list is written anew."""
+    tables = [parts.header[key] for key in (3, 4, 5) if isinstance(parts.header.get(key), list)]
+    change_value(rng, rng.choice(tables) if tables and rng.random() < 0.5 else parts.header)
     names.append("a header value")
 
 
@@ -291,7 +267,7 @@ def payload_bytes(rng: random.Random, parts: Parts, other: Parts, names: list[st
     """Bytes of a whole payload, its parameters included."""
     chunk = rng.choice(parts.chunks)
     chunk.payload = change_bytes(rng, chunk.packed(), rng.choice(other.chunks).packed(), names)
-    chunk.meta = chunk.sections = None
+    chunk.meta = None
     names.append("in a payload")
 
 
@@ -322,7 +298,7 @@ def chunks(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> 
 
 PartChange = Callable[[random.Random, Parts, Parts, list[str]], None]
 PART_CHANGES: dict[PartChange, int] = {
-    section_bytes: 45, section_swap: 10, parameters: 20, header_value: 8, payload_bytes: 12, chunks: 5
+    coded_bytes: 40, coded_swap: 8, parameters: 22, header_value: 14, payload_bytes: 10, chunks: 6
 }  # fmt: skip
 
 
@@ -333,7 +309,7 @@ def change_parts(rng: random.Random, data: bytes, other: bytes, names: list[str]
         for change in rng.choices([*PART_CHANGES], [*PART_CHANGES.values()], k=rng.choice((1, 1, 1, 2))):
             change(rng, parts, donor, names)
         return put_together(parts)
-    except EncodeError:  # a value that has no canonical form, such as one nested too deep
+    except ValueError:  # a number that has no form
         return data
 
 
@@ -349,8 +325,8 @@ def make_case(seeds: Sequence[Seed], run: int, index: int) -> Case:
     """Input number `index` of a run over these files."""
     rng = random.Random(run << 40 | index)
     if rng.random() < LEGAL_SHARE:
-        file = legal(rng)
-        return Case(file.data(), True, "a legal file", meaning=file.hashes())
+        file, scene = legal(rng)
+        return Case(file.data(), True, "a legal file", meaning=file.hashes(), scene=scene)
     chosen, donor = rng.choice(seeds), rng.choice(seeds)
     names: list[str] = []
     act = rng.random()

@@ -64,6 +64,7 @@ CONTENTS = {
     ],
     "Format": ["spec/format", "spec/audit", "spec/vectors/README", "docs/robustness"],
     "Project": ["docs/results", "docs/design", "CONTRIBUTING", "SECURITY", "CHANGELOG"],
+    "Log": ["docs/log/README", *sorted(f"docs/log/{page.stem}" for page in ROOT.glob("docs/log/[a-z]*.md"))],
 }
 
 PLAYER = '<iframe src="sample.html" title="The dancer, playing" width="480" height="480" style="border: 0"></iframe>'

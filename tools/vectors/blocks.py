@@ -1,50 +1,40 @@
 """Writes `.pd4` structures from explicit choices, right or wrong.
 
-Nothing here searches, fits or rounds: the caller names every prior, form, predictor and field, or it follows from the
-symbols by a rule on integers, so the bytes are the same on every machine. Lengths, scene ids and CRCs are right unless
-the caller asks for others.
+This is written from the specification and shares no code with the package, so that a misreading of either is found.
+Nothing here searches, fits or rounds: the caller names every prior, predictor and field, or it follows from the symbols
+by a rule on integers, so the bytes are the same on every machine. Lengths, scene ids and CRCs are right unless the
+caller asks for others.
 """
 
 from __future__ import annotations
 
 import hashlib
 import itertools
+import math
 import struct
 import zlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
+from functools import cache
 from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.entropy.ans import ans_encode
-from pd4dgs_codec.entropy.positions import position_channels
-from pd4dgs_codec.entropy.priors import FIRST_REUSE, Const, Gauss, Normal, Prior, Window
-from pd4dgs_codec.entropy.varint import put_varint, put_zigzag
-from pd4dgs_codec.format import canonical
-from pd4dgs_codec.format.container import MAJOR, SIGNATURE
-from pd4dgs_codec.format.planes import residual
-from pd4dgs_codec.morton import morton_order
-from pd4dgs_codec.scene import DEFAULT_WIDTHS, Widths, plane_shapes
-
 from . import lzma2
 
-POSITIONS, MASKS, ATTRIBUTES, PLANE, WEIGHTS, SYMBOLS = range(6)  # sections (clause 6.4)
+SIGNATURE, MAJOR = b"\x89PD4\r\n\x1a\n", 4
 ANS, LZMA = 0, 1
+TOTAL = 1 << 24  # of a frequency table
+PAIRS = {sides: [*itertools.combinations(range(sides), 2)] for sides in range(2, 6)}  # the axes of a grid's planes
 HEADER: dict[int, Any] = {
     2: ANS,
-    4: [0.0625, 0.03125, 0.125],
-    5: 2.0**-7,
-    6: [-1.0, -2.0, -3.0, 1.0, 2.0, 3.0],
-    7: [0.5, 3.25],
-    8: [0.0, 0.5, 1.0],
-    9: [0.125, 64.0],
-    10: [0.0, -1.0, 0.0],
-    11: 1.5,
-    # of all classes: a file may declare bounds for tensors that it does not have
-    13: dict(enumerate([0.03125, 0.015625, 0.0625, 2.0**-8, 0.25, 2.0**-9, 0.5, 2.0**-10])),
-    15: [32, 10, 7],
+    6: 2.0**-7,
+    7: [-1.0, -2.0, -3.0, 1.0, 2.0, 3.0],
+    8: [0.5, 3.25],
+    9: [0.0, 0.5, 1.0],
+    10: [0.125, 64.0],
+    11: [0.0, -1.0, 0.0],
+    12: 1.5,
 }
 CAMERA: dict[int, Any] = {
     1: [1.0, 0.0, 0.0, 0.25, 0.0, 0.0, -1.0, 0.5, 0.0, 1.0, 0.0, 4.0],
@@ -52,8 +42,7 @@ CAMERA: dict[int, Any] = {
     3: 640,
     4: 480,
 }
-NO_CLASSES = np.zeros(0, np.int32)
-
+STEPS = (0.0625, 0.03125, 0.125)  # of the tensors of rows, in turn
 
 # -- primitives --------------------------------------------------------------------------------------------------------
 
@@ -62,16 +51,16 @@ def varint(*values: int) -> bytes:
     """Clause 7.1."""
     out = bytearray()
     for value in values:
-        put_varint(out, value)
+        while value > 127:
+            out.append(value & 127 | 128)
+            value >>= 7
+        out.append(value)
     return bytes(out)
 
 
 def zigzag(*values: int) -> bytes:
     """Clause 7.1."""
-    out = bytearray()
-    for value in values:
-        put_zigzag(out, value)
-    return bytes(out)
+    return varint(*(2 * v if v >= 0 else -2 * v - 1 for v in values))
 
 
 def words(*values: int) -> bytes:
@@ -79,170 +68,285 @@ def words(*values: int) -> bytes:
     return struct.pack(f"<{len(values)}I", *values)
 
 
+def pack(value: Any) -> bytes:
+    """Canonical msgpack (clause 4). struct.error for a number that has no form."""
+    if isinstance(value, bool):
+        return b"\xc3" if value else b"\xc2"
+    if isinstance(value, float):
+        return b"\xca" + struct.pack(">f", value)
+    if isinstance(value, int):
+        if -32 <= value < 128:
+            return bytes([value & 255])
+        wide = max(0, math.ceil(math.log2((value if value >= 0 else -2 * value - 1).bit_length() / 8)))
+        return bytes([(0xCC if value > 0 else 0xD0) + wide]) + struct.pack(
+            ">" + ("BHIQ" if value > 0 else "bhiq")[wide], value
+        )
+    if isinstance(value, str):
+        return _head(len(value.encode()), 0xA0, 32, 0xD9) + value.encode()
+    if isinstance(value, bytes):
+        return _head(len(value), 0, 0, 0xC4) + value
+    if isinstance(value, dict):
+        return _head(len(value), 0x80, 16, 0xDD) + b"".join(pack(x) for pair in value.items() for x in pair)
+    return _head(len(value), 0x90, 16, 0xDB) + b"".join(map(pack, value))
+
+
+def _head(size: int, fix: int, below: int, code: int) -> bytes:
+    """code: of the form with a u8, which lists and maps do not have: they are below 16 or take a u16."""
+    if size < below:
+        return bytes([fix | size])
+    wide = (size > 0xFF or below == 16) + (size > 0xFFFF)
+    return bytes([code + wide]) + struct.pack(">" + "BHI"[wide], size)
+
+
 def pattern(*shape: int, low: int = -3, high: int = 3, seed: int = 0) -> np.ndarray:
     """int32 of `shape` in low..high that look irregular: upper bits of a Lehmer generator."""
     state, values = seed * 7919 + 12345, []
-    for _ in range(int(np.prod(shape))):
+    for _ in range(math.prod(shape)):
         state = state * 48271 % (2**31 - 1)
         values.append(low + (state >> 8) % (high - low + 1))
     return np.array(values, np.int32).reshape(shape)
 
 
-# -- coded channels (clause 8) -----------------------------------------------------------------------------------------
+# -- coded channels (clauses 7 and 8) ----------------------------------------------------------------------------------
+
+T = [round(2**27 * math.erf(i / (32 * math.sqrt(2)))) for i in (*range(257), 256)]
+M = [round(2 ** (31 - j / 64)) for j in range(64)]
 
 
-@lru_cache
-def gauss(low: int, n: int, *, si: int = 64, offset: int = 0) -> Gauss:
-    """A Gaussian prior over n entries from `low`. offset: of its mean from the middle of the window, entries / 256."""
-    return Gauss(Window(low, n), Normal(offset + 128 * (n - 1), si))
+@dataclass(frozen=True)
+class Prior:
+    """The window of n entries from kmin; of more than one entry under a Gaussian with the mean g / 256 from their
+    middle and the deviation 2^(si / 64). Const if n is 1. mixed: si, g and weight of a second Gaussian."""
+
+    kmin: int
+    n: int = 1
+    si: int = 64
+    g: int = 0
+    mixed: tuple[int, int, int] | None = None
+
+    @property
+    def family(self) -> int:
+        """Clause 8.1."""
+        return 0 if self.n == 1 else 1 if self.mixed is None else 2
+
+    def parameters(self) -> bytes:
+        """Clause 8.2."""
+        if self.n == 1:
+            return zigzag(self.kmin)
+        one = zigzag(self.kmin) + varint(self.n - 2) + zigzag(self.g) + varint(self.si + 640)
+        return one + zigzag(self.mixed[1]) + varint(self.mixed[0] + 640) + bytes([self.mixed[2]]) if self.mixed else one
+
+    @cache  # noqa: B019  (few priors, each used often)
+    def cum(self, q: int) -> int:
+        """Clauses 7.3 and 7.4."""
+        if not 0 < q < self.n:
+            return TOTAL if q else 0
+        c = normal(q - 1, self.n, self.si, self.g)
+        if self.mixed:
+            si, g, w = self.mixed
+            c = (256 - w) * c + w * normal(q - 1, self.n, si, g) >> 8
+        return (c * (TOTAL - 16 * self.n) >> 28) + 16 * q
 
 
-SMALL = gauss(-3, 7)
+def normal(k: int, n: int, si: int, g: int) -> int:
+    """C(k) of clause 7.3."""
+    e, j = si >> 6, si & 63
+    down, t = max(0, e - 8), 256 * k + 128 - g - 128 * (n - 1)
+    z = min(min(abs(t) >> down, (1 << 21) - 1) * M[j] >> 23 + e - down, 1 << 19)
+    v = T[z >> 11] + ((T[(z >> 11) + 1] - T[z >> 11]) * (z & 2047) >> 11)
+    return (1 << 27) + (-v if t < 0 else v)
 
 
-def default_prior(symbols: np.ndarray) -> Prior:
+SMALL = Prior(-3, 7)
+Choice = Callable[[int, str, int, list[int]], Prior]  #: of a prior, from prior list, piece, number of channel, symbols
+
+
+class Known(list[list["Prior"]]):
+    """The three prior lists."""
+
+    def __init__(self) -> None:
+        super().__init__(([], [], []))
+
+
+def default_prior(k: Sequence[int]) -> Prior:
     """The prior of a channel for which the caller names none, by the range of its symbols."""
-    low, high = int(symbols.min()), int(symbols.max())
+    low, high = min(k), max(k)
     if low == high:
-        return Const(Window(low, 1))
+        return Prior(low)
     if -3 <= low and high <= 3:
         return SMALL
     n, most = high - low + 1, (1 << 24) - 1
     if n > 1 << 14:  # around the median; the others are exceptions
-        low, n = int(np.sort(symbols)[len(symbols) // 2]) - 7, 15
-    return gauss(min(max(low, -most), most - n + 1), n, si=64 * n.bit_length() - 128)
+        low, n = sorted(k)[len(k) // 2] - 7, 15
+    return Prior(min(max(low, -most), most - n + 1), n, 64 * n.bit_length() - 128)
 
 
-Known = list[bytes]  # definitions of priors
-Coder = Callable[[Iterable[np.ndarray]], bytes]  # of the channels of a section
+def named(priors: Mapping[str, Mapping[int, Prior]]) -> Choice:
+    """Those of some channels, by piece and number."""
+    return lambda _, piece, number, k: priors.get(piece, {}).get(number) or default_prior(k)
 
 
-def coded(
-    channels: Iterable[Iterable[int]], priors: Mapping[int, Prior] | None = None, known: Known | None = None
-) -> bytes:
-    """A section of coded channels: its parameter block and its ANS stream.
+@dataclass
+class Coder:
+    """Codes channels, whose symbols go to one stream."""
 
-    Symbols outside the window of a prior become exceptions. A prior that is defined already is referred to. priors: of
-    some channels, by their number. known: definitions of the slices before, to which those of this section are added.
-    """
-    block, defined = b"", [] if known is None else known
-    parts, used = list[tuple[np.ndarray, Prior]](), dict[bytes, Prior]()
-    for number, channel in enumerate(channels):
-        k = np.asarray(channel, np.int64)
-        if not k.size:
-            continue
-        prior = (priors or {}).get(number) or default_prior(k)
-        window = prior.window
-        inside = (k >= window.kmin) & (k < window.end)
-        parameters = bytearray()
-        prior.write(parameters)
-        key = bytes([prior.id]) + parameters
-        if key in defined:
-            block += varint(2 * (FIRST_REUSE + defined[::-1].index(key)) + (not inside.all()))
-        else:
-            block += varint(2 * prior.id + (not inside.all())) + parameters
-            defined.append(key)
-        if not inside.all():
-            block += _exceptions(k, inside, window)
-        parts.append((k[inside] - window.kmin, used.setdefault(key, prior)))  # one makes a table for all equal ones
-    return block + ans_encode([symbols for symbols, _ in parts], [prior.cum for _, prior in parts])
+    known: Known
+    choose: Choice
+    parts: list[tuple[list[int], Prior]] = field(default_factory=list)
 
+    def codes(self, which: int, piece: str, channels: Iterable[np.ndarray]) -> bytes:
+        """Tokens, priors and exceptions of channels. A prior that the list has is referred to, and symbols outside its
+        window become exceptions."""
+        out, defined = b"", self.known[which]
+        for number, channel in enumerate(channels):
+            k = channel.ravel().tolist()
+            if not k:
+                continue
+            prior = self.choose(which, piece, number, k)
+            low, end = prior.kmin, prior.kmin + prior.n
+            places = [at for at, v in enumerate(k) if not low <= v < end]
+            if prior in defined:
+                out += varint(2 * (8 + defined[::-1].index(prior)) + bool(places))
+            else:
+                defined.append(prior)
+                out += varint(2 * prior.family + bool(places)) + prior.parameters()
+            out += varint(len(places) - 1) if places else b""
+            for last, at in zip([-1, *places], places):  # noqa: B905
+                out += varint(at - last - 1, 2 * (k[at] - end) if k[at] >= end else 2 * (low - 1 - k[at]) + 1)
+            self.parts.append(([v - low for v in k if low <= v < end], prior))
+        return out
 
-def _exceptions(k: np.ndarray, inside: np.ndarray, window: Window) -> bytes:
-    places = np.flatnonzero(~inside).tolist()
-    out = varint(len(places) - 1)
-    for last, at in zip([-1, *places], places, strict=False):
-        below = 2 * (window.kmin - 1 - int(k[at])) + 1
-        out += varint(at - last - 1, below if below > 0 else 2 * (int(k[at]) - window.end))
-    return out
-
-
-def positions(cells: np.ndarray, coder: Coder) -> bytes:
-    """Section POSITIONS of int32 [n, 3] in Morton order (clause 10)."""
-    head, channels = position_channels(cells)
-    return head + coder(channels)
-
-
-def graded_part(classes: np.ndarray, length: int | None = None, coder: Coder = coded) -> bytes:
-    """The step classes of the rows as the attributes section has them. length: stated instead of the true one."""
-    if not classes.size:
-        return b""
-    section = coder([classes])
-    return varint(len(section) if length is None else length) + section
+    def stream(self) -> bytes:
+        """Clause 7.5, run backwards from state 0."""
+        x, out = 0, list[int]()
+        for entries, prior in reversed(self.parts):
+            spans = {s: (prior.cum(s), prior.cum(s + 1)) for s in set(entries)} if prior.n > 1 else {}
+            for s in reversed(entries if spans else []):
+                low, high = spans[s]
+                if x >= high - low << 40:
+                    out.append(x & 0xFFFFFFFF)
+                    x >>= 32
+                x = (x // (high - low) << 24) + x % (high - low) + low
+        while x:
+            out.append(x & 0xFFFFFFFF)
+            x >>= 32
+        return words(*reversed(out))
 
 
-def relative_magnitude(e: np.ndarray) -> np.ndarray:
-    """int64 [n] of residuals int64 [m, n] (clause 8.7)."""
-    parts = (abs(c) * 256 * e.shape[1] // (1 + int(abs(c).sum())) for c in e)
-    return sum(parts, np.zeros(e.shape[1], np.int64))
+# -- positions (clause 10) ---------------------------------------------------------------------------------------------
+
+
+def morton(cell: Sequence[int]) -> int:
+    """Clause 10.1: binary digits read as octal ones lie three bits apart."""
+    return sum(int(f"{v:b}", 8) << axis for axis, v in enumerate(cell))
+
+
+def morton_order(cells: np.ndarray) -> list[int]:
+    """The rows of int [n, 3] in Morton order."""
+    codes = [morton(cell) for cell in (cells.astype(np.int64) - cells.min(axis=0, initial=1 << 21)).tolist()]
+    return sorted(range(len(codes)), key=codes.__getitem__)
+
+
+def octree(cells: np.ndarray) -> tuple[bytes, list[np.ndarray]]:
+    """Head, counts and channels of int32 [n, 3] in Morton order."""
+    low = cells.min(axis=0)
+    depth = int((cells.astype(np.int64) - low).max()).bit_length()
+    codes, patterns = [morton(cell) for cell in (cells - low).tolist()], dict[int, list[int]]()
+    out, channels = zigzag(*low.tolist()) + bytes([depth]), list[list[int]]()
+    counts, only = {k: list[int]() for k in range(2, 9)}, {0: False}
+    for level in range(depth - 1, -1, -1):
+        children = dict[int, list[int]]()
+        for node in sorted({code >> 3 * level for code in codes}):
+            children.setdefault(node >> 3, []).append(node & 7)
+        if len(children) < len(codes):
+            single = [len(own) for own in children.values()].count(1)
+            out += varint(single, sum(map(len, children.values())) - 2 * len(children) + single)
+            channels += [
+                [len(children[node]) - 1 for node in children if only[node] == alone] for alone in (True, False)
+            ]
+        channels.append([own[0] for own in children.values() if len(own) == 1])
+        only = {8 * node + c: len(own) == 1 for node, own in children.items() for c in own}
+        for own in children.values():
+            if len(own) > 1:
+                counts[len(own)].append(sum(1 << c for c in own))
+    for k in range(2, 8) if len(codes) > 1 else ():
+        patterns[k] = [byte for byte in range(256) if byte.bit_count() == k]
+        channels.append([patterns[k].index(byte) for byte in counts[k]])
+        out += varint(len(counts[k]))
+    return out, [np.array(channel, np.int64) for channel in channels]
+
+
+# -- grids (clauses 8.6, 8.7 and 11.3) ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Grid:
+    """fill: makes the samples of one plane from its number and shape [C, H, W]."""
+
+    channels: int = 2
+    sides: tuple[int, ...] = (3, 2, 4, 2)
+    predictors: tuple[int, ...] | None = None  #: all 0 if None
+    fill: Callable[[int, tuple[int, ...]], np.ndarray] = lambda number, shape: pattern(*shape, seed=number)
+    id: int = 0
+
+    def row(self) -> list[Any]:
+        """As it stands in the parameters."""
+        return [self.id, self.channels, list(self.sides), list(self.predictors or [0] * len(self.shapes()))]
+
+    def shapes(self) -> list[tuple[int, int, int]]:
+        """[C, H, W] of each plane."""
+        pairs = PAIRS.get(len(self.sides))
+        return (
+            [(self.channels, self.sides[j], self.sides[i]) for i, j in pairs]
+            if pairs
+            else [(self.channels, 1, self.sides[0])]
+        )
+
+    def planes(self) -> list[np.ndarray]:
+        """Samples int32 [C, H, W]."""
+        return [self.fill(number, shape) for number, shape in enumerate(self.shapes())]
+
+
+def constant(value: int) -> Callable[[int, tuple[int, ...]], np.ndarray]:
+    """A `fill` of one symbol."""
+    return lambda number, shape: np.full(shape, value, np.int32)
+
+
+def residual(predictor: int, k: np.ndarray) -> np.ndarray:
+    """int64 [C, H, W] of samples (clause 11.3)."""
+    k = k.astype(np.int64)
+    if not k.size:
+        return k
+    west, north, corner = (np.zeros_like(k) for _ in range(3))
+    west[:, :, 1:], north[:, 1:], corner[:, 1:, 1:] = k[:, :, :-1], k[:, :-1], k[:, :-1, :-1]
+    north[:, 0] = corner[:, 0] = west[:, 0]
+    west[:, 1:, 0] = corner[:, 1:, 0] = north[:, 1:, 0]
+    if predictor == 0:
+        return k - north
+    low, high = np.minimum(west, north), np.maximum(west, north)
+    return k - np.maximum(low, np.minimum(high, west + north - corner))
 
 
 def classes_of_plane(e: np.ndarray) -> np.ndarray:
-    """Class 0..7 [H·W] of each cell, by residuals int64 [m, H, W] of the stages before (clause 8.6)."""
+    """Class 0..7 [H·W] of each cell, by residuals int64 [m, H, W] of the stages before."""
     _, height, width = e.shape
-    size = relative_magnitude(e.reshape(len(e), -1)).reshape(height, width)
-    i, j = np.indices((height, width))
-    near = itertools.product((-1, 0, 1), repeat=2)
-    parts = (size[np.clip(i + a, 0, height - 1), np.clip(j + b, 0, width - 1)] for a, b in near)
-    activity = sum(parts, np.zeros_like(size)).ravel()
+    size = sum((abs(c) * 256 * c.size // (1 + int(abs(c).sum())) for c in e), np.zeros((height, width), np.int64))
+    size = np.pad(size, 1, mode="edge")
+    near = itertools.product(range(3), repeat=2)
+    activity = sum(size[a : a + height, b : b + width] for a, b in near).ravel()  # type: ignore[union-attr]
     bounds = np.sort(activity)[[i * len(activity) // 8 for i in range(1, 8)]]
     return np.searchsorted(bounds, activity, side="right")
 
 
-Lengths = Callable[[list[int]], list[int]]
-StagePriors = Mapping[int, Mapping[int, Prior]]  # by stage, then by channel of the stage
-
-
-def coded_planes(
-    planes: Sequence[np.ndarray],
-    lengths: Lengths = lambda sizes: sizes,
-    tail: bytes = b"",
-    priors: StagePriors | None = None,
-) -> bytes:
-    """Section PLANES of residuals int32 [C, H, W] (clause 8.6). lengths: the stated ones of all stages but the last,
-    from the true ones."""
-    payloads = [coded(stage, (priors or {}).get(number)) for number, stage in enumerate(plane_stages(planes))]
-    return varint(*lengths([len(p) for p in payloads[:-1]])) + b"".join(payloads) + tail
-
-
-def plane_stages(planes: Sequence[np.ndarray]) -> list[list[np.ndarray]]:
-    """The channels of the stages of clause 8.6."""
-    stages = []
-    for stage in range(max(1, (len(planes[0]) - 1).bit_length())):
-        first, end, channels = (1 << stage if stage else 0), 2 << stage, list[np.ndarray]()
-        for plane in planes:
-            e = plane.astype(np.int64)
-            classes = classes_of_plane(e[:first]) if stage else None
+def grid_channels(planes: Sequence[np.ndarray]) -> Iterator[np.ndarray]:
+    """The coded channels of residuals int64 [C, H, W], stage by stage."""
+    first, end = 0, 2
+    while any(first < len(e) for e in planes):
+        for e in planes:
+            classes = classes_of_plane(e[:first]) if 0 < first < len(e) and e.size else None
             for channel in map(np.ravel, e[first:end]):
-                channels += [channel] if classes is None else [channel[classes == q] for q in range(8)]
-        stages.append(channels)
-    return stages
-
-
-# -- LZMA sections (clause 9) ------------------------------------------------------------------------------------------
-
-
-def lzma_symbols(
-    channels: Sequence[np.ndarray],
-    *,
-    base: int | None = 0,
-    width: int | None = None,
-    planar: bool = False,
-    stream: Callable[[bytes], bytes] = lzma2.stored,
-) -> bytes:
-    """Section SYMBOLS. base: of all channels; None takes the first symbol of each. width: log2 of the bytes of every
-    number; None takes the narrowest."""
-    out, data = bytes([planar]), b""
-    for channel in channels:
-        if channel.size:
-            own = int(channel[0]) if base is None else base
-            v = channel.astype(np.int64) - own
-            reach = max(int(v.max()) + 1, -int(v.min()))
-            w = (reach > 1 << 7) + (reach > 1 << 15) if width is None else width
-            out += varint(4 * (2 * own if own >= 0 else -2 * own - 1) + w)
-            numbers = v.astype(("<i1", "<i2", "<i4")[w])
-            data += numbers.view(np.uint8).reshape(-1, numbers.itemsize).T.tobytes() if planar else numbers.tobytes()
-    return out + stream(data)
+                yield from [channel] if classes is None else (channel[classes == q] for q in range(8))
+        first, end = end, 2 * end
 
 
 # -- layers (clause 6) -------------------------------------------------------------------------------------------------
@@ -250,85 +354,124 @@ def lzma_symbols(
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """A slice of a layer: what it means, and its parameters and sections as they are written.
+    """A slice of a layer: what it means, and its parameters, codes and stream as they are written.
 
-    planes, weights: symbols. residuals: of the planes. meta: the layer parameters without the lengths of the sections.
+    rows, layer_rows: symbols [C, n] and [C, earlier rows + n] of each tensor. earlier: step classes of the earlier rows
+    in a first slice. planes: samples. chains: weights and biases. meta: the parameters but that of the codes' length.
+    tree: instead of the octree of the cells. pieces: of the codes, by what they code.
     """
 
     number: int
-    widths: Widths
     cells: np.ndarray
     rises: np.ndarray
     codes: np.ndarray
-    classes: np.ndarray
-    attributes: np.ndarray
+    classes: np.ndarray | None
+    earlier: np.ndarray
+    rows: list[np.ndarray]
+    layer_rows: list[np.ndarray]
     planes: list[np.ndarray]
-    residuals: list[np.ndarray]
-    weights: list[np.ndarray]
+    predictors: list[int]
+    chains: list[np.ndarray]
     meta: dict[int, Any]
-    sections: dict[int, bytes] = field(default_factory=dict)
+    choose: Choice
+    tree: tuple[bytes, list[np.ndarray]] | None = None
+    pieces: dict[str, bytes] = field(default_factory=dict)
+    stream: bytes = b""
+
+    @property
+    def residuals(self) -> list[np.ndarray]:
+        """Of the planes."""
+        return [residual(p, k) for p, k in zip(self.predictors, self.planes, strict=True)]
+
+    def written(self, known: Known | None = None) -> Layer:
+        """With its codes and its stream in mode ans. known: the prior lists of the slices before, which it extends."""
+        known = Known() if known is None else known
+        known[2].clear()
+        coder, pieces, classes = Coder(known, self.choose), dict[str, bytes](), self.classes
+        if len(self.cells):
+            head, channels = self.tree or octree(self.cells)
+            pieces["positions"] = head + coder.codes(0, "positions", channels)
+        rows = [[channel for tensor in own for channel in tensor] for own in (self.rows, self.layer_rows)]
+        if classes is not None:
+            split = zip(rows, (classes, np.append(self.earlier, classes)), strict=True)
+            rows = [[channel[c == q] for channel in own for q in range(7)] for own, c in split]
+        pieces["rises"] = coder.codes(1, "rises", [self.rises])
+        pieces["masks"] = coder.codes(1, "masks", [self.codes])
+        pieces["classes"] = coder.codes(1, "classes", [] if classes is None else [classes])
+        pieces["rows"] = coder.codes(1, "rows", rows[0])
+        pieces["layer_rows"] = coder.codes(1, "layer_rows", rows[1])
+        pieces["grids"] = coder.codes(2, "grids", grid_channels(self.residuals))
+        pieces["chains"] = coder.codes(2, "chains", self.chains)
+        return replace(self, pieces=pieces, stream=coder.stream())
+
+    def channels(self) -> list[np.ndarray]:
+        """Those of mode lzma."""
+        cells = np.diff(self.cells.astype(np.int64), axis=0, prepend=0).T if len(self.cells) else []
+        planes = [channel for e in self.residuals for channel in e]
+        rows = [channel for tensor in (*self.rows, *self.layer_rows) for channel in tensor]
+        return [
+            *cells,
+            self.rises,
+            self.codes,
+            *([] if self.classes is None else [self.classes]),
+            *rows,
+            *planes,
+            *self.chains,
+        ]
+
+    def packed(
+        self,
+        stream: Callable[[bytes], bytes] = lzma2.packed,
+        base: int | None = 0,
+        width: int | None = None,
+        channels: Sequence[np.ndarray] | None = None,
+    ) -> Layer:
+        """With its codes and its stream in mode lzma. base: of all channels; None takes the first symbol of each.
+        width: log2 of the bytes of every number; None takes the narrowest. channels: other ones."""
+        codes, data = b"", b""
+        for channel in self.channels() if channels is None else channels:
+            k = channel.ravel().astype(np.int64)
+            if k.size:
+                own = int(k[0]) if base is None else base
+                v = k - own
+                reach = max(int(v.max()) + 1, -int(v.min()))
+                w = (reach > 1 << 7) + (reach > 1 << 15) if width is None else width
+                codes += varint(4 * (2 * own if own >= 0 else -2 * own - 1) + w)
+                data += v.astype(("<i1", "<i2", "<i4")[w]).view(np.uint8).reshape(-1, 1 << w).T.tobytes()
+        return replace(self, pieces={"lzma": codes}, stream=stream(data) if data else b"")
 
     def parameters(self) -> dict[int, Any]:
-        """The layer parameters."""
-        return {**self.meta, 2: {s: len(self.sections[s]) for s in sorted(self.sections)}}
+        """The parameters."""
+        return dict(sorted({**self.meta, 2: sum(map(len, self.pieces.values()))}.items()))
 
     def payload(self, packed: bytes | None = None) -> bytes:
         """Its bytes. packed: instead of its parameters."""
-        packed = canonical.pack(self.parameters()) if packed is None else packed
-        return struct.pack("<I", len(packed)) + packed + b"".join(self.sections[s] for s in sorted(self.sections))
+        packed = pack(self.parameters()) if packed is None else packed
+        return struct.pack("<I", len(packed)) + packed + b"".join(self.pieces.values()) + self.stream
 
     def padded(self, size: int) -> bytes:
         """Its bytes, with parameters of `size` bytes due to an ignored key."""
-        bare = len(canonical.pack(self.parameters()))
+        bare = len(pack(self.parameters()))
         form = 2 if size - bare - 3 < 1 << 8 else 3
-        return self.payload(canonical.pack({**self.parameters(), 64: bytes(size - bare - 1 - form)}))
+        return self.payload(pack({**self.parameters(), 64: bytes(size - bare - 1 - form)}))
 
-    def with_sections(self, sections: Mapping[int, bytes | None]) -> Layer:
-        """With other bytes in some sections; None takes one out."""
-        both = {**self.sections, **sections}
-        return replace(self, sections={s: data for s, data in both.items() if data is not None})
+    def with_pieces(self, **pieces: bytes) -> Layer:
+        """With other bytes in some pieces of the codes."""
+        return replace(self, pieces={**self.pieces, **pieces})
 
-    @property
-    def flat(self) -> list[np.ndarray]:
-        """The channels of section PLANES."""
-        return [channel.ravel() for plane in self.residuals for channel in plane]
-
-    @property
-    def channels(self) -> list[np.ndarray]:
-        """The channels of section SYMBOLS."""
-        grades = [self.classes] if self.widths.graded else []
-        return [self.rises, self.codes, *grades, *self.attributes, *self.flat, *(w.ravel() for w in self.weights)]
+    def with_meta(self, fields: Mapping[int, Any]) -> Layer:
+        """With other parameters; None takes one out."""
+        return replace(self, meta={k: v for k, v in {**self.meta, **fields}.items() if v is not None})
 
 
-@dataclass(frozen=True)
-class Scale:
-    """One scale of a HexPlane. fill: makes the symbols of one plane from its name and shape."""
-
-    channels: int = 2
-    sides: tuple[int, ...] = (3, 2, 4, 2)
-    predictors: tuple[int, ...] = (0,) * 6
-    fill: Callable[[str, tuple[int, ...]], np.ndarray] = lambda name, shape: pattern(*shape, seed=ord(name[0]))
-
-    def planes(self) -> list[np.ndarray]:
-        """int32 [C, H, W] each, in the order of the format."""
-        return [self.fill(*plane) for plane in plane_shapes(self.channels, self.sides).items()]
-
-
-def constant(value: int) -> Callable[[str, tuple[int, ...]], np.ndarray]:
-    """A `fill` of one symbol."""
-    return lambda name, shape: np.full(shape, value, np.int32)
-
-
-def constant_networks(widths: Mapping[int, Sequence[int]], inputs: Mapping[int, int]) -> dict[int, list[np.ndarray]]:
-    """id -> weight, bias, weight, ..; each of one symbol of its own. widths: id -> outputs. inputs: id -> inputs."""
-    networks, symbol = {}, 2
-    for number, outputs in widths.items():
-        wide, layers = inputs[number], list[np.ndarray]()
-        for out in outputs:
-            layers += [np.full((out, wide), symbol, np.int32), np.full(out, symbol - 5, np.int32)]
-            wide, symbol = out, symbol + 1
-        networks[number] = layers
-    return networks
+def constant_chain(widths: Sequence[int], symbol: int) -> list[np.ndarray]:
+    """weight, bias, weight, ..; each of one symbol of its own, such that Gaussians can be seen. widths: from the input
+    on."""
+    return [
+        array
+        for i, (wide, out) in enumerate(itertools.pairwise(widths))
+        for array in (np.full((out, wide), symbol + i, np.int32), np.full(out, symbol + i + 38, np.int32))
+    ]
 
 
 def line(n: int, z: int = 0) -> list[list[int]]:
@@ -339,7 +482,7 @@ def line(n: int, z: int = 0) -> list[list[int]]:
 def ordered(cells: Any) -> list[list[int]]:
     """Cells in Morton order."""
     array = np.array(cells, np.int32).reshape(-1, 3)
-    return array[morton_order(array)].tolist() if len(array) else []
+    return array[morton_order(array)].tolist()
 
 
 def make_layer(
@@ -350,94 +493,75 @@ def make_layer(
     below: int = 0,
     rises: Sequence[int] | None = None,
     codes: Sequence[int] | None = None,
-    attributes: np.ndarray | None = None,
-    scales: Sequence[Scale] = (),
-    networks: Mapping[int, Sequence[int]] | dict[int, list[np.ndarray]] | None = None,
-    steps: Sequence[float] | None = None,
-    mode: int | None = ANS,
-    widths: Widths = DEFAULT_WIDTHS,
+    rows: Any = None,
+    widths: Sequence[int] = (2, 6, 3),
     classes: Sequence[int] | None = None,
+    earlier: Sequence[int] = (),
+    layer_rows: Sequence[np.ndarray] = (),
+    grids: Sequence[Grid] = (),
+    chains: Mapping[int, Any] | None = None,
+    kind: list[int] | None = None,
+    fill: list[int] | None = None,
+    steps: tuple[float, float] = (2.0**-4, 2.0**-7),
+    priors: Mapping[str, Mapping[int, Prior]] | Choice = {},  # noqa: B006  (never changed)
+    tree: tuple[bytes, list[np.ndarray]] | None = None,
+    known: Known | None = None,
 ) -> Layer:
-    """A layer of `cells` (in Morton order) after `before` earlier rows. below: features of the planes of the layer
-    below.
+    """A slice of `cells` (in Morton order) after `before` earlier rows. below: plane channels of the layers below.
 
-    Defaults: every rise 0, every code 77, attributes all 2; in layer 0 the networks without hidden layers, elsewhere a
-    trunk and the head 1 if there are `scales`. networks: outputs by id, or their weights and biases. mode: None leaves
-    the sections to the caller.
+    Defaults: every rise 0, every code 77, rows all 2; in layer 0 the networks of a scaffold without hidden layers,
+    elsewhere a trunk and the head 1 if there are `grids`. rows: int32 [sum of widths, n]. chains: widths by id, or weight,
+    bias, weight, .. steps: of grids and of chains.
     """
-    n = len(cells)
-    if networks is None:
-        least = {0: (widths.slots,), 1: (7 * widths.slots,), 2: (3 * widths.slots,)} if number == 0 else {}
-        networks = {0: (3,), 1: (3,)} if scales else least
-    if not any(isinstance(x, np.ndarray) for own in networks.values() for x in own):
-        inputs = dict(enumerate(widths.inputs.values()))
-        if number:
-            read = below + sum(s.channels for s in scales)
-            inputs = {i: networks[0][-1] if i else read for i in networks}  # type: ignore[misc]
-        networks = constant_networks(networks, inputs)  # type: ignore[arg-type]
-    planes = [plane for scale in scales for plane in scale.planes()]
-    predictors = [p for s in scales for p in s.predictors]
+    n, slots = len(cells), max(1, widths[-1] // 3)
+    if chains is None:
+        features = below + sum(grid.channels for grid in grids)
+        chains = {0: (features, 3), 1: (3, 3)} if grids else {}
+        if number == 0:
+            chains = {i: (widths[0], outputs * slots) for i, outputs in enumerate((1, 7, 3))}
+    if number and grids and kind is None:
+        kind = [0]
+    symbols = itertools.accumulate([2, *(len(own) - 1 for own in chains.values())])  # a symbol of its own per array
+    made = {
+        i: constant_chain(own, s) if isinstance(own, tuple) else own for (i, own), s in zip(chains.items(), symbols)
+    }  # noqa: B905
     meta: dict[int, Any] = {1: n}
-    if networks:
-        meta[3] = list(steps or ([2.0**-7] if number == 0 else [2.0**-4, 2.0**-6]))
-    if scales:
-        meta[4] = [[s.channels, *s.sides, *s.predictors] for s in scales]
-    if networks:
-        meta[5] = [[i, *(len(bias) for bias in own[1::2])] for i, own in networks.items()]
-    layer = Layer(
+    if fill is not None:
+        meta[3] = fill
+    if grids:
+        meta[4] = [steps[0], *(grid.row() for grid in grids)]
+    if made:
+        meta[5] = [steps[1], *([i, own[0].shape[1], *(len(bias) for bias in own[1::2])] for i, own in made.items())]
+    if kind is not None:
+        meta[6] = kind
+    if layer_rows and chains is not LATER:
+        meta[7] = [[i, len(k), 2.0**-5, i % 2] for i, k in enumerate(layer_rows)]
+    rows = np.full((sum(widths), n), 2, np.int32) if rows is None else np.asarray(rows)
+    planes = [plane for grid in grids for plane in grid.planes()]
+    return Layer(
         number=number,
-        widths=replace(widths, graded=classes is not None),
         cells=np.array(cells, np.int32).reshape(-1, 3),
         rises=np.array([0] * before if rises is None else rises, np.int32),
         codes=np.array([77] * n if codes is None else codes, np.int32),
-        classes=NO_CLASSES if classes is None else np.array(classes, np.int32),
-        attributes=np.full((widths.channels, n), 2, np.int32) if attributes is None else attributes,
+        classes=None if classes is None else np.array(classes, np.int32),
+        earlier=np.array(earlier, np.int32),
+        rows=np.split(rows, np.cumsum(widths)[:-1]),
+        layer_rows=list(layer_rows),
         planes=planes,
-        residuals=[residual(p, k) if k.size else k for p, k in zip(predictors, planes, strict=True)],
-        weights=[w for own in networks.values() for w in own],  # type: ignore[misc]
+        predictors=[p for grid in grids for p in grid.row()[3]][: len(planes)],
+        chains=[array for own in made.values() for array in own],
         meta=meta,
-    )
-    if mode is None:
-        return layer
-    if mode == LZMA:
-        some = any(c.size for c in layer.channels)
-        symbols = lzma_symbols(layer.channels, stream=lzma2.packed) if some else None
-        return layer.with_sections({POSITIONS: positions(layer.cells, coded) if n else None, SYMBOLS: symbols})
-    planes = coded_planes(layer.residuals) if layer.residuals else None
-    weights = coded(w.ravel() for w in layer.weights) if layer.weights else None
-    return Slices().add(layer.with_sections({PLANE: planes, WEIGHTS: weights}))
+        choose=priors if callable(priors) else named(priors),
+        tree=tree,
+    ).written(known)
+
+
+LATER: dict[int, Any] = {}  #: the chains of a slice after the first
 
 
 def later(number: int, cells: Sequence[Sequence[int]], **fields: Any) -> Layer:
     """A slice after the first of its layer."""
-    return make_layer(number, ordered(cells), networks={}, **fields)
-
-
-def _coder() -> Coder:
-    """Of a section that knows what the slices before defined."""
-    return partial(coded, known=[])
-
-
-@dataclass
-class Slices:
-    """Writes the slices of a layer in turn, each with what those before defined. grades: codes step classes."""
-
-    positions: Coder = field(default_factory=_coder)
-    masks: Coder = field(default_factory=_coder)
-    attributes: Coder = field(default_factory=_coder)
-    grades: Coder = coded
-
-    def add(self, layer: Layer) -> Layer:
-        """The slice as it is written."""
-        sections, k, classes = dict[int, bytes | None](), layer.attributes, layer.classes
-        if layer.codes.size:
-            sections[POSITIONS] = positions(layer.cells, self.positions)
-        if layer.rises.size or layer.codes.size:
-            sections[MASKS] = self.masks([layer.rises, layer.codes])
-        if layer.codes.size:
-            channels = [c[classes == q] for c in k for q in range(7)] if classes.size else list(k)
-            sections[ATTRIBUTES] = graded_part(classes, coder=self.grades) + self.attributes(channels)
-        return layer.with_sections(sections)
+    return make_layer(number, ordered(cells), **{"chains": LATER, **fields})
 
 
 # -- files (clause 3) --------------------------------------------------------------------------------------------------
@@ -496,7 +620,7 @@ class File:
 
     def header_bytes(self) -> bytes:
         """The header."""
-        return canonical.pack(self.fields()) if self.packed is None else self.packed
+        return pack(self.fields()) if self.packed is None else self.packed
 
     def start(self, index: int) -> int:
         """Offset of a chunk; that of the end of the file for the number of chunks."""
@@ -505,19 +629,13 @@ class File:
     @property
     def scene_id(self) -> bytes:
         """Clause 3.3, of the header as it is written. Where its chunk list is not there, of all its bytes."""
-        header, fields = self.header_bytes(), self.fields()
-        chunk_list = canonical.pack(1) + canonical.pack(fields[1]) if 1 in fields else header
-        described = header[header.find(chunk_list) + len(chunk_list) :] if chunk_list in header else header
-        return hashlib.sha256(described).digest()[:8]
+        return scene_id_of(self.header_bytes(), self.fields())
 
     def data(self) -> bytes:
         """Its bytes."""
-        header, scene_id = self.header_bytes(), self.scene_id
-        declared = len(header) if self.declared is None else self.declared
-        front = struct.pack("<8sHHI", self.signature, self.major, self.minor, declared)
-        crc = zlib.crc32(header, zlib.crc32(front)) ^ self.crc
-        frames = b"".join(c.frame(scene_id) for c in self.chunks)
-        return front + struct.pack("<I", crc) + header + frames + self.tail
+        frames = b"".join(c.frame(self.scene_id) for c in self.chunks)
+        front = preamble(self.header_bytes(), self.declared, self.signature, self.major, self.minor, self.crc)
+        return front + frames + self.tail
 
     def with_header(self, fields: Mapping[int, Any]) -> File:
         """With other fields in the header; the value None takes one out."""
@@ -528,6 +646,10 @@ class File:
         chunks = list(self.chunks)
         chunks[index] = replace(chunks[index], **fields)
         return replace(self, chunks=tuple(chunks))
+
+    def with_layer(self, index: int, layer: Layer, meaning: bool = False) -> File:
+        """With other bytes for a slice, which mean what they did, or what `layer` says."""
+        return self.with_chunk(index, payload=layer.payload(), **({"layer": layer} if meaning else {}))
 
     def layer(self, index: int) -> Layer:
         """The meaning of a layer's chunk."""
@@ -542,7 +664,27 @@ class File:
     def hashes(self, chunks: int | None = None) -> list[dict[str, Any]]:
         """Clause 12.4 of the layers among the first `chunks` chunks, from what they mean."""
         layers = [c.layer for c in self.chunks[:chunks] if c.layer is not None]
-        return [_hashes(list(own), self.header) for _, own in itertools.groupby(layers, key=lambda x: x.number)]
+        return [_hashes(list(own), self.fields()) for _, own in itertools.groupby(layers, key=lambda x: x.number)]
+
+
+def preamble(
+    header: bytes,
+    declared: int | None = None,
+    signature: bytes = SIGNATURE,
+    major: int = MAJOR,
+    minor: int = 0,
+    crc: int = 0,
+) -> bytes:
+    """The file's bytes up to the first chunk."""
+    front = struct.pack("<8sHHI", signature, major, minor, len(header) if declared is None else declared)
+    return front + struct.pack("<I", zlib.crc32(header, zlib.crc32(front)) ^ crc) + header
+
+
+def scene_id_of(header: bytes, fields: Mapping[int, Any]) -> bytes:
+    """fields: what the header says. Where its chunk list is not there, of all its bytes."""
+    chunk_list = pack(1) + pack(fields[1]) if 1 in fields else header
+    described = header[header.find(chunk_list) + len(chunk_list) :] if chunk_list in header else header
+    return hashlib.sha256(described).digest()[:8]
 
 
 def make_file(*layers: Layer, header: Mapping[int, Any] | None = None) -> File:
@@ -552,33 +694,56 @@ def make_file(*layers: Layer, header: Mapping[int, Any] | None = None) -> File:
         own = list(slices)
         flags = [i << 6 | 2 * (i + 1 < len(own)) for i in range(len(own))]
         chunks += [Chunk(number, x.payload(), f, x) for f, x in zip(flags, own, strict=True)]
-    widths = layers[0].widths
-    views = sum(1 << i for i, inputs in enumerate(widths.inputs.values()) if inputs > widths.feature)
-    centres = {3: [i % 5 - 2 for i in range(widths.channels)]} if widths.graded else {}
-    return File(tuple(chunks)).with_header({15: [widths.feature, widths.slots, views], **centres, **(header or {})})
+    widths = [len(tensor) for tensor in layers[0].rows]
+    rows = [[i, width, STEPS[i % 3], 0] for i, width in enumerate(widths)]
+    centres = {} if layers[0].classes is None else {5: [i % 5 - 2 for i in range(sum(widths))]}
+    return File(tuple(chunks)).with_header({3: [0, widths[-1] // 3, 0], 4: rows, **centres, **(header or {})})
+
+
+def slices_of(*parts: Layer) -> File:
+    """A file of slices, which refer to the priors of those before."""
+    known = {part.number: Known() for part in parts}
+    return make_file(*[layer.written(known[layer.number]) for layer in parts])
+
+
+def row_values(k: np.ndarray, classes: Any, centres: Any, predictor: int, mend: bool = False) -> np.ndarray:
+    """int64 [C, n] of symbols (clause 11.2). mend: put 0 in the places of symbols that lead out of the range."""
+    last = np.repeat(np.array(centres, np.int64)[:, None], 7, axis=1)
+    v = np.zeros(k.shape, np.int64)
+    for row, c in enumerate(np.broadcast_to(classes, k.shape[1:]).tolist()):
+        v[:, row] = last[:, c] + (k[:, row].astype(np.int64) << c)
+        if mend:
+            k[abs(v[:, row]) > 1 << 23, row] = 0
+            v[:, row] = np.where(k[:, row], v[:, row], last[:, c])
+        if predictor:
+            last[:, c:] = v[:, row, None]
+    return v
 
 
 def _hashes(slices: list[Layer], header: Mapping[int, Any]) -> dict[str, Any]:
-    first, d, slots = slices[0], slices[0].widths.feature, slices[0].widths.slots
-    cells = np.concatenate([x.cells for x in slices])
-    order = morton_order(cells) if len(cells) else slice(None)
-    codes, classes = (np.concatenate([getattr(x, name) for x in slices]) for name in ("codes", "classes"))
-    k = np.concatenate([x.attributes for x in slices], axis=1)[:, order]
-    classes = classes[order] if classes.size else classes
-    values = k.astype(np.int64) << (classes if classes.size else 0)
-    values += np.array(header.get(3, [0] * len(k)), np.int64)[:, None]
-
-    def dequantised(symbols: np.ndarray, step: Any) -> np.ndarray:
-        return (symbols.astype(np.float64) * np.asarray(step, np.float64)).astype("<f4")
-
-    x = dequantised(values, np.repeat(header[4], [d, 6, 3 * slots])[:, None])
-    tensors = [dequantised(cells[order], header[5]), x[:d].T, x[d : d + 6].T, x[d + 6 :].T]
-    tensors += [dequantised(p, first.meta[3][0]) for p in first.planes]
-    tensors += [dequantised(w, first.meta[3][-1]) for w in first.weights]
-    symbols = [cells[order], first.rises, codes[order], classes, k, *first.planes, *first.weights]
-    digests = [hashlib.sha256(b"".join(a.tobytes() for a in own)).hexdigest() for own in (
-        [a.astype("<i4") for a in symbols], tensors)]  # fmt: skip
-    return {"layer": first.number, "symbols": digests[0], "tensors": digests[1]}
+    first = slices[0]
+    cells, codes = (np.concatenate([getattr(x, name) for x in slices]) for name in ("cells", "codes"))
+    order, before = morton_order(cells), len(first.rises)
+    arrays = [(cells[order], header[6]), (first.rises, 0), (codes[order], 0)]
+    if first.classes is not None:
+        arrays.append((np.concatenate([x.classes for x in slices])[order], 0))
+    centres = np.array(header.get(5, [0] * sum(row[1] for row in header[4])))
+    for i, (_, width, step, predictor) in enumerate(header[4]):
+        own, centres = centres[:width], centres[width:]
+        k = [row_values(x.rows[i], 0 if x.classes is None else x.classes, own, predictor) for x in slices]
+        arrays.append((np.concatenate(k, axis=1)[:, order], step))
+    for i, (_, width, step, predictor) in enumerate(first.meta.get(7, ())):
+        classes = [0 if x.classes is None else np.append(x.earlier, x.classes) for x in slices]
+        k = [row_values(x.layer_rows[i], c, [0] * width, predictor) for x, c in zip(slices, classes, strict=True)]
+        k[:1] = np.split(k[0], [before], axis=1)
+        arrays.append((np.concatenate([k[0], np.concatenate(k[1:], axis=1)[:, order]], axis=1), step))
+    tensors = [a.T if i else a for i, a in enumerate(a.astype(np.float64) * step for a, step in arrays if step)]
+    tensors += [a * first.meta[4][0] for a in first.planes] + [a * first.meta[5][0] for a in first.chains]
+    symbols = [*(a for a, _ in arrays), *first.planes, *first.chains]
+    forms = (("symbols", "<i4", symbols), ("tensors", "<f4", tensors))
+    return {"layer": first.number} | {
+        name: hashlib.sha256(b"".join(a.astype(form).tobytes() for a in own)).hexdigest() for name, form, own in forms
+    }
 
 
 # -- vectors -----------------------------------------------------------------------------------------------------------
@@ -588,7 +753,7 @@ def _hashes(slices: list[Layer], header: Mapping[int, Any]) -> dict[str, Any]:
 class Vector:
     """One file of spec/vectors. layers: the hashes of all layers that decode. error: a name of clause 15, None for a
     valid file. chunk, offset: of the fault, if it lies in a chunk and at a field that the frame fixes. slices: the
-    layer of each slice that decodes."""
+    layer of each slice that decodes. scene: the error of clause 13 where the tensors make no scene."""
 
     name: str
     what: str
@@ -599,3 +764,4 @@ class Vector:
     error: str | None = None
     chunk: int | None = None
     offset: int | None = None
+    scene: str | None = None

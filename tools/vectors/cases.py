@@ -10,8 +10,9 @@ separated by ` ; `, edits one thing of it; lengths, CRCs, digest and scene ids a
     header.4.1 = 0.0     a field of the header by its keys and places (None takes it out)
     header += 40cc7f     one entry more in the map of the header, as bytes
     header := bytes      the header, as bytes
-    layer1.5.0 = [0, 3]  a field of the parameters of chunk 1; += and := as for the header
-    section1.2 = bytes   a section of chunk 1
+    layer1.5.0 = 0.5     a field of the parameters of chunk 1; += and := as for the header
+    codes1.masks = bytes the codes of chunk 1 for what `blocks.Layer.pieces` names
+    stream1 = bytes      the stream of chunk 1
     payload1 = bytes     the payload of chunk 1
     chunk1.flags = 4     a field of `blocks.Chunk`
     chunks = [...]       the chunks, `c` in the expression
@@ -22,9 +23,9 @@ separated by ` ; `, edits one thing of it; lengths, CRCs, digest and scene ids a
 
 Values are Python expressions over the names of blocks.py and of this file. `it` is the value before, `base` the file,
 n(i) the length of the payload of chunk i. Options: `!Error` and clauses in place of those of the group, `@2` the
-chunk at fault (`@end` behind all chunks) where it does not follow from the first patch. `for a: x | b: y` writes the
-line once for each name and value, in the places of {i} and {x}. `let name = value` defines a name for later lines.
-Without a sentence the name and the patch are the description.
+chunk at fault (`@end` behind all chunks) where it does not follow from the first patch, `~Error` the error of a scene
+whose tensors decode. `for a: x | b: y` writes the line once for each name and value, in the places of {i} and {x}.
+`let name = value` defines a name for later lines. Without a sentence the name and the patch are the description.
 """
 
 from __future__ import annotations
@@ -39,41 +40,12 @@ from typing import Any
 
 import numpy as np
 
-import pd4dgs_codec.entropy.priors
-from pd4dgs_codec.entropy.priors import Const, Prior, Window
-from pd4dgs_codec.format import canonical
-from pd4dgs_codec.format.planes import restore
-
 from . import blocks, lzma2
-from .blocks import (
-    ATTRIBUTES,
-    LZMA,
-    MASKS,
-    PLANE,
-    SMALL,
-    SYMBOLS,
-    WEIGHTS,
-    File,
-    Layer,
-    Scale,
-    Slices,
-    Vector,
-    coded,
-    coded_planes,
-    constant,
-    gauss,
-    graded_part,
-    later,
-    line,
-    lzma_symbols,
-    make_file,
-    make_layer,
-    pattern,
-    varint,
-)
+from .blocks import LZMA, File, Grid, Layer, Prior, Vector, constant, later, line, make_file, make_layer, pack, pattern
 
 TABLE = Path(__file__).with_name("table.txt")
 M, K, ROWS = 1 << 23, 1 << 24, 40
+WIDE = (32, 6, 30)  #: channels of the tensors of rows, where a vector needs many
 LEAST, LARGEST, SUBNORMAL = 2.0**-126, (2.0 - 2.0**-23) * 2.0**127, 2.0**-127
 FRAME = {"type": 0, "flags": 2, "length": 4, "scene_id": 8}  # offsets in a chunk
 PREAMBLE = {"signature": 0, "major": 8, "declared": 12, "crc": 16}
@@ -84,7 +56,7 @@ PREAMBLE = {"signature": 0, "major": 8, "declared": 12, "crc": 16}
 
 def vectors() -> Iterator[Vector]:
     """All vectors, in the order of the table."""
-    names: dict[str, Any] = {**vars(pd4dgs_codec.entropy.priors), **vars(blocks), **globals()}
+    names: dict[str, Any] = {**vars(blocks), **globals()}
     bases: dict[str, File] = {}
     group = ("", "", "", "")
     for text in _lines():
@@ -107,7 +79,7 @@ def vectors() -> Iterator[Vector]:
 
 def _lines() -> Iterator[str]:
     """One line for each vector: continuations are joined, and lines with `for` are written out."""
-    text = re.sub(r"\n +(?=[#!@]|for [\w-]+: |\d[\d. ]*(?:  |\n))", "  ", TABLE.read_text(encoding="utf-8"))
+    text = re.sub(r"\n +(?=[#!@~]|for [\w-]+: |\d[\d. ]*(?:  |\n))", "  ", TABLE.read_text(encoding="utf-8"))
     text = re.sub(r"\n +", " ", text)
     for row in text.splitlines():
         head, found, values = row.partition("  for ")
@@ -120,10 +92,12 @@ def _lines() -> Iterator[str]:
 def _vector(text: str, folder: str, base: File, clauses: str, error: str | None, names: dict[str, Any]) -> Vector:
     text, _, what = text.partition("  # ")
     name, patches, *options = re.split(r" {2,}", text.strip())
-    target: Any = None
+    target = scene = None
     for option in options:
         if option.startswith("!"):
             error = option[1:]
+        elif option.startswith("~"):
+            scene = option[1:]
         elif option.startswith("@"):
             target = option[1:]
         else:
@@ -144,7 +118,7 @@ def _vector(text: str, folder: str, base: File, clauses: str, error: str | None,
     sentence = what or f"{name.replace('-', ' ').capitalize()}: {patches}"
     layers, slices = file.hashes(count), file.slices(count)
     place = (chunk, at) if error else (None, None)
-    return Vector(f"{folder}/{name}", sentence, tuple(clauses.split()), data, layers, slices, error, *place)
+    return Vector(f"{folder}/{name}", sentence, tuple(clauses.split()), data, layers, slices, error, *place, scene)
 
 
 def _patched(file: File, patch: str, edits: list[Any], names: dict[str, Any]) -> tuple[File, Any]:
@@ -156,7 +130,6 @@ def _patched(file: File, patch: str, edits: list[Any], names: dict[str, Any]) ->
     def value(it: Any = None) -> Any:
         return eval(right, names | {"it": it})
 
-    number = int(index) if index else None
     if target == "":
         return value(file), None
     if target in ("cut", "xor"):
@@ -174,21 +147,21 @@ def _patched(file: File, patch: str, edits: list[Any], names: dict[str, Any]) ->
             fields = _set(file.fields(), [int(k) for k in keys], value)
             return file.with_header({int(keys[0]): fields.get(int(keys[0]))}), (None, None)
         return replace(file, packed=_bytes(op, right, file.header_bytes(), value)), (None, None)
-    assert number is not None
+    number = int(index)
     if target == "chunk":
         at = 16 + len(file.chunks[number].payload) if keys[0] == "crc" else FRAME.get(keys[0])
         return file.with_chunk(number, **{keys[0]: value(getattr(file.chunks[number], keys[0]))}), (number, at)
     if target == "payload":
         return file.with_chunk(number, payload=value(file.chunks[number].payload)), (number, None)
-    layer = file.layer(number)
-    if target == "section":
-        layer = layer.with_sections({int(keys[0]): value(layer.sections.get(int(keys[0])))})
-        return file.with_chunk(number, payload=layer.payload()), (number, None)
-    assert target == "layer"
-    if op == "=":
-        packed = canonical.pack(_set(layer.parameters(), [int(k) for k in keys], value))
+    layer, packed = file.layer(number), None
+    if target == "codes":
+        layer = layer.with_pieces(**{keys[0]: value(layer.pieces.get(keys[0]))})
+    elif target == "stream":
+        layer = replace(layer, stream=value(layer.stream))
+    elif op == "=":
+        packed = pack(_set(layer.parameters(), [int(k) for k in keys], value))
     else:
-        packed = _bytes(op, right, canonical.pack(layer.parameters()), value)
+        packed = _bytes(op, right, pack(layer.parameters()), value)
     return file.with_chunk(number, payload=layer.payload(packed)), (number, None)
 
 
@@ -236,34 +209,32 @@ def _finished(file: File, edits: list[Any]) -> tuple[bytes, int | None]:
 
 def three_layers(**fields: Any) -> File:
     """Layers 0, 1 and 2 with anchors, rises and deformations of their own."""
-    first = make_layer(0, line(3), codes=[3, 77, 200], attributes=pattern(68, 3))
-    second = make_layer(1, line(2, z=5), before=3, rises=[0, 1, 5], codes=[9, 255], scales=[Scale()])
-    k, rises = pattern(68, 1, seed=4), [252, 0, 50, 3, 0]
-    third = make_layer(2, line(1, z=9), before=5, below=2, rises=rises, scales=[Scale()], attributes=k)
+    first = make_layer(0, line(3), codes=[3, 77, 200], rows=pattern(11, 3))
+    second = make_layer(1, line(2, z=5), before=3, rises=[0, 1, 5], codes=[9, 255], grids=[Grid()])
+    k, rises = pattern(11, 1, seed=4), [252, 0, 50, 3, 0]
+    third = make_layer(2, line(1, z=9), before=5, below=2, rises=rises, grids=[Grid()], rows=k)
     return make_file(first, second, third, **fields)
 
 
-def rows(count: int = 3, **fields: Any) -> File:
+def anchors(count: int = 3, header: Any = None, **fields: Any) -> File:
     """Layer 0 with so many anchors in a row."""
-    return make_file(make_layer(0, line(count), **fields))
+    return make_file(make_layer(0, line(count), **fields), header=header)
 
 
-def deformed(*scales: Scale, number: int = 1, **fields: Any) -> File:
+def tables(*widths: int, n: int = 2, header: Any = None, **fields: Any) -> File:
+    """Rows of these widths in a scene of unknown kind, without chains."""
+    k = np.concatenate([pattern(width, n, seed=i) for i, width in enumerate(widths)])
+    return anchors(n, {3: [7], **(header or {})}, widths=widths, rows=k, chains={}, **fields)
+
+
+def deformed(*grids: Grid, number: int = 1, **fields: Any) -> File:
     """One anchor in layer 0, and a deformation in layer 1."""
-    return make_file(make_layer(), make_layer(number, (), before=1, scales=scales, **fields))
+    return make_file(make_layer(), make_layer(number, (), before=1, grids=grids, **fields))
 
 
-def slices_of(*parts: Layer) -> File:
-    """A file of slices, which refer to the priors of those before."""
-    written = dict[int, Slices]()
-    return make_file(*[written.setdefault(layer.number, Slices()).add(layer) for layer in parts])
-
-
-def with_meta(file: File, chunk: int, fields: dict[int, Any], sections: Any = None) -> File:
-    """With other parameters (None takes one out) and sections in one layer."""
-    layer = file.layer(chunk).with_sections(sections or {})
-    meta = {k: v for k, v in sorted({**layer.meta, **fields}.items()) if v is not None}
-    return file.with_chunk(chunk, payload=replace(layer, meta=meta).payload())
+def with_meta(file: File, chunk: int, fields: dict[int, Any], **pieces: bytes) -> File:
+    """With other parameters (None takes one out) and pieces of the codes in one slice."""
+    return file.with_layer(chunk, file.layer(chunk).with_meta(fields).with_pieces(**pieces))
 
 
 def take(file: File, *order: int) -> File:
@@ -271,52 +242,39 @@ def take(file: File, *order: int) -> File:
     return replace(file, chunks=tuple(file.chunks[i] for i in order)).with_header({14: file.fields()[14]})
 
 
-def with_section(number: int, data: bytes, file: File, chunk: int = 0) -> File:
-    """A file whose meaning is as before, with other bytes for a section."""
-    layer = file.layer(chunk).with_sections({number: data})
-    return file.with_chunk(chunk, payload=layer.payload(), layer=layer)
-
-
-def with_priors(priors: dict[int, Any], k: np.ndarray | None = None) -> File:
-    """40 anchors, whose attributes are coded under these priors, by channel."""
-    k = pattern(68, ROWS) if k is None else k
-    return with_section(ATTRIBUTES, coded(k, priors), rows(ROWS, attributes=k))
+def with_priors(priors: dict[int, Prior], k: np.ndarray | None = None) -> File:
+    """40 anchors of 68 channels, which are coded under these priors."""
+    return anchors(ROWS, widths=WIDE, rows=pattern(68, ROWS) if k is None else k, priors={"rows": priors})
 
 
 def of_highs(*highs: int) -> np.ndarray:
-    """Attributes of 40 anchors, the first channels in -high..high, the others small."""
+    """Rows of 40 anchors, the first channels in -high..high, the others small."""
     k = pattern(68, ROWS)
     for c, high in enumerate(highs):
         k[c] = pattern(ROWS, low=-high, high=high, seed=c)
     return k
 
 
-def tables_at_limit(more: bool = False) -> File:
-    """A section of windows of 2^18 entries, and one entry for each of its symbols; one more if so."""
-    k = pattern(68, ROWS)
-    k[67] = 1
-    own: list[Any] = [gauss(-(1 << 13), 1 << 14, si=200 + c) for c in range(16)]
-    own.append(gauss(-(k.size >> 1), k.size))
-    return with_priors({c: own[c % len(own)] for c in range(67 if more else 68)}, k)
+def entries_at_limit(over: int = 0) -> File:
+    """A first slice whose windows have 2^18 entries and one for each of its symbols, or `over` more."""
+
+    def file(last: int) -> File:
+        own = [Prior(-(n >> 1), n, 200 + c) for c, n in enumerate([1 << 14] * 16 + [last])]
+        return with_priors({c: own[c if c < 17 else 0] for c in range(68)})
+
+    layer, known = file(2).layer(0), blocks.Known()
+    layer.written(known)
+    symbols = (68 + 4) * ROWS + sum(map(np.size, layer.chains))
+    return file(2 + (1 << 18) + symbols + over - sum(prior.n for own in known for prior in own))
 
 
-def tables_of_stages() -> File:
-    """Windows of more than 2^18 entries in all stages together, not in any of them. Planes of one cell, of class 7."""
-    file = deformed(Scale(32, (1, 1, 1, 1)))
-    wide = [gauss(-(1 << 13), 1 << 14, si=200 + c) for c in range(14)]
-    priors: dict[int, dict[int, Prior]] = {s: {8 * c + 7: p for c, p in enumerate(wide)} for s in (3, 4)}
-    return with_section(PLANE, coded_planes(file.layer(1).residuals, priors=priors), file, 1)
-
-
-def tables_of_slices(over: int) -> File:
-    """Windows of 2^18 entries in a first slice; in a second one of as many as it may define, or `over` more."""
-    layers, known = list[Layer](), blocks.Known()
-    for number, (count, n) in enumerate(((16, 1 << 14), (1, (1 << 10) + 68 + over))):
-        k = np.full((68, 1), number, np.int32)
-        layer = later(0, line(1, z=4), attributes=k) if number else make_layer(0, line(1), attributes=k)
-        priors = {c: gauss(min(c, count - 1) - 20, n) for c in range(68)}
-        layers.append(layer.with_sections({ATTRIBUTES: coded(k, priors, known)}))
-    return make_file(*layers)
+def entries_of_slices(over: int) -> File:
+    """A first slice with windows of 2^18 entries, and a second one of as many as it may define, or `over` more."""
+    first = make_layer(0, line(1), widths=WIDE, rows=np.zeros((68, 1), np.int32), priors={"rows": {
+        c: Prior(min(c, 15) - 20, 1 << 14) for c in range(68)}})  # fmt: skip
+    wide = Prior(-20, (1 << 10) + 72 + over)
+    return blocks.slices_of(first, later(0, line(1, z=4), widths=WIDE, rows=np.ones((68, 1), np.int32),
+        codes=[3], priors=lambda *_: wide))  # fmt: skip
 
 
 def large_products() -> File:
@@ -339,27 +297,30 @@ def large_products() -> File:
         left -= min(left, e)
     assert left == 0
     residuals[2] = (blocks.classes_of_plane(residuals[:2]) == 7).reshape(height, width)
-    samples = restore([(0, residuals.astype(np.int32).swapaxes(1, 2))])[0]
-    fill = lambda name, shape: samples if name == "xy" else np.zeros(shape, np.int32)  # noqa: E731
-    layer = make_layer(1, (), scales=[Scale(3, (height, width, 1, 1), fill=fill)])
-    section = coded_planes(layer.residuals, priors={0: {0: Const(Window(0, 1))}})
-    return with_section(PLANE, section, make_file(make_layer(cells=()), layer), 1)
+    samples = residuals.swapaxes(1, 2).copy()
+    samples[:, 0] = samples[:, 0].cumsum(axis=1)
+    samples = samples.cumsum(axis=1).astype(np.int32)
+    layer = make_layer(
+        1, (), grids=[Grid(3, (height, width), fill=lambda number, shape: samples)], priors={"grids": {0: Prior(0)}}
+    )
+    assert np.array_equal(layer.residuals[0].swapaxes(1, 2), residuals)
+    return make_file(make_layer(cells=()), layer)
 
 
 def symbols_at_limit(over: int = 0, count: int = 0, graded: bool = False) -> File:
     """As many symbols as clause 6.5 allows a file, or `over` more, with `count` anchors in either layer."""
     classes = [1] * count if graded else None
-    plane = Scale(1, (2048, 1920, 1, 1), fill=constant(0))
+    plane = Grid(1, (2048, 1920, 1, 1), fill=constant(0))
 
     def layer(first: int, second: int, hidden: int) -> Layer:
-        networks = {0: (first, second), 1: (hidden, 3)}
+        chains = {0: (1, first, second), 1: (second, hidden, 3)}
         cells = line(count, z=5)
-        return make_layer(1, cells, before=count, scales=[plane], networks=networks, classes=classes)
+        return make_layer(1, cells, before=count, grids=[plane], chains=chains, classes=classes)
 
     below = make_layer(cells=line(count), classes=classes)
     size = len(below.payload()) + len(layer(300, 300, 1).payload())  # the same while no width takes more bytes
-    spent = 72 * count + below.channels[0].size + sum(w.size for w in below.weights) + graded * count
-    spent += 2048 * 1920 + 2 * (2048 + 1920) + 1 + (73 + graded) * count
+    spent = 2 * (15 + graded) * count + count + sum(map(np.size, below.chains))
+    spent += 2048 * 1920 + 2 * (2048 + 1920) + 1
     weights = (1 << 22) + 256 * size + over - spent
     for first, hidden in itertools.product(range(256, 400), range(1, 100)):
         # weights = (1 + 1) first + (first + 1) second + (second + 1) hidden + (hidden + 1) 3
@@ -372,15 +333,13 @@ def symbols_at_limit(over: int = 0, count: int = 0, graded: bool = False) -> Fil
 def rows_at_limit(over: int = 0) -> File:
     """As many anchors as clause 6.5 allows a payload of 600 bytes, or `over` more."""
     layer = make_layer(0, line((1 << 13) + 2 * 600 + over))
-    size = len(canonical.pack(layer.parameters())) + 600 - len(layer.payload())
+    size = len(pack(layer.parameters())) + 600 - len(layer.payload())
     return make_file(layer).with_chunk(0, payload=layer.padded(size))
 
 
 def lzma_file(*layers: Layer, **how: Any) -> File:
-    """These layers with section SYMBOLS written in another way."""
-    none = dict.fromkeys((MASKS, ATTRIBUTES, PLANE, WEIGHTS))
-    written = [x.with_sections({**none, SYMBOLS: lzma_symbols(x.channels, **how)}) for x in layers]
-    return make_file(*written, header={2: LZMA})
+    """These layers in mode lzma."""
+    return make_file(*[layer.packed(**how) for layer in layers], header={2: LZMA})
 
 
 def every_chunk(data: bytes) -> bytes:
@@ -393,39 +352,19 @@ def every_chunk(data: bytes) -> bytes:
 
 
 def lzma_text() -> Layer:
-    """Attributes that repeat phrases at many distances."""
+    """Rows that repeat phrases at many distances."""
     phrases = [pattern(9, low=0, high=9, seed=s).tolist() for s in range(6)]
     text = [n for s in pattern(400, low=0, high=5, seed=8) for n in [*phrases[s][: 4 + s], int(s)]]
-    return make_layer(0, line(40), mode=LZMA, attributes=np.resize(text, (68, 40)).astype(np.int32))
-
-
-def lzma_narrow() -> bytes:
-    """A section whose channels state 2 bytes over numbers of 4."""
-    channels = make_layer(0, line(2), mode=LZMA).channels
-    narrow, wide = (lzma_symbols(channels, base=None, width=w, stream=lambda d: b"") for w in (1, 2))
-    return narrow + lzma_symbols(channels, base=None, width=2)[len(wide) :]
-
-
-def slices_with_classes(go_on: bool) -> File:
-    """Two slices with step classes; those of the second under the prior of the first one's, which is wrong, or under
-    one of its own of more entries than a section may define that goes on."""
-    known = blocks.Known()
-    coded([[0, 3, 6]], known=known)
-    part = coded([[6, 0, 3]], {} if go_on else {0: gauss(0, 2 << 10)}, known if go_on else None)
-    first = make_layer(0, line(3), attributes=pattern(68, 3), classes=[0, 3, 6])
-    second = later(0, line(3, z=2), attributes=pattern(68, 3, seed=1), classes=[6, 0, 3])
-    rest = second.sections[ATTRIBUTES][len(graded_part(second.classes)) :]
-    return make_file(first, second.with_sections({ATTRIBUTES: varint(len(part)) + part + rest}))
+    return make_layer(0, line(40), widths=WIDE, rows=np.resize(text, (68, 40)).astype(np.int32))
 
 
 def costly(which: int) -> File:
     """A few hundred bytes that declare some 3 million symbols. 0: planes of one channel, to be predicted sample by
     sample. 1: two stages of many cells, the dearest in memory."""
     if which == 0:
-        flat = Scale(1, (4096, 256, 256, 256), (1,) * 6, constant(0))
-        first = make_layer(0, networks={0: (64, 10), 1: (64, 70), 2: (64, 30)})
-        return make_file(first, make_layer(1, (), before=1, scales=[flat]))
-    return deformed(*[Scale(4, s, fill=constant(0)) for s in ((4095, 5, 1, 16), (64, 256, 64, 256), (4095, 2, 2, 99))])
+        return deformed(Grid(1, (4096, 256, 256, 256), (1,) * 6, constant(0)))
+    sides = ((4095, 5, 1, 16), (64, 256, 64, 256), (4095, 2, 2, 99))
+    return deformed(*[Grid(4, s, fill=constant(0), id=i) for i, s in enumerate(sides)])
 
 
 def exceptions() -> File:
@@ -433,14 +372,5 @@ def exceptions() -> File:
     k = pattern(68, ROWS)
     k[0, [0, 7, 39]] = 90000, -M, M
     k[1, :20], k[2, 39] = 12, -4
-    ends = {3: gauss(K - 1, 2), 4: Const(Window(-K, 1)), 5: Const(Window(K, 1))}
-    return with_priors({0: SMALL, 1: SMALL, 2: gauss(-3, 20, si=100), **ends}, k)
-
-
-def stage_of_rest(file: File, more: int) -> bytes:
-    """Stage 0 stated as long as all that its length and the rest take, or longer."""
-    said, section = 0, b""
-    for _ in range(3):  # the bytes of the length count
-        section = coded_planes(file.layer(1).residuals, lambda s: [said + more, s[1]])  # noqa: B023
-        said = len(section)
-    return section
+    ends = {3: Prior(K - 1, 2), 4: Prior(-K), 5: Prior(K)}
+    return with_priors({0: blocks.SMALL, 1: blocks.SMALL, 2: Prior(-3, 20, 100), **ends}, k)

@@ -14,6 +14,7 @@ from typing import Any
 
 import torch
 
+from pd4dgs_codec.data.view import thinned
 from pd4dgs_codec.train import phases, workers
 from pd4dgs_codec.train.phases.levels import gain_in, images
 from pd4dgs_codec.train.state import TrainState
@@ -86,6 +87,6 @@ def _predicted(state: TrainState) -> float:
     """The gain in dB of the highest level over level 0 in views well outside the window of the trial."""
     least, most = (TRIAL * times for times in BEYOND)
     far = [index for index in range(len(state.views)) if least < _distance(state, index) <= most]
-    views = [state.picture(index) for index in far[:: max(1, -(-len(far) // VIEWS))]]
+    views = [state.picture(index) for index in thinned(far, VIEWS)]
     still, moved = ([images(state, view, (level,))[0] for view in views] for level in (0, state.model.level))
     return gain_in(views, [None] * len(views), still, moved)

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.data.view import View
+from pd4dgs_codec.data.view import View, thinned
 from pd4dgs_codec.model.model import Model, to_scene
 from pd4dgs_codec.model.sensitivity import utility, without
 from pd4dgs_codec.scene import MASK_THRESHOLD
@@ -72,7 +72,7 @@ def rank_anchors(model: Model, views: Sequence[View]) -> Tensor:
     absent = (model.masks(0).detach() <= MASK_THRESHOLD).cpu().numpy()
     scene = without(to_scene(model).prefix(0), np.flatnonzero(absent))
     scene = replace(scene, steps=scene.steps.scaled(1.0))  # binary32, as a file has them
-    viewpoints = [(view.camera, view.time) for view in views[:: -(-len(views) // VIEWS)]]
+    viewpoints = [(view.camera, view.time) for view in thinned(views, VIEWS)]
     rank = torch.full((len(absent),), -torch.inf, dtype=torch.float64)
     rank[torch.from_numpy(~absent)] = torch.from_numpy(utility(scene, viewpoints, fewest=FEWEST))
     return rank

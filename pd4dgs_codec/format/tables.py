@@ -1,0 +1,350 @@
+"""The tables from which the tensors of a file follow, and the tensors of a layer, by form and id (clauses 5.4 to 6.5).
+
+A tensor is *rows* (channels of each anchor), a *grid* (planes of every pair of its axes) or a *chain* (weights and
+biases of linear layers that follow each other). What it means is the business of `kinds`.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations, pairwise
+from typing import Any
+
+import numpy as np
+
+from pd4dgs_codec.errors import LimitExceeded, Malformed
+from pd4dgs_codec.format import canonical
+from pd4dgs_codec.format.canonical import Fields, as_integer, as_list, as_long, as_registered
+from pd4dgs_codec.format.planes import PREDICTORS, PlaneShape
+from pd4dgs_codec.format.quantise import ROW_PREDICTORS, Rows, RowTable, dequantise, is_step, quantise
+from pd4dgs_codec.format.registry import (
+    MAX_ANCHORS,
+    MAX_AXES,
+    MAX_CELLS,
+    MAX_CHAIN_LAYERS,
+    MAX_CHAINS,
+    MAX_CHANNELS,
+    MAX_GRIDS,
+    MAX_ID,
+    MAX_KIND,
+    MAX_KIND_LENGTH,
+    MAX_PARAMETERS,
+    MAX_PAYLOAD,
+    MAX_ROWS,
+    MAX_ROWS_WIDTH,
+    MAX_SIDE,
+    MAX_WIDTH,
+)
+from pd4dgs_codec.scene import Network
+
+# Keys of the parameters of a slice.
+KEYS = OWN_ROWS, CODES, FILL, GRIDS, CHAINS, KIND, LAYER_ROWS = range(1, 8)
+
+#: A file of S symbols has at least (S - FREE_SYMBOLS) / SYMBOLS_PER_BYTE bytes, so that a few bytes that declare
+#: constant channels cannot make a decoder allocate without end. Real scenes spend over 0.1 bit per symbol.
+FREE_SYMBOLS = 1 << 22
+SYMBOLS_PER_BYTE = 256
+#: The same bound for anchors, which may cost almost nothing each; a position takes up to 42 symbols.
+FREE_ROWS = 1 << 13
+ROWS_PER_BYTE = 2
+
+Kind = tuple[int, ...]  #: the number of a kind and its parameters, see `kinds`
+Fill = tuple[int, int, int]  #: RGB, 0..255
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A grid. sides: of its axes, 1 to 4. predictors: an id per plane, empty before they are chosen."""
+
+    id: int
+    channels: int
+    sides: tuple[int, ...]
+    predictors: tuple[int, ...] = ()
+
+    @property
+    def planes(self) -> list[PlaneShape]:
+        """[C, H, W] of its planes: of the pairs of axes i < j in lexicographic order, H along j and W along i. One axis
+        has one plane of one row."""
+        pairs = combinations(self.sides, 2) if len(self.sides) > 1 else [(self.sides[0], 1)]
+        return [(self.channels, height, width) for width, height in pairs]
+
+
+@dataclass(frozen=True)
+class Chain:
+    """A chain of linear layers. widths: of its input and of the outputs of each layer."""
+
+    id: int
+    widths: tuple[int, ...]
+
+    @property
+    def arrays(self) -> list[tuple[int, ...]]:
+        """Shapes of weight [outputs, inputs], bias [outputs], weight, bias ..."""
+        return [shape for inputs, outputs in pairwise(self.widths) for shape in ((outputs, inputs), (outputs,))]
+
+
+@dataclass(frozen=True)
+class Tables:
+    """The grids, chains and layer rows of a layer, by ascending id. grid_step, chain_step: their steps, 0 without any.
+    kind: of the deformation, empty if none is stated. rows: tensors with a row for each earlier and each own anchor."""
+
+    grids: tuple[Grid, ...] = ()
+    chains: tuple[Chain, ...] = ()
+    grid_step: float = 0.0
+    chain_step: float = 0.0
+    kind: Kind = ()
+    rows: tuple[Rows, ...] = ()
+
+    @property
+    def planes(self) -> list[PlaneShape]:
+        """[C, H, W] of all planes, grid by grid."""
+        return [shape for grid in self.grids for shape in grid.planes]
+
+    @property
+    def weights(self) -> list[tuple[int, ...]]:
+        """Shapes of all weights and biases, chain by chain."""
+        return [shape for chain in self.chains for shape in chain.arrays]
+
+    @property
+    def cells(self) -> int:
+        """Number of plane samples."""
+        return sum(map(math.prod, self.planes))
+
+    @property
+    def symbols(self) -> int:
+        """Number of plane samples, weights and biases."""
+        return self.cells + sum(map(math.prod, self.weights))
+
+    @property
+    def steps(self) -> list[float]:
+        """The step of each plane, then of each weight and bias."""
+        return [self.grid_step] * len(self.planes) + [self.chain_step] * len(self.weights)
+
+    def json(self) -> dict[str, Any]:
+        """grids: [id, C, sides ...] each. chains: [id, widths ...] each. kind: numbers, None if not stated. layer_rows:
+        [id, C, step, predictor] each."""
+        return {
+            "layer_rows": [[t.id, t.channels, t.step, t.predictor] for t in self.rows],
+            "grids": [[grid.id, grid.channels, *grid.sides] for grid in self.grids],
+            "chains": [[chain.id, *chain.widths] for chain in self.chains],
+            "grid_step": self.grid_step or None,
+            "chain_step": self.chain_step or None,
+            "kind": list(self.kind) or None,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Tensors:
+    """The grids and chains of a layer: float32 values, or int32 symbols. planes: [C, H, W] each, weights: weights and
+    biases, both in the order of `tables`."""
+
+    tables: Tables
+    planes: Sequence[np.ndarray] = ()
+    weights: Sequence[np.ndarray] = ()
+
+    @property
+    def arrays(self) -> list[np.ndarray]:
+        """All arrays in coding order."""
+        return [*self.planes, *self.weights]
+
+    @property
+    def grids(self) -> dict[int, tuple[np.ndarray, ...]]:
+        """The planes by id of their grid."""
+        left = iter(self.planes)
+        return {grid.id: tuple(next(left) for _ in grid.planes) for grid in self.tables.grids}
+
+    @property
+    def chains(self) -> dict[int, Network]:
+        """(weight, bias) of each linear layer by id of its chain."""
+        left = iter(self.weights)
+        return {chain.id: tuple((next(left), next(left)) for _ in chain.widths[1:]) for chain in self.tables.chains}
+
+    def with_arrays(self, arrays: Iterable[np.ndarray]) -> Tensors:
+        """Returns tensors of the same tables with these arrays, in coding order."""
+        found, planes = list(arrays), len(self.planes)
+        return replace(self, planes=found[:planes], weights=found[planes:])
+
+    def quantised(self, name: Callable[[int], str]) -> Tensors:
+        """Returns the symbols. name: of an array by its place, for messages. Raises EncodeError for a value without a
+        symbol."""
+        pairs = zip(self.arrays, self.tables.steps, strict=True)
+        return self.with_arrays(quantise(x, step, name(i)) for i, (x, step) in enumerate(pairs))
+
+    def dequantised(self) -> Tensors:
+        """Returns the values of symbols."""
+        return self.with_arrays(dequantise(k, step) for k, step in zip(self.arrays, self.tables.steps, strict=True))
+
+
+NOTHING = Tensors(Tables())
+
+# -- parameters of a slice ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Declared:
+    """Sums over the slices of a file so far: rows, symbols and bytes of payloads."""
+
+    rows: int = 0
+    symbols: int = 0
+    payload_bytes: int = 0
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """The parameters of a slice. rows: its own anchors. rises: earlier anchors whose mask codes it raises. codes:
+    length of its codes in bytes. tables: in a later slice, of the rows of its layer alone. symbols: number of all its
+    symbols, those of voxel indices and masks included."""
+
+    rows: int
+    codes: int
+    fill: Fill | None
+    tables: Tables
+    rises: int
+    symbols: int
+
+
+def pack_parameters(rows: int, codes: int, fill: Fill | None, tables: Tables) -> bytes:
+    """Returns the bytes before the codes: the parameters behind their length."""
+    fields: dict[int, object] = {OWN_ROWS: rows, CODES: codes}
+    if fill:
+        fields[FILL] = list(fill)
+    if tables.grids:
+        own = [[grid.id, grid.channels, list(grid.sides), list(grid.predictors)] for grid in tables.grids]
+        fields[GRIDS] = [tables.grid_step, *own]
+    if tables.chains:
+        fields[CHAINS] = [tables.chain_step, *([chain.id, *chain.widths] for chain in tables.chains)]
+    if tables.kind:
+        fields[KIND] = list(tables.kind)
+    if tables.rows:
+        fields[LAYER_ROWS] = pack_rows(tables.rows)
+    packed = canonical.pack(fields)
+    return struct.pack("<I", len(packed)) + packed
+
+
+def read_parameters(
+    payload: bytes | memoryview, layer: int, table: RowTable, before: Declared, of: Tables | None = None
+) -> tuple[Parameters, int, Declared]:
+    """Returns (parameters, offset of the codes, sums with this slice) of a payload. Checks all lengths against the
+    payload's size and all counts against their limits.
+
+    table: of the header's rows. before: sums over earlier slices. of: in a later slice, the tables of its layer's first
+    one. Raises subclasses of DecodeError.
+    """
+    where, later = f"layer {layer}", of is not None
+    if len(payload) < 4:
+        raise Malformed(f"{where}: payload of {len(payload)} bytes, expected at least 4")
+    (length,) = struct.unpack_from("<I", payload)
+    if length > MAX_PARAMETERS:
+        raise LimitExceeded(f"{where}: parameters of {length} bytes, limit {MAX_PARAMETERS}")
+    start = 4 + length
+    if start > len(payload):
+        raise Malformed(f"{where}: parameters of {length} bytes, expected at most {len(payload) - 4}")
+    fields = Fields(canonical.unpack(payload[4:start]), where, set(KEYS))
+    misplaced = [key for key in (GRIDS, CHAINS, KIND, LAYER_ROWS) if later and key in fields]
+    if misplaced:
+        raise Malformed(f"{where}: key {misplaced[0]} in a later slice, expected it in the first one only")
+    rows, codes = fields.integer(OWN_ROWS, MAX_ANCHORS - before.rows), fields.integer(CODES, MAX_PAYLOAD)
+    if codes > len(payload) - start:
+        raise Malformed(f"{where}: codes of {codes} bytes, expected at most {len(payload) - start}")
+    fill: Any = tuple(as_integer(c, 255, f"{where} fill") for c in fields.sequence(FILL, 3)) if FILL in fields else None
+    tables = Tables(rows=of.rows) if of else _unpack_tables(fields, where)
+    rises, width = 0 if later else before.rows, RowTable(tables.rows).channels
+    symbols = rises + (table.channels + table.graded + 4) * rows + width * (rises + rows) + tables.symbols
+    total = Declared(before.rows + rows, before.symbols + symbols, before.payload_bytes + len(payload))
+    _check_declared(tables.cells, total, where)
+    return Parameters(rows, codes, fill, tables, rises, symbols), start, total
+
+
+def _check_declared(cells: int, total: Declared, where: str) -> None:
+    """Raises LimitExceeded if the slices so far are too short for what they declare (clause 6.5)."""
+    if cells > MAX_CELLS:
+        raise LimitExceeded(f"{where}: planes of {cells} cells, limit {MAX_CELLS}")
+    for what, found, free, per_byte in (
+        ("anchors", total.rows, FREE_ROWS, ROWS_PER_BYTE),
+        ("symbols", total.symbols, FREE_SYMBOLS, SYMBOLS_PER_BYTE),
+    ):
+        limit = free + per_byte * total.payload_bytes
+        if found > limit:
+            size = f"{total.payload_bytes} bytes of payloads up to here"
+            raise LimitExceeded(f"{where}: {found} {what} in {size}, limit {limit}")
+
+
+def _unpack_tables(fields: Fields, where: str) -> Tables:
+    tables = Tables(kind=unpack_kind(fields.get(KIND), f"{where} kind") if KIND in fields else ())
+    if LAYER_ROWS in fields:
+        tables = replace(tables, rows=unpack_rows(fields.get(LAYER_ROWS), f"{where}: layer rows"))
+    if GRIDS in fields:
+        grids = as_long(fields.get(GRIDS), f"{where} grids", MAX_GRIDS + 1, 2)
+        tables = replace(tables, grid_step=as_step(grids[0], f"{where} grids"))
+        tables = replace(tables, grids=_ascending([_unpack_grid(row, where) for row in grids[1:]], f"{where} grids"))
+    if CHAINS in fields:
+        chains = as_long(fields.get(CHAINS), f"{where} chains", MAX_CHAINS + 1, 2)
+        tables = replace(tables, chain_step=as_step(chains[0], f"{where} chains"))
+        tables = replace(
+            tables, chains=_ascending([_unpack_chain(row, where) for row in chains[1:]], f"{where} chains")
+        )
+    return tables
+
+
+def _unpack_grid(row: object, where: str) -> Grid:
+    number, channels, sides, predictors = as_list(row, f"{where} grid", 4)
+    where = f"{where} grid {as_integer(number, MAX_ID, f'{where} grid id')}"
+    as_integer(channels, MAX_CHANNELS, f"{where} channels", 1)
+    for side in as_long(sides, f"{where} sides", MAX_AXES):
+        as_integer(side, MAX_SIDE, f"{where} side", 1)
+    grid = Grid(number, channels, tuple(sides))
+    for predictor in as_list(predictors, f"{where} predictors", len(grid.planes)):
+        as_registered(predictor, PREDICTORS, f"{where} predictor")
+    return replace(grid, predictors=tuple(predictors))
+
+
+def _unpack_chain(row: object, where: str) -> Chain:
+    number, *widths = as_long(row, f"{where} chain", MAX_CHAIN_LAYERS + 2, 3)
+    where = f"{where} chain {as_integer(number, MAX_ID, f'{where} chain id')}"
+    for width in widths:
+        as_integer(width, MAX_WIDTH, f"{where} width", 1)
+    return Chain(number, tuple(widths))
+
+
+def _ascending(tensors: list[Any], where: str) -> tuple[Any, ...]:
+    _check_ascending([tensor.id for tensor in tensors], where)
+    return tuple(tensors)
+
+
+def _check_ascending(ids: Sequence[int], where: str) -> None:
+    if any(a >= b for a, b in pairwise(ids)):
+        raise Malformed(f"{where}: ids {list(ids)}, expected them to ascend")
+
+
+def pack_rows(tensors: Iterable[Rows]) -> list[list[object]]:
+    """Returns the records of tensors of rows."""
+    return [[tensor.id, tensor.channels, float(np.float32(tensor.step)), tensor.predictor] for tensor in tensors]
+
+
+def unpack_rows(value: object, where: str) -> tuple[Rows, ...]:
+    """Returns the tensors of rows of these records. Raises subclasses of DecodeError."""
+    tensors = []
+    for row in as_long(value, where, MAX_ROWS):
+        number, channels, step, predictor = as_list(row, where, 4)
+        as_integer(number, MAX_ID, f"{where}: id")
+        as_integer(channels, MAX_CHANNELS, f"{where} {number}: channels", 1)
+        as_registered(predictor, ROW_PREDICTORS, f"{where} {number}: predictor")
+        tensors.append(Rows(number, channels, as_step(step, f"{where} {number}"), predictor))
+    _check_ascending([tensor.id for tensor in tensors], where)
+    if (width := RowTable(tuple(tensors)).channels) > MAX_ROWS_WIDTH:
+        raise LimitExceeded(f"{where} of {width} channels, limit {MAX_ROWS_WIDTH}")
+    return tuple(tensors)
+
+
+def unpack_kind(value: object, where: str) -> Kind:
+    """Returns the integers of a kind. Raises Malformed or LimitExceeded for anything else."""
+    return tuple(as_integer(part, MAX_KIND, where) for part in as_long(value, where, MAX_KIND_LENGTH))
+
+
+def as_step(value: object, where: str) -> float:
+    """Returns a step. Raises Malformed unless it is a positive normal binary32."""
+    if not isinstance(value, float) or not is_step(value):
+        raise Malformed(f"{where}: step {value!r}, expected a positive normal binary32 value")
+    return value

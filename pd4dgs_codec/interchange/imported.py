@@ -1,0 +1,190 @@
+"""Another program's model -> a `.pd4` file, with its quality against the model's own renderings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pd4dgs_codec.data.view import depth_range, held_out, points_box, seconds_range
+from pd4dgs_codec.errors import EncodeError
+from pd4dgs_codec.format.decoder import decode
+from pd4dgs_codec.format.encoder import Report, encode_with_report, with_metadata
+from pd4dgs_codec.format.metadata import Metadata
+from pd4dgs_codec.interchange.direct import GOLDEN, Packer
+from pd4dgs_codec.interchange.sampled import Sampled, sampled
+from pd4dgs_codec.interchange.splats import evenly, picture
+from pd4dgs_codec.interchange.teacher import SOLID, Options, Teacher, cameras_of, read_model
+from pd4dgs_codec.kinds.splats import SplatScene
+from pd4dgs_codec.quality.image import mpsnr
+from pd4dgs_codec.scene import Camera, SceneInfo
+
+#: Cameras; of so many of them one measures the result and decides nothing. Width and height of a dome's pictures.
+CAMERAS, HOLDOUT, SIZE = 72, 6, 400
+BOX_INSTANTS = 5  #: number of instants whose Gaussians the box encloses
+#: A target size is met if the file has at least this share of it; most tries; dB of the first guess and the bounds.
+FULL, TRIES, LOWEST, HIGHEST = 0.95, 8, 15.0, 70.0
+GROWTH = 0.05  #: first guess of the change of the logarithm of bytes by dB
+BEST = 100.0  #: dB that stand for equal pictures
+
+Progress = Callable[[str, "int | None"], AbstractContextManager[Callable[[], None]]]
+
+
+@dataclass(frozen=True, eq=False)
+class Imported:
+    """A file. psnr: mean over `views` pictures in dB against the source's, by level. gaussians: in the file; left_out:
+    those of the source that no view sees. instants, static, order, matched: see `Sampled`."""
+
+    data: bytes
+    report: Report
+    psnr: dict[int, float]
+    views: int
+    gaussians: int
+    left_out: int
+    instants: int
+    static: float
+    order: str
+    matched: float
+
+    def json(self) -> dict[str, Any]:
+        """The report, with what was read and measured."""
+        names = ("psnr", "views", "gaussians", "left_out", "instants", "static", "order", "matched")
+        return (
+            self.report.json()
+            | {"gaussians_left_out": self.left_out}
+            | {n: getattr(self, n) for n in names[:3]}
+            | {name: getattr(self, name) for name in names[4:]}
+        )
+
+
+def import_model(
+    place: str,
+    *,
+    psnr: float,
+    most_bytes: int | None = None,
+    slices: int | None = None,
+    fps: float = 30.0,
+    seconds: float | None = None,
+    background: tuple[float, float, float] | None = None,
+    up: tuple[float, float, float] | None = None,
+    metadata: Metadata | None = None,
+    tell: Callable[[str], None],
+    progress: Progress,
+) -> Imported:
+    """Packs the model at `place`, see `teacher.read_model`, for `psnr` dB, or with most_bytes for so many bytes.
+
+    fps: frames per second of a folder. seconds: the duration instead. tell: gets lines about what was read. progress:
+    (task, number of steps or None) -> a context whose value is called after each step. Raises DataError, EncodeError.
+    """
+    model = read_model(place, fps)
+    with progress("reading", None if model.times is None else len(model.times)) as step:
+        source = sampled(model, place, fps, step)
+    instants, count = source.means.shape[:2]
+    seconds = seconds or model.seconds
+    static = float(source.static.mean())
+    tell(f"{place}: {_about(source, seconds, static)}")
+    info, cameras, judges = _scene_info(place, model, source, seconds, background, up)
+    with progress("packing", None) as step:
+        packer = Packer(source, cameras, info, step)
+        write = _writer(packer, slices, metadata, step)
+        data, report = _of_size(write, psnr, most_bytes) if most_bytes else write(psnr)
+    scene = decode(data)
+    assert isinstance(scene, SplatScene)
+    with progress("measuring", len(judges)) as step:
+        quality = _quality(model, scene, judges, step)
+    data, about = with_metadata(data, replace(metadata or Metadata(), quality=quality))
+    report = replace(report, bytes=len(data), metadata_bytes=about)
+    if most_bytes and len(data) > most_bytes:
+        raise EncodeError(f"target size: the file takes {len(data):,} bytes with its metadata, expected {most_bytes:,}")
+    return Imported(
+        data, report, quality, len(judges), len(scene.anchor_q), count - len(scene.anchor_q), instants, static,
+        source.order, source.matched,
+    )  # fmt: skip
+
+
+def _about(source: Sampled, seconds: float, static: float) -> str:
+    instants, count = source.means.shape[:2]
+    degree = math.isqrt(source.rest.shape[1] + 1) - 1
+    if instants == 1:
+        return f"{count:,} Gaussians, harmonics of degree {degree}, static"
+    times = f"{instants} instants in {seconds:.3g} s"
+    return f"{count:,} Gaussians, harmonics of degree {degree}, {times}, {source.order}, {static:.0%} static"
+
+
+def _scene_info(
+    place: str, model: Teacher, source: Sampled, seconds: float, background: Any, up: Any
+) -> tuple[SceneInfo, list[Camera], list[tuple[Camera, float]]]:
+    """Returns (info but the voxel size, cameras that decide, cameras and times that measure)."""
+    middle = len(source.times) // 2
+    points = [source.means[i][source.opacities[i] >= SOLID] for i in evenly(range(len(source.times)), BOX_INSTANTS)]
+    everywhere = np.concatenate(points)
+    if not len(everywhere):
+        everywhere = source.means[middle]
+    options = Options(views=CAMERAS, size=(SIZE, SIZE))
+    cameras, level = cameras_of(Path(place), everywhere, replace(options, up=up) if up else options)
+    near, far = depth_range([c.viewmat.astype(np.float64) for c in cameras], points_box(everywhere), everywhere)
+    times = seconds_range(0.0, seconds) if len(source.times) > 1 else (0.0, 1.0)
+    box, behind = points_box(everywhere).astype(np.float32), background or model.background
+    near, far = (float(np.float32(x)) for x in (near, far))
+    fitting, others = held_out(cameras, HOLDOUT)
+    judges = [(camera, model.nearest((i + 0.5) * GOLDEN % 1.0)) for i, camera in enumerate(others or fitting)]
+    front = max(cameras, key=lambda camera: float(camera.viewmat[2, 2]))  # the dome has one in the usual direction
+    return SceneInfo(1.0, box, times, behind, near, far, up or level, 0.0, front), fitting, judges
+
+
+def _writer(
+    packer: Packer, slices: int | None, metadata: Metadata | None, step: Callable[[], None]
+) -> Callable[[float], tuple[bytes, Report]]:
+    """Returns the function from dB to (file without measured quality, report)."""
+
+    def write(psnr: float) -> tuple[bytes, Report]:
+        made = encode_with_report(packer.scene(psnr), slices=slices, metadata=metadata)
+        step()
+        return made
+
+    return write
+
+
+def _of_size(write: Callable[[float], tuple[bytes, Report]], psnr: float, most: int) -> tuple[bytes, Report]:
+    """Returns the file of the most dB that has at most `most` bytes. Raises EncodeError if there is none."""
+    room, low, high = most - 256, LOWEST, HIGHEST  # the quality takes some bytes
+    best, tried = None, list[tuple[float, float]]()
+    for _ in range(TRIES):
+        made = write(psnr)
+        tried.append((psnr, math.log(len(made[0]))))
+        if len(made[0]) <= room:
+            best, low = made, psnr
+            if len(made[0]) >= FULL * room or psnr == HIGHEST:
+                return best
+        elif psnr == LOWEST:
+            break
+        else:
+            high = psnr
+        (a, la), (b, lb) = (tried[-2] if len(tried) > 1 else (psnr - 1, tried[-1][1] - GROWTH)), tried[-1]
+        slope = (lb - la) / (b - a) if b != a else GROWTH
+        psnr = min(max(b + (math.log(room * (1 + FULL) / 2) - lb) / max(slope, GROWTH / 3), LOWEST), HIGHEST)
+        if len(tried) > 1 and not low < psnr < high:
+            psnr = (low + high) / 2
+    if best is None:
+        found = min(math.exp(size) for _, size in tried)
+        raise EncodeError(f"target size: the smallest file tried takes {found:,.0f} bytes, expected at most {most:,}")
+    return best
+
+
+def _quality(
+    model: Teacher, scene: SplatScene, judges: list[tuple[Camera, float]], step: Callable[[], None]
+) -> dict[int, float]:
+    """Returns the mean PSNR in dB of each level against the source's own pictures."""
+    found: dict[int, list[float]] = {level: [] for level in scene.layers}
+    for camera, t in judges:
+        truth = picture(model.splats(t), camera, scene.info.background, scene.info.near)
+        for level, row in found.items():
+            image = picture(scene.splats(t, level)[0], camera, scene.background(level), scene.info.near)
+            row.append(min(mpsnr(image, truth), BEST))
+        step()
+    return {level: float(np.mean(row)) for level, row in found.items()}

@@ -1,0 +1,279 @@
+"""Samples a model of another program at instants, so that each Gaussian keeps its row over time.
+
+Runs, functions and polynomials know all times: they are sampled where a straight line between two samples would be
+wrong. A folder of frames has a stable order if a row's next Gaussian is, more often than not, the one that most
+resembles it. Without such an order, Gaussians of neighbouring frames are matched where each is the other's nearest in
+space and colour. A row is then a chain of matches, and is shown only in its own frames: it has a window.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pd4dgs_codec.draw.simd import kernel
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.interchange.runs import visible
+from pd4dgs_codec.interchange.splats import evenly
+from pd4dgs_codec.interchange.teacher import Teacher
+from pd4dgs_codec.kinds.splats import Splats
+
+MOST_FRAMES = 4096  #: instants of tracks, a limit of the format
+MOST_NUMBERS = 1 << 29  #: numbers of all samples, which take 2 GiB
+NUMBERS = 14  #: of a Gaussian that may change over time: all but harmonics
+#: Samples of a model that knows all times: at first, and at most.
+FIRST, MOST = 9, 257
+#: A straight line is wrong if Gaussians lie beside it by this share of their size, or change by it, on average.
+STRAIGHT = 0.02
+SEEN = 0.05  #: the least opacity of Gaussians that count for this
+#: Gaussians whose order is checked, triples of frames, and the rank up to which a Gaussian resembles its row.
+ROWS, TRIPLES, RANK = 200, 6, 2
+#: Matches are nearer than so many median distances between neighbours, and than so much in colour and in logarithms of
+#: sizes.
+REACH, HUE, GROWTH = 3.0, 0.2, 1.0
+SHARP = 1e-3  #: the share of a frame in which a window of matched Gaussians ends
+MOVES = 0.02  #: Gaussians are static if they move by less than this share of their size, and change by less than it
+
+Step = Callable[[], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """n Gaussians at T instants.
+
+    times: float64 [T], from 0 to 1, or [0] if nothing moves. means, quats, scales: float32 [T, n, ..]; opacities [T, n]
+    without windows; colors [T, n, 3], the constants of the harmonics. rest: float32 [n, J - 1, 3], the other harmonics.
+    windows: float32 [n, 3], centre, half width and softness in normalised time, or None. order: how rows were found, in
+    words. matched: the share of the Gaussians of all frames that are rows of the frame before, 1 if the order is known.
+    """
+
+    times: np.ndarray
+    means: np.ndarray
+    quats: np.ndarray
+    scales: np.ndarray
+    opacities: np.ndarray
+    colors: np.ndarray
+    rest: np.ndarray
+    windows: np.ndarray | None
+    order: str
+    matched: float = 1.0
+
+    def frame(self, i: int, *, bare: bool = True) -> Splats:
+        """Returns the Gaussians at instant i; bare: without their windows."""
+        shown = np.float32(1) if bare or self.windows is None else visible(self.windows, self.times[i])
+        sh = np.concatenate([self.colors[i][:, None], self.rest], axis=1)
+        return Splats(self.means[i], self.quats[i], self.scales[i], self.opacities[i] * shown, sh)
+
+    @property
+    def static(self) -> np.ndarray:
+        """bool [n]: the Gaussians that neither move nor change, and are always shown."""
+        size = self.scales[0].max(axis=1)
+        still = np.ptp(self.means, axis=0).max(axis=1) < MOVES * size
+        for values in (np.log(np.maximum(self.scales, 1e-12)), self.opacities, self.colors):
+            still &= np.ptp(values, axis=0).reshape(len(size), -1).max(axis=1) < MOVES
+        still &= np.abs(np.einsum("tnd,nd->tn", self.quats, self.quats[0])).min(axis=0) > 1 - MOVES**2
+        found: np.ndarray = still if self.windows is None else still & (self.windows[:, 1] >= 0.5)
+        return found
+
+
+def sampled(model: Teacher, where: str, fps: float = 30.0, step: Step = lambda: None) -> Sampled:
+    """Samples a model. where: its name for messages. fps: of models that give other Gaussians at other times. step:
+    called after each sample. Raises DataError."""
+    read, times = model.bare or model.splats, model.times
+    if times is None and model.varies:
+        times = tuple(np.linspace(0, 1, max(round(model.seconds * fps), 1) + 1))
+    if times is None:
+        exact, frames = _by_error(read, where, step)
+        same = True
+    else:
+        if len(times) > MOST_FRAMES:
+            raise DataError(f"{where}: holds {len(times):,} frames, expected at most {MOST_FRAMES:,}")
+        exact, frames = np.asarray(times), list[Splats]()
+        for t in times:
+            frame = read(float(t))
+            _check_size(where, len(times), len(frame.means))
+            frames.append(frame)
+            step()
+        same = len({len(frame.means) for frame in frames}) == 1 and _in_order(frames)
+    degree = min(frame.degree for frame in frames)
+    frames = [replace(frame, sh=frame.sh[:, : (degree + 1) ** 2]) for frame in frames]
+    if same:
+        order = "one instant" if len(frames) == 1 else "rows in a stable order"
+        return _stacked(exact, frames, model.windows, order)
+    return _matched(where, exact, frames)
+
+
+def _check_size(where: str, frames: int, count: int) -> None:
+    if frames * count * NUMBERS > MOST_NUMBERS:
+        found = f"{count:,} Gaussians at {frames:,} instants"
+        raise DataError(f"{where}: {found}, expected at most {MOST_NUMBERS // NUMBERS:,} in all")
+
+
+def _stacked(times: np.ndarray, frames: Sequence[Splats], windows: np.ndarray | None, order: str) -> Sampled:
+    """Stacks frames with the same rows. Harmonics but the constants are means over the frames."""
+    names = ("means", "quats", "scales", "opacities")
+    means, quats, scales, opacities = (np.stack([getattr(frame, name) for frame in frames]) for name in names)
+    flips = np.einsum("tnd,tnd->tn", quats[1:], quats[:-1])
+    quats[1:] *= np.cumprod(np.where(flips < 0, np.float32(-1), np.float32(1)), axis=0)[..., None]
+    colors = np.stack([frame.sh[:, 0] for frame in frames])
+    rest = np.asarray(sum(frame.sh[:, 1:] for frame in frames) / len(frames), np.float32)
+    return Sampled(times, means, quats, scales, opacities, colors, rest, windows, order)
+
+
+# -- models that know all times ----------------------------------------------------------------------------------------
+
+
+def _by_error(read: Callable[[float], Splats], where: str, step: Step) -> tuple[np.ndarray, list[Splats]]:
+    """Returns (times, frames with the same rows): more where a straight line between samples is wrong."""
+    found = dict[float, Splats]()
+
+    def at(t: float) -> Splats:
+        if t not in found:
+            found[t] = read(t)
+            first = next(iter(found.values()))
+            if len(found[t].means) != len(first.means):
+                have = f"{len(found[t].means):,} usable Gaussians at {t:g} and {len(first.means):,} at 0"
+                raise DataError(f"{where}: gives {have}, expected the same at all times")
+            _check_size(where, len(found), len(first.means))
+            step()
+        return found[t]
+
+    grid = np.linspace(0, 1, FIRST).tolist()
+    open_ = [(a, b) for a, b in zip(grid[:-1], grid[1:], strict=True)]
+    for t in grid:
+        at(t)
+    while open_ and len(found) < MOST:
+        a, b = open_.pop(0)
+        middle = (a + b) / 2
+        if _bend(at(a), at(middle), at(b)) > STRAIGHT:
+            open_ += [(a, middle), (middle, b)]
+    times = sorted(found)
+    return np.array(times), [found[t] for t in times]
+
+
+def _bend(a: Splats, middle: Splats, b: Splats) -> float:
+    """Returns how far the Gaussians `middle` are from the mean of a and b, in shares of their size."""
+    seen = middle.opacities > SEEN
+    if not seen.any():
+        return 0.0
+    size = middle.scales.max(axis=1)[seen]
+    aside = np.abs((a.means + b.means)[seen] / 2 - middle.means[seen]).max(axis=1, keepdims=True) / np.maximum(
+        size, 1e-9
+    )
+    turned = 1 - np.abs(np.einsum("nd,nd->n", _halfway(a.quats, b.quats), middle.quats))[seen]
+    grown = np.abs((a.scales + b.scales)[seen] / 2 / np.maximum(middle.scales[seen], 1e-9) - 1).max(axis=1)
+    faded = np.abs((a.opacities + b.opacities) / 2 - middle.opacities)[seen]
+    tinted = np.abs((a.sh[:, 0] + b.sh[:, 0]) / 2 - middle.sh[:, 0])[seen].max(axis=1)
+    parts = (aside, np.sqrt(turned.clip(0)), grown, faded, tinted)
+    return max(float(np.minimum(part, 1).mean()) for part in parts)
+
+
+def _halfway(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Returns the unit quaternions [n, 4] between a and b."""
+    middle = a + b * np.where(np.einsum("nd,nd->n", a, b) < 0, -1, 1)[:, None]
+    halfway: np.ndarray = middle / np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-12)
+    return halfway
+
+
+# -- frames ------------------------------------------------------------------------------------------------------------
+
+
+def _features(splats: Splats, means: np.ndarray, reach: float) -> np.ndarray:
+    """Returns float32 [n, 7] whose distances say how little Gaussians, moved to `means`, resemble each other."""
+    size = np.log(np.maximum(splats.scales, 1e-12)).mean(axis=1, keepdims=True)
+    return np.concatenate(
+        [means / np.float32(reach), splats.base_colors / np.float32(HUE), size / np.float32(GROWTH)], 1
+    )
+
+
+def _reach(splats: Splats) -> float:
+    """Returns the distance of matches: REACH median distances between neighbours."""
+    some = np.random.default_rng(0).permutation(len(splats.means))[:ROWS]
+    apart = np.linalg.norm(splats.means[some][:, None] - splats.means[None], axis=2)
+    apart[np.arange(len(some)), some] = np.inf
+    nearest = apart.min(axis=1)
+    return max(REACH * float(np.median(nearest[np.isfinite(nearest)], axis=0)) if len(nearest) > 1 else 1.0, 1e-9)
+
+
+def _in_order(frames: Sequence[Splats]) -> bool:
+    """Whether frames of as many rows keep their rows: of most Gaussians, the one in the same row of the next frame is
+    among the RANK that most resemble it where its last movement takes it."""
+    n, rng = len(frames[0].means), np.random.default_rng(0)
+    for i in evenly(range(len(frames) - 1), TRIPLES):
+        before, now, later = frames[max(i - 1, 0)], frames[i], frames[i + 1]
+        rows, reach = rng.permutation(n)[:ROWS], _reach(now)
+        guesses = (now.means, 2 * now.means - before.means)
+        ranks = []
+        for guess in guesses:
+            here, there = _features(now, guess, reach)[rows], _features(later, later.means, reach)
+            apart = np.square(here[:, None] - there[None]).sum(axis=2)
+            ranks.append((apart < apart[np.arange(len(rows)), rows][:, None]).sum(axis=1))
+        if np.median(np.minimum(*ranks)) > RANK:
+            return False
+    return True
+
+
+@kernel()
+def _nearest(here: np.ndarray, there: np.ndarray) -> np.ndarray:
+    """Returns int64 [n]: for each row of `here` [n, d] the row of `there` [m, d], sorted by its first column, nearest
+    to it within a distance of 1, else -1."""
+    found = np.full(len(here), -1, np.int64)
+    for i in range(len(here)):
+        least = np.float32(1)
+        j = np.searchsorted(there[:, 0], here[i, 0] - np.float32(1))
+        while j < len(there) and there[j, 0] <= here[i, 0] + 1:
+            apart = np.float32(0)
+            for k in range(here.shape[1]):
+                apart += (here[i, k] - there[j, k]) ** 2
+            if apart < least:
+                least, found[i] = apart, j
+            j += 1
+    return found
+
+
+def _pairs(here: np.ndarray, there: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the rows of features `here` and `there`, [n, d] and [m, d], that are each other's nearest."""
+    order, back = (np.argsort(x[:, 0], kind="stable") for x in (there, here))
+    to, fro = _nearest(here, there[order]), _nearest(there, here[back])
+    to, fro = np.where(to < 0, -1, order[to]), np.where(fro < 0, -1, back[fro])
+    rows = np.flatnonzero(to >= 0)
+    rows = rows[fro[to[rows]] == rows]
+    return rows, to[rows]
+
+
+def _matched(where: str, times: np.ndarray, frames: Sequence[Splats]) -> Sampled:
+    """Chains the Gaussians of neighbouring frames that match. A chain stays as it is before and after its frames."""
+    reach = float(np.median([_reach(frame) for frame in evenly(frames, TRIPLES)]))
+    chain, links = np.arange(len(frames[0].means)), [np.arange(len(frames[0].means))]
+    count, kept, speed = len(chain), 0, np.zeros_like(frames[0].means)
+    for now, later in zip(frames[:-1], frames[1:], strict=True):
+        rows, others = _pairs(_features(now, now.means + speed, reach), _features(later, later.means, reach))
+        chain, speed = np.full(len(later.means), -1), np.zeros_like(later.means)
+        chain[others], speed[others] = links[-1][rows], later.means[others] - now.means[rows]
+        new = np.flatnonzero(chain < 0)
+        chain[new] = count + np.arange(len(new))
+        count, kept = count + len(new), kept + len(rows)
+        _check_size(where, len(frames), count)
+        links.append(chain)
+    owner = np.concatenate(links)
+    frame = np.repeat(np.arange(len(frames)), [len(link) for link in links])
+    order = np.lexsort((frame, owner))
+    first = np.searchsorted(owner[order], np.arange(count))
+    length = np.bincount(owner, minlength=count)
+    start = frame[order][first]
+    columns = {name: np.concatenate([getattr(f, name) for f in frames])[order] for name in vars(frames[0])}
+
+    def at(i: int) -> Splats:
+        entries = first + np.clip(i - start, 0, length - 1)
+        return Splats(**{name: values[entries] for name, values in columns.items()})
+
+    half = 0.5 / max(len(frames) - 1, 1)
+    low, high = times[start] - half, times[start + length - 1] + half
+    low, high = np.where(start == 0, -half, low), np.where(start + length == len(frames), 1 + half, high)
+    windows = np.stack([(low + high) / 2, (high - low) / 2, np.full(count, half * SHARP)], axis=1).astype(np.float32)
+    share = kept / max(len(owner) - len(frames[0].means), 1)
+    words = f"no stable order: {share:.0%} of the Gaussians match one of the frame before, the others have windows"
+    found = _stacked(times, [at(i) for i in range(len(frames))], windows, words)
+    return replace(found, matched=share)

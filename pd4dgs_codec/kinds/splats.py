@@ -1,0 +1,333 @@
+"""The scene kind "splats": every anchor is a Gaussian under the laws of 3D Gaussian splatting (clause 13.7).
+
+Colours are as in its reference implementation (Kerbl et al. 2023), in PLY, SPZ and KHR_gaussian_splatting: real
+harmonics Y_j with their signs, and max(0, 0.5 + sum c_j Y_j(d)), d the unit vector from the eye to the mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from pd4dgs_codec.errors import Malformed
+from pd4dgs_codec.format.quantise import RowTable, dequantise
+from pd4dgs_codec.format.symbols import Growing
+from pd4dgs_codec.format.tables import Kind, Tables
+from pd4dgs_codec.kinds.tracks import Tracks, total, tracks_of
+from pd4dgs_codec.scene import MASK_STEP, MIN_OPACITY, Gaussians, Grading, LayeredScene, SceneInfo
+
+NUMBER, NAME = 1, "splats"
+
+#: Tensors of rows in the order of their numbers, with their channels, and those that a scene may lack.
+TENSORS = {"offset": (3,), "color": (3,), "opacity": (1,), "scale": (3,), "rotation": (3,), "harmonics": (9, 24, 45),
+           "window": (3,)}  # fmt: skip
+OPTIONAL = ("harmonics", "window")
+
+MAX_DEGREE = 3
+#: Y_0, a constant: the factor between a colour and its first coefficient.
+SH_C0 = 0.28209479177387814
+#: Y, Co, Cg -> red, green, blue.
+RGB = np.array([[1, 1, -1], [1, 0, 1], [1, -1, -1]], np.float32)
+
+
+# -- Gaussians at an instant -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """N Gaussians at an instant, float32."""
+
+    means: np.ndarray  #: [N, 3] world, scene units
+    quats: np.ndarray  #: [N, 4] wxyz, unit
+    scales: np.ndarray  #: [N, 3] standard deviations, scene units
+    opacities: np.ndarray  #: [N] 0..1
+    sh: np.ndarray  #: [N, (degree + 1)^2, 3] coefficients of red, green and blue
+
+    @property
+    def degree(self) -> int:
+        """Degree of the harmonics, 0 to 3."""
+        return int(np.sqrt(self.sh.shape[1])) - 1
+
+    def colors(self, eye: np.ndarray) -> np.ndarray:
+        """Returns the colours float32 [N, 3] >= 0 seen from `eye` [3], world."""
+        basis = harmonics(unit(self.means - eye.astype(np.float32)), self.degree)
+        return np.asarray(np.maximum(np.einsum("nj,njc->nc", basis, self.sh) + np.float32(0.5), 0))
+
+    def seen_from(self, eye: np.ndarray, slots: np.ndarray) -> Gaussians:
+        """Returns the Gaussians with their colours seen from `eye` [3], world."""
+        return Gaussians(self.means, self.quats, self.scales, self.opacities, self.colors(eye), slots)
+
+    @property
+    def base_colors(self) -> np.ndarray:
+        """float32 [N, 3] 0..1: the mean colours over all directions."""
+        return np.asarray(np.clip(self.sh[:, 0] * np.float32(SH_C0) + np.float32(0.5), 0, 1))
+
+    @property
+    def rest(self) -> np.ndarray:
+        """float32 [N, 3 ((degree + 1)^2 - 1)]: coefficients from degree 1 on, channel by channel as in files."""
+        return np.asarray(self.sh[:, 1:].transpose(0, 2, 1).reshape(len(self.sh), 3 * (self.sh.shape[1] - 1)))
+
+    def taken(self, rows: np.ndarray) -> Splats:
+        """Returns the Gaussians `rows`, indices or a mask."""
+        return Splats(*(part[rows] for part in vars(self).values()))
+
+    def scaled(self, factor: float) -> Splats:
+        """Returns the Gaussians with all lengths multiplied by `factor`."""
+        return replace(self, means=self.means * np.float32(factor), scales=self.scales * np.float32(factor))
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Divides vectors [..., d] by their length; zero vectors stay zero."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.maximum(length, np.finfo(vectors.dtype).tiny))
+
+
+def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The Hamilton products of quaternions [..., 4] wxyz."""
+    (w, x, y, z), (i, j, k, l) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
+    return np.stack(
+        [w * i - x * j - y * k - z * l, w * j + x * i + y * l - z * k, w * k - x * l + y * i + z * j,
+         w * l + x * k - y * j + z * i], axis=-1,
+    )  # fmt: skip
+
+
+def harmonics(directions: np.ndarray, degree: int) -> np.ndarray:
+    """Evaluates (degree + 1)^2 real harmonics [..., j], degree 0 to 3, at unit vectors [..., 3] in their dtype."""
+    x, y, z = np.moveaxis(directions, -1, 0)
+    rows = [np.full_like(x, SH_C0)]
+    if degree >= 1:
+        c = 0.4886025119029199
+        rows += [-c * y, c * z, -c * x]
+    if degree >= 2:
+        c = 1.0925484305920792
+        xx, yy, zz = x * x, y * y, z * z
+        rows += [c * x * y, -c * y * z, 0.31539156525252005 * (2 * zz - xx - yy), -c * x * z, c / 2 * (xx - yy)]
+    if degree >= 3:
+        rows += [
+            -0.5900435899266435 * y * (3 * xx - yy),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4 * zz - xx - yy),
+            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+            -0.4570457994644658 * x * (4 * zz - xx - yy),
+            1.445305721320277 * z * (xx - yy),
+            -0.5900435899266435 * x * (xx - 3 * yy),
+        ]
+    return np.stack(rows, axis=-1).astype(directions.dtype)
+
+
+def splats_of(tensors: Mapping[str, np.ndarray]) -> Splats:
+    """Returns the Gaussians of tensors [n, C] by the names of TENSORS, with "position" instead of "offset" and no
+    window."""
+    xyz, color = tensors["rotation"], tensors["color"]
+    w = np.sqrt(np.maximum(1 - np.square(xyz).sum(axis=1, keepdims=True), 0))
+    channels = np.concatenate([color, tensors["harmonics"]], axis=1) if "harmonics" in tensors else color
+    parts = (
+        tensors["position"],
+        _rotations(np.concatenate([w, xyz], axis=1)),
+        np.exp(tensors["scale"]),
+        _sigmoid(tensors["opacity"][:, 0]),
+        channels.reshape(len(xyz), -1, 3) @ RGB.T.astype(color.dtype),
+    )
+    return Splats(*(np.ascontiguousarray(part, np.float32) for part in parts))
+
+
+def _rotations(p: np.ndarray) -> np.ndarray:
+    """Returns quaternions [n, 4] divided by their length, the identity instead of 0."""
+    found = unit(p)
+    found[~found.any(axis=1), 0] = 1
+    return found
+
+
+def _sigmoid(x: np.ndarray) -> np.ndarray:
+    return np.asarray(1 / (1 + np.exp(-x)))
+
+
+# -- the scene ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SplatScene(LayeredScene):
+    """A scene of the kind splats. tensors: float32 [N, C] by the names of TENSORS, in their order. steps: of the
+    tensors. tracks: the deformations, by layer; those of layers up to a level add up."""
+
+    steps: dict[str, float]
+    tensors: dict[str, np.ndarray]
+    tracks: dict[int, Tracks]
+
+    @property
+    def attributes(self) -> dict[str, np.ndarray]:
+        return self.tensors
+
+    @property
+    def row_steps(self) -> dict[str, float]:
+        return self.steps
+
+    def anchor_at(self, rows: np.ndarray | slice) -> np.ndarray:
+        place = self.anchor_q[rows] + self.tensors["offset"][rows].astype(np.float64)
+        place *= np.float32(self.info.voxel_size)
+        return place.astype(np.float32)
+
+    def deformation(self, layer: int) -> Tracks | None:
+        """Returns the tracks of a layer, None without any."""
+        return self.tracks.get(layer)
+
+    def with_deformation(self, layer: int, deformation: Tracks | None) -> SplatScene:
+        """Returns the scene with these tracks in a layer."""
+        others = {number: tracks for number, tracks in self.tracks.items() if number != layer}
+        return replace(self, tracks=others | ({layer: deformation} if deformation else {}))
+
+    def of_anchors(self, rows: np.ndarray | slice) -> dict[str, Any]:
+        grading = None if self.grading is None else replace(self.grading, classes=self.grading.classes[rows])
+        tensors = {name: values[rows] for name, values in self.tensors.items()}
+        tracks = {layer: own.of_rows(rows) for layer, own in self.tracks.items()}
+        return {"anchor_q": self.anchor_q[rows], "tensors": tensors, "tracks": tracks, "grading": grading}
+
+    def of_layers(self) -> dict[str, Any]:
+        return {"tracks": {layer: own for layer, own in self.tracks.items() if layer in self.layers}}
+
+    def scaled(self, factor: float) -> SplatScene:
+        steps = {name: float(np.float32(step * factor)) for name, step in self.steps.items()}
+        return replace(self, steps=steps, tracks={layer: own.scaled(factor) for layer, own in self.tracks.items()})
+
+    def splats(self, t: float, level: int | None = None) -> tuple[Splats, np.ndarray]:
+        """Returns (the visible Gaussians at normalised time t in 0..1, their rows int64 [K]). Arguments and errors as
+        of `gaussians`."""
+        with np.errstate(all="ignore"):
+            return Moving(self.at(t, level)).at(t)
+
+    def _evaluated(self, t: float, eye: np.ndarray) -> Gaussians:
+        splats, rows = Moving(self).at(t)
+        return splats.seen_from(eye, rows)
+
+
+class Moving:
+    """The active Gaussians of a scene's highest level, prepared for any time."""
+
+    def __init__(self, scene: SplatScene):
+        rows = scene.active
+        mask, tensors = scene.mask[-1][rows] * MASK_STEP, {name: x[rows] for name, x in scene.tensors.items()}
+        self._rest = splats_of(tensors | {"position": scene.anchor_at(rows)})
+        heads = {name for own in scene.tracks.values() for name in own.heads}
+        if "opacity" not in heads:  # those that no time makes visible
+            seen = self._rest.opacities * mask >= np.float32(MIN_OPACITY)
+            rows, mask, self._rest = rows[seen], mask[seen], self._rest.taken(seen)
+            tensors = {name: x[seen] for name, x in tensors.items()}
+        self._rows, self._mask, self._fades = rows, mask, "opacity" in heads or "window" in tensors
+        self._logits, self._logs, self._window = tensors["opacity"][:, 0], tensors["scale"], tensors.get("window")
+        if "scale" not in heads:
+            self._rest = replace(self._rest, scales=self._rest.scales * mask[:, None])
+        self._tracks = {layer: own.of_rows(rows) for layer, own in scene.tracks.items()}
+
+    def at(self, t: float) -> tuple[Splats, np.ndarray]:
+        """Returns (the visible Gaussians at normalised time t in 0..1, their rows int64 [K])."""
+        rest, mask, added = self._rest, self._mask, total(self._tracks, t, len(self._rows))
+        opacities = rest.opacities if "opacity" not in added else _sigmoid(self._logits + added["opacity"][:, 0])
+        if self._window is not None:
+            centre, half, log = self._window.T
+            excess = np.maximum(np.abs(np.float32(t) - centre) - half, 0)
+            opacities = opacities * np.where(excess > 0, np.exp(-0.5 * np.square(excess / np.exp(log))), 1)
+        changed: dict[str, np.ndarray] = {"opacities": opacities * mask}
+        if "position" in added:
+            changed["means"] = rest.means + added["position"]
+        if "rotation" in added:
+            turn = added["rotation"]
+            turn[:, 0] += 1
+            changed["quats"] = _rotations(product(turn, rest.quats))
+        if "scale" in added:
+            changed["scales"] = np.exp(self._logs + added["scale"]) * mask[:, None]
+        if "color" in added:
+            changed["sh"] = rest.sh.copy()
+            changed["sh"][:, 0] += added["color"] @ RGB.T
+        splats = replace(rest, **changed)
+        if not self._fades:
+            return splats, self._rows
+        seen = np.flatnonzero(splats.opacities >= np.float32(MIN_OPACITY))
+        return splats.taken(seen), self._rows[seen]
+
+
+def scene(
+    info: SceneInfo,
+    cells: np.ndarray,
+    tensors: Mapping[str, np.ndarray],
+    steps: Mapping[str, float],
+    *,
+    classes: np.ndarray | None = None,
+    centres: Mapping[str, np.ndarray] | None = None,
+    tracks: Mapping[int, Tracks] | None = None,
+    layer: np.ndarray | None = None,
+) -> SplatScene:
+    """Returns a scene to be encoded, of n Gaussians in any order, all of them active from their layer on.
+
+    cells: int32 [n, 3], distinct voxels. tensors: float32 [n, C], and steps, by the names of TENSORS. classes: uint8
+    [n] step classes; with them centres int32 [C] by name, in steps: values become (centre + k 2^class) step. tracks:
+    by layer 1, 2. layer: [n], the layer 0, 1 or 2 with which a Gaussian comes; default 0.
+    """
+    names = [name for name in TENSORS if name in tensors]
+    own = np.zeros(len(cells), np.int64) if layer is None else np.asarray(layer)
+    tracks = dict(tracks or {})
+    present = tuple(i for i in range(3) if i == 0 or i in tracks or (own == i).any())
+    grading = None
+    if classes is not None:
+        centre = [dequantise(np.asarray((centres or {})[name], np.int32), float(steps[name])) for name in names]
+        grading = Grading(classes, np.concatenate(centre))
+    return SplatScene(
+        info=info,
+        layers=present,
+        rows=(len(cells),) * len(present),
+        anchor_q=cells,
+        mask=tuple(np.where(own <= i, 255, 0).astype(np.uint8) for i in present),
+        grading=grading,
+        steps={name: float(np.float32(steps[name])) for name in names},
+        tensors={name: tensors[name] for name in names},
+        tracks=tracks,
+    )
+
+
+# -- tensors of a file -------------------------------------------------------------------------------------------------
+
+
+def widths_of(kind: Kind, table: RowTable) -> None:
+    """Raises Malformed if a header breaks the rules of the kind. No other widths follow from those of the rows."""
+    if len(kind) != 1:
+        raise Malformed(f"header: kind {list(kind)}, expected [{NUMBER}]")
+    found, expected = {tensor.id: tensor.channels for tensor in table.tensors}, dict(enumerate(TENSORS.items()))
+    lacking = [i for i, (name, _) in expected.items() if i not in found and name not in OPTIONAL]
+    odd = [i for i, channels in found.items() if i not in expected or channels not in expected[i][1]]
+    if lacking or odd:
+        known = ", ".join(f"{i} of {' or '.join(map(str, sizes))}" for i, (_, sizes) in expected.items())
+        raise Malformed(f"header: rows {list(found.items())} (id, channels), expected {known}; 5 and 6 if wanted")
+
+
+def check(tables: Tables, widths: None) -> None:
+    """Raises Malformed if layer 0 breaks the rules of the kind."""
+    if tables != Tables():
+        raise Malformed("layer 0: grids, chains, layer rows or a deformation, expected none")
+
+
+def json(kind: Kind, table: RowTable) -> dict[str, Any]:
+    """Returns the degree of the harmonics, whether there are windows, and the steps."""
+    steps = {list(TENSORS)[tensor.id]: tensor.step for tensor in table.tensors}
+    degree = next((TENSORS["harmonics"].index(t.channels) + 1 for t in table.tensors if t.id == 5), 0)
+    return {"degree": degree, "windows": "window" in steps, "steps": steps}
+
+
+def scene_of(table: RowTable, info: SceneInfo, grown: Growing, writeable: bool) -> SplatScene:
+    """Returns the scene of the slices so far, of at least one."""
+    names = list(TENSORS)
+    (anchor_q, classes, *rows), codes, layer_rows = grown.arrays(writeable)
+    pairs = zip(grown.tensors.items(), layer_rows, strict=True)
+    return SplatScene(
+        info=info,
+        layers=tuple(grown.tensors),
+        rows=tuple(len(own) for own in codes),
+        anchor_q=anchor_q,
+        mask=tuple(codes),
+        grading=Grading(classes, table.centre_values) if table.graded else None,
+        fills=tuple(grown.fills.values()),
+        steps={names[tensor.id]: tensor.step for tensor in table.tensors},
+        tensors={names[tensor.id]: x for tensor, x in zip(table.tensors, rows, strict=True)},
+        tracks={layer: tracks_of(tensors, own) for (layer, tensors), own in pairs if own},
+    )

@@ -1,0 +1,134 @@
+// Clauses 8.6, 8.7 and 11.3: grids in stages, and samples from their residuals.
+
+import { channelsOf, groupByClass } from "./channels.js";
+import { malformed } from "./errors.js";
+import { MAX_SYMBOL } from "./limits.js";
+/** @import { ChannelReader } from "./channels.js" */
+/** @import { PlaneShape } from "./parameters.js" */
+/** @import { Prior } from "./tables.js" */
+
+/** How many predictors 11.3 has. */
+export const PREDICTORS = 2;
+/** Classes of a plane channel that is split. */
+const CLASSES = 8;
+/** Relative magnitudes of residuals below this come from a table. */
+const LOOKED_UP = 256;
+
+/**
+ * The samples of each plane of all grids.
+ *
+ * @param {ChannelReader} reader @param {PlaneShape[]} shapes @param {Prior[]} priors see ChannelReader
+ * @returns {Int32Array[]} [channels, height, width] each
+ */
+export function decodePlanes(reader, shapes, priors) {
+  const planes = shapes.map(({ channels, height, width }) => new Int32Array(channels * height * width));
+  const all = planes.map((plane, i) => channelsOf(plane, shapes[i].channels));
+  /** @type {Float64Array[]} */
+  const magnitudes = shapes.map(() => new Float64Array(0)); // sums over the stages before, per plane
+  const most = Math.max(0, ...shapes.map(({ channels }) => channels));
+  for (let first = 0, end = 2; first < most; first = end, end *= 2) {
+    shapes.forEach(({ channels, height, width }, i) => {
+      const stage = all[i].slice(first, end);
+      if (!stage.length) return;
+      const groups = first ? groupByActivity(sumOfNine(magnitudes[i], height, width)) : null;
+      for (const channel of stage) reader.fill(channel, priors, groups);
+      if (end >= channels) return;
+      if (!first) magnitudes[i] = new Float64Array(height * width);
+      for (const residuals of stage) addRelativeMagnitudes(residuals, magnitudes[i]);
+    });
+  }
+  all.forEach((plane, i) => plane.forEach((channel) => restore(channel, shapes[i])));
+  return planes;
+}
+
+/** Adds the relative magnitude of each cell in one channel to `sums`. @param {Int32Array} residuals
+ * @param {Float64Array} sums */
+function addRelativeMagnitudes(residuals, sums) {
+  const n = residuals.length;
+  let total = 1;
+  let largest = 0;
+  for (let p = 0; p < n; p++) {
+    const e = Math.abs(residuals[p]);
+    total += e;
+    largest = Math.max(largest, e);
+  }
+  const factor = 256 * n;
+  if (largest * factor > Number.MAX_SAFE_INTEGER) {
+    for (let p = 0; p < n; p++) sums[p] += Number((BigInt(Math.abs(residuals[p])) * BigInt(factor)) / BigInt(total));
+    return;
+  }
+  // The quotient of two integers below 2^53, rounded to binary64, does not reach the next integer: the floor is exact.
+  const known = new Float64Array(Math.min(largest + 1, LOOKED_UP));
+  for (let e = 0; e < known.length; e++) known[e] = Math.floor((e * factor) / total);
+  for (let p = 0; p < n; p++) {
+    const e = Math.abs(residuals[p]);
+    sums[p] += e < LOOKED_UP ? known[e] : Math.floor((e * factor) / total);
+  }
+}
+
+/** Groups cells by activity into classes of about equal size. @param {Float64Array} activity */
+function groupByActivity(activity) {
+  const n = activity.length;
+  const ascending = activity.slice().sort();
+  const classes = new Uint8Array(n);
+  for (let i = 1; i < CLASSES; i++) {
+    const bound = ascending[Math.floor((i * n) / CLASSES)];
+    for (let p = 0; p < n; p++) if (activity[p] >= bound) classes[p]++;
+  }
+  return groupByClass(classes, CLASSES);
+}
+
+/** Per cell the sum over the nine cells around it; beyond the border the border's cells count again.
+ * @param {Float64Array} values @param {number} height @param {number} width */
+function sumOfNine(values, height, width) {
+  const rows = new Float64Array(values.length);
+  for (let i = 0, at = 0; i < height; i++) {
+    for (let j = 0; j < width; j++, at++) {
+      rows[at] = values[at] + values[j ? at - 1 : at] + values[j + 1 < width ? at + 1 : at];
+    }
+  }
+  const sums = new Float64Array(values.length);
+  for (let i = 0, at = 0; i < height; i++) {
+    const up = i ? width : 0;
+    const down = i + 1 < height ? width : 0;
+    for (let j = 0; j < width; j++, at++) sums[at] = rows[at] + rows[at - up] + rows[at + down];
+  }
+  return sums;
+}
+
+/** 11.3, in place: residuals of a channel become samples. Each is checked before others are predicted from it, so that a
+ * sum stays small. @param {Int32Array} samples @param {PlaneShape} shape */
+function restore(samples, { width, predictor }) {
+  check(samples[0]);
+  // both predictors give W in row 0 and N in column 0
+  for (let at = 1; at < width; at++) check((samples[at] += samples[at - 1]));
+  for (let row = width; row < samples.length; row += width) {
+    check((samples[row] += samples[row - width]));
+    let w = samples[row];
+    let nw = samples[row - width];
+    for (let at = row + 1; at < row + width; at++) {
+      const n = samples[at - width];
+      const k = samples[at] + (predictor ? median(w, n, w + n - nw) : n);
+      check(k);
+      samples[at] = w = k;
+      nw = n;
+    }
+  }
+}
+
+/** The median of three numbers below 2^30 in magnitude, without branches, which a processor would mispredict.
+ * @param {number} a @param {number} b @param {number} c */
+function median(a, b, c) {
+  let step = (a - b) & ((a - b) >> 31);
+  const least = b + step;
+  const most = a - step;
+  step = most - c;
+  const below = most - (step & ~(step >> 31));
+  step = below - least;
+  return least + (step & ~(step >> 31));
+}
+
+/** @param {number} k */
+function check(k) {
+  if ((k + MAX_SYMBOL) >>> 0 > 2 * MAX_SYMBOL) throw malformed(`a plane sample of ${k}, limit ±${MAX_SYMBOL}`);
+}

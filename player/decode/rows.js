@@ -1,0 +1,81 @@
+// Clauses 8.5, 11.2 and 11.5: tensors of rows, from symbols to their values.
+
+import { channelsOf, checkRange, groupByClass } from "./channels.js";
+import { malformed } from "./errors.js";
+import { MAX_SYMBOL } from "./limits.js";
+/** @import { ChannelReader } from "./channels.js" */
+/** @import { Prior } from "./tables.js" */
+/** @import { RowTensor } from "./tensors.js" */
+
+/** How many predictors of rows 11.2 has. */
+export const ROW_PREDICTORS = 2;
+export const STEP_CLASSES = 7;
+
+/** Channels of all these tensors. @param {RowTensor[]} tensors */
+export const widthOf = (tensors) => tensors.reduce((sum, { channels }) => sum + channels, 0);
+
+/**
+ * The values in steps of tensors of rows, [channels, count] of all tensors one behind the other.
+ *
+ * @param {ChannelReader} reader @param {RowTensor[]} tensors @param {number} count of rows
+ * @param {Int32Array | Uint8Array | null} classes [count] step classes, null if rows have none
+ * @param {number[] | null} centres of the channels, null if they are 0 @param {Prior[]} priors see ChannelReader
+ */
+export function decodeRows(reader, tensors, count, classes, centres, priors) {
+  const values = new Int32Array(widthOf(tensors) * count);
+  const groups = classes && groupByClass(classes, STEP_CLASSES);
+  const predictors = tensors.flatMap(({ channels, predictor }) => new Array(channels).fill(predictor));
+  channelsOf(values, predictors.length).forEach((channel, c) => {
+    reader.fill(channel, priors, groups);
+    restore(channel, classes, centres?.[c] ?? 0, predictors[c]);
+  });
+  return values;
+}
+
+/** 11.2, in place: symbols become values. @param {Int32Array} values @param {Int32Array | Uint8Array | null} classes
+ * @param {number} centre @param {number} predictor */
+function restore(values, classes, centre, predictor) {
+  checkRange(values, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of a row");
+  const last = new Int32Array(STEP_CLASSES).fill(centre);
+  for (let i = 0; i < values.length; i++) {
+    const c = classes ? classes[i] : 0;
+    const v = last[c] + (values[i] << c); // below 2^30 in magnitude
+    if ((v + MAX_SYMBOL) >>> 0 > 2 * MAX_SYMBOL) throw malformed(`a row's value of ${v} steps, limit ±${MAX_SYMBOL}`);
+    values[i] = v;
+    if (predictor) for (let j = c; j < STEP_CLASSES; j++) last[j] = v;
+  }
+}
+
+/** Each tensor of rows dequantised, [count, channels]. @param {RowTensor[]} tensors @param {Int32Array} values as
+ * decodeRows gives them @param {number} count */
+export function rowsOf(tensors, values, count) {
+  let at = 0;
+  return tensors.map(({ channels, step }) => {
+    return transposed(values.subarray(at, (at += channels * count)), count, channels, step);
+  });
+}
+
+/** 11.5: symbols times their step, rounded to binary32. Malformed if a result is not finite. @param {Int32Array} symbols
+ * @param {number} step */
+export const dequantise = (symbols, step) => transposed(symbols, symbols.length, 1, step);
+
+/** Rows that are transposed at a time, so few that they stay in the cache. */
+const BLOCK = 128;
+
+/** As dequantise, of [columns, rows] symbols to [rows, columns] values. @param {Int32Array} symbols @param {number} rows
+ * @param {number} columns @param {number} step */
+function transposed(symbols, rows, columns, step) {
+  const values = new Float32Array(symbols.length);
+  for (let first = 0; first < rows; first += BLOCK) {
+    const end = Math.min(first + BLOCK, rows);
+    for (let c = 0; c < columns; c++) {
+      // The product is exact: 24 bits by 24 bits.
+      for (let r = first; r < end; r++) values[r * columns + c] = symbols[c * rows + r] * step;
+    }
+  }
+  // Rounding is monotone, so that where the largest symbol stays finite all do.
+  if (!Number.isFinite(Math.fround(MAX_SYMBOL * step))) {
+    for (const value of values) if (!Number.isFinite(value)) throw malformed("a reconstructed value is not finite");
+  }
+  return values;
+}

@@ -1,0 +1,228 @@
+"""Models of other programs straight into a file."""
+
+import warnings
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from test_splats import gsplat_state, make_splats
+
+from pd4dgs_codec import decode
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.interchange import imported
+from pd4dgs_codec.interchange.sampled import sampled
+from pd4dgs_codec.interchange.splats import ply_bytes
+from pd4dgs_codec.interchange.teacher import Teacher, read_model
+from pd4dgs_codec.kinds.splats import Splats
+
+pytestmark = pytest.mark.usefixtures("small_views")
+
+
+@pytest.fixture
+def small_views(monkeypatch):
+    monkeypatch.setattr(imported, "CAMERAS", 18)
+    monkeypatch.setattr(imported, "SIZE", 64)
+
+
+def body(count: int = 300, degree: int = 0) -> Splats:
+    """Gaussians of which 40 % move with `moved`."""
+    return replace(make_splats(count, degree), opacities=np.full(count, 0.9, np.float32))
+
+
+def moved(splats: Splats, t: float) -> Splats:
+    """Some turn and fade, each in its own measure; the others stay."""
+    means, opacities, n = splats.means.copy(), splats.opacities.copy(), int(0.4 * len(splats.means))
+    angle = np.float32(2 * t)
+    x, y, z = splats.means[:n].T
+    means[:n] = np.stack([x * np.cos(angle) - y * np.sin(angle), x * np.sin(angle) + y * np.cos(angle), z + t], axis=1)
+    opacities[: n // 2] *= np.float32(1 - 0.5 * t)
+    return replace(splats, means=means, opacities=opacities)
+
+
+def sequence(folder: Path, frames: int = 9, shuffled: bool = False) -> Path:
+    """Frames as PLY files, in a random order and with some rows lost if shuffled."""
+    folder.mkdir()
+    rng = np.random.default_rng(0)
+    for i in range(frames):
+        splats = moved(body(), i / (frames - 1) / (4 if shuffled else 1))
+        rows = rng.permutation(300)[:290] if shuffled else np.arange(300)
+        (folder / f"{i:04d}.ply").write_bytes(ply_bytes(splats.taken(rows)))
+    return folder
+
+
+def test_still_files(tmp_path, cli):
+    splats = body(degree=2)
+    (tmp_path / "a.ply").write_bytes(ply_bytes(splats))
+    torch.save({"splats": gsplat_state(splats)}, tmp_path / "b.pt")
+    for name in ("a.ply", "b.pt"):
+        out = tmp_path / "scene.pd4"
+        result = cli("import_model", tmp_path / name, "-o", out, "-f", "--psnr", 45, "--json", "--title", "A")
+        assert result.code == 0, result.err
+        found = result.json
+        assert found["psnr"]["0"] > 43 and found["bytes"] == out.stat().st_size
+        assert found["gaussians"] + found["gaussians_left_out"] == 300
+        scene = decode(out.read_bytes())
+        assert scene.layers == (0,) and scene.splats(0.0)[0].degree == 2
+    quiet = cli("import_model", tmp_path / "a.ply", "-o", tmp_path / "c.pd4")
+    assert quiet.code == 0 and "300 Gaussians, harmonics of degree 2, static" in quiet.err
+
+
+def test_frames_in_order_become_tracks(tmp_path, cli):
+    out = tmp_path / "scene.pd4"
+    result = cli("import_model", sequence(tmp_path / "set"), "-o", out, "--psnr", 40, "--fps", 4, "--json")
+    assert result.code == 0, result.err
+    assert result.json["order"] == "rows in a stable order" and result.json["static"] == pytest.approx(0.6, abs=0.01)
+    assert result.json["psnr"]["1"] > 37 and result.json["psnr"]["0"] < result.json["psnr"]["1"] - 3
+    scene = decode(out.read_bytes())
+    heads = {name for tracks in scene.tracks.values() for name in tracks.heads}
+    assert scene.info.time_range == (0.0, 2.0) and {"position", "opacity"} <= heads
+
+
+def test_frames_without_an_order_are_matched(tmp_path, cli):
+    out = tmp_path / "scene.pd4"
+    result = cli("import_model", sequence(tmp_path / "set", shuffled=True), "-o", out, "--psnr", 36, "--json")
+    assert result.code == 0, result.err
+    assert "no stable order" in result.json["order"] and 0.7 < result.json["matched"] < 1
+    assert max(result.json["psnr"].values()) > 32
+    assert "window" in decode(out.read_bytes()).tensors
+
+
+def test_random_frames_have_no_order():
+    frames = [make_splats(200, 0, seed) for seed in range(4)]
+    model = Teacher(lambda t: frames[round(3 * t)], tuple(np.linspace(0, 1, 4)), 1.0)
+    found = sampled(model, "frames")
+    assert found.matched < 0.5 and found.windows is not None
+    for i, frame in enumerate(frames):  # each frame shows its own Gaussians
+        shown = found.frame(i, bare=False)
+        seen = shown.opacities > 1e-3
+        assert np.count_nonzero(seen) == 200
+        np.testing.assert_array_equal(np.sort(shown.means[seen], axis=0), np.sort(frame.means, axis=0))
+
+
+def test_a_function_is_sampled_where_it_bends(tmp_path, monkeypatch, cli):
+    (tmp_path / "late.py").write_text(
+        "from test_import import body, moved\ndef model(t):\n    return vars(moved(body(), 4 * max(t - 0.75, 0)))\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    found = sampled(read_model("late:model", 30), "late:model")
+    gaps = np.diff(found.times)
+    assert gaps[-1] <= gaps[0] / 4
+    result = cli("import_model", "late:model", "-o", "late.pd4", "--target-size", "9k", "--json")
+    assert result.code == 0, result.err
+    assert 0.85 * 9000 < Path("late.pd4").stat().st_size <= 9000 and max(result.json["psnr"].values()) > 30
+
+
+def test_spacetime_gaussians(tmp_path, cli):
+    """Against their formulas, written out here."""
+    rng, n = np.random.default_rng(0), 50
+    values = {name: rng.normal(0, 0.3, n) for name in ("x", "y", "z", "opacity", *(f"f_dc_{i}" for i in range(3)))}
+    values |= {f"motion_{i}": rng.normal(0, 0.5, n) for i in range(9)}
+    values |= {f"rot_{i}": rng.normal(size=n) for i in range(4)} | {f"omega_{i}": rng.normal(size=n) for i in range(4)}
+    values |= {f"scale_{i}": rng.normal(-2, 0.2, n) for i in range(3)}
+    values |= {"trbf_center": rng.uniform(0, 1, n), "trbf_scale": rng.normal(-1, 0.3, n)}
+    head = "ply\nformat binary_little_endian 1.0\nelement vertex 50\n"
+    head += "".join(f"property float {name}\n" for name in values) + "end_header\n"
+    path = tmp_path / "point_cloud.ply"
+    path.write_bytes(head.encode() + np.stack([*values.values()], axis=1).astype("<f4").tobytes())
+    model = read_model(str(path), 30)
+    for t in (0.0, 0.4, 1.0):
+        d = t - values["trbf_center"]
+        near = np.abs(d) < 2 * np.exp(values["trbf_scale"])
+        x = values["x"] + values["motion_0"] * d + values["motion_3"] * d**2 + values["motion_6"] * d**3
+        opacity = np.exp(-np.square(d / np.exp(values["trbf_scale"]))) / (1 + np.exp(-values["opacity"]))
+        found = model.splats(t)
+        np.testing.assert_allclose(found.means[near, 0], x[near], atol=1e-5)
+        np.testing.assert_allclose(found.opacities, opacity, atol=1e-5)
+        np.testing.assert_allclose(found.base_colors[:, 0], np.clip(values["f_dc_0"], 0, 1), atol=1e-5)
+    result = cli("import_model", path, "-o", tmp_path / "a.pd4", "--psnr", 38, "--json")
+    assert result.code == 0, result.err
+    assert max(result.json["psnr"].values()) > 34
+    path.write_bytes(path.read_bytes().replace(b"float omega_3", b"float f_t_0xx"[:13]))
+    with pytest.raises(DataError, match="omega_3"):
+        read_model(str(path), 30)
+    path.write_bytes(path.read_bytes().replace(b"float f_t_0xx", b"float f_t_0\n"))
+    with pytest.raises(DataError, match="full model"):
+        read_model(str(path), 30)
+
+
+# -- bad input ---------------------------------------------------------------------------------------------------------
+
+EXPLODES = """
+import numpy as np
+def at_once(t):
+    far = np.float32(np.inf if t == 1 else t)
+    return dict(means=np.zeros((9, 3)) + far, quats=np.ones((9, 4)), scales=np.ones((9, 3)), opacities=np.ones(9),
+                colors=np.ones((9, 3)))
+def in_part(t):
+    found = at_once(0)
+    found["means"][4] = np.nan if t == 1 else t
+    return found
+"""
+
+
+def _refused(cli, source, message, *options):
+    out = Path("scene.pd4")
+    before = sorted(Path().rglob("*"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        result = cli("import_model", source, "-o", out, *options)
+    told = [line for line in result.error_lines if "error:" in line]
+    assert result.code == 1 and len(told) == 1 and message in told[0], result.err
+    assert sorted(Path().rglob("*")) == before, "something was written"
+
+
+def test_bad_input_is_refused_in_one_line(tmp_path, monkeypatch, cli):
+    monkeypatch.chdir(tmp_path)
+    Path("bad.py").write_text(EXPLODES)
+    monkeypatch.setattr("sys.dont_write_bytecode", True)
+    _refused(cli, "bad:at_once", "at 1: none of 9 Gaussians is finite")
+    _refused(cli, "bad:in_part", "8 usable Gaussians at 1 and 9 at 0")
+    folder = sequence(tmp_path / "set")
+    (folder / "0004.ply").rename(tmp_path / "kept")
+    _refused(cli, folder, "has no frame 4, expected one for each number from 0 to 8")
+    data = (tmp_path / "kept").read_bytes()
+    (folder / "0004.ply").write_bytes(data[: len(data) // 2])
+    _refused(cli, folder, "0004.ply")
+    (folder / "0004.ply").write_bytes(data.replace(b"vertex 300", b"vertex 999999999"))
+    _refused(cli, folder, "0004.ply")
+    Path("nan.ply").write_bytes(ply_bytes(replace(body(), means=np.full((300, 3), np.nan, np.float32))))
+    _refused(cli, "nan.ply", "none of 300 Gaussians is finite")
+    Path("one.ply").write_bytes(ply_bytes(body()))
+    _refused(cli, "one.ply", "target size: the smallest file tried takes", "--target-size", "500")
+    _refused(cli, "none.ply", "found nothing")
+
+
+def test_too_many_frames_and_gaussians_are_refused():
+    still = make_splats(200, 0)
+    many = Teacher(lambda t: still, tuple(np.linspace(0, 1, 1_000_000)), 1.0)
+    with pytest.raises(DataError, match="holds 1,000,000 frames, expected at most 4,096"):
+        sampled(many, "many")
+    wide = Splats(*(np.broadcast_to(part[:1], (20_000_000, *part.shape[1:])) for part in vars(still).values()))
+    large = Teacher(lambda t: wide, tuple(np.linspace(0, 1, 100)), 1.0)
+    with pytest.raises(DataError, match="20,000,000 Gaussians at 100 instants"):
+        sampled(large, "large")
+
+
+def test_a_run_whose_tensors_disagree(tmp_path, monkeypatch, cli):
+    from teachers import FourD
+
+    monkeypatch.chdir(tmp_path)
+    run = FourD(make_splats()).save(tmp_path / "run", make_splats())
+    path = run / "point_cloud/iteration_7/deformation.pth"
+    state = torch.load(path)
+    state["deformation_net.pos_deform.1.weight"] = state["deformation_net.pos_deform.1.weight"][:, :5]
+    torch.save(state, path)
+    _refused(cli, run, "pos_deform.1.weight has shape")
+
+
+def test_options_that_do_not_fit(tmp_path, cli):
+    for out, option, message in (
+        ("a.pt", ("--psnr", 40), "--psnr needs a .pd4 file"),
+        ("a.pd4", ("--appearance", 1), "--appearance needs -o model.pt"),
+        ("a.pd4", ("--psnr", 40, "--quality", 3), "not allowed with"),
+        ("a.pd4", ("--up", "0,0,0"), "expected X,Y,Z"),
+    ):
+        result = cli("import_model", tmp_path / "x.ply", "-o", tmp_path / out, *option)
+        assert result.code == 2 and message in result.err
