@@ -177,7 +177,10 @@ APART = {
     ),
     "batch": ("batch", "cli/batch.py"),
     "export": ("interchange/export.py", "cli/export.py"),
-    "import": ("interchange/scaffold_gs.py", "cli/import_model.py"),
+    "import": (
+        *(f"interchange/{name}.py" for name in ("direct", "imported", "pack", "sampled", "scaffold_gs")),
+        "cli/import_model.py",
+    ),
     "prepare": ("prepare", "cli/prepare.py"),
     "view": ("cli/view.py", "cli/watch.py"),
 }

@@ -3,8 +3,9 @@
     scene = decode("scene.pd4")             # or its bytes; max_layer=1: a prefix of its layers
     scene.gaussians(0.5)                    # numpy arrays of the Gaussians at the middle of the time
     render(scene, scene.info.camera, 0.5)   # a picture, float32 [H, W, 3]
-    data = encode(scene)                    # scene.Scene -> bytes of a .pd4 file
-    stream = open_stream()                  # stream.feed(bytes) -> a Scene per layer it adds to
+    data = encode(scene)                    # a Scene or SplatScene -> bytes of a .pd4 file
+    stream = open_stream()                  # stream.feed(bytes) -> a scene per layer it adds to
+    decode_tensors("scene.pd4")             # arrays by layer, form and id, whatever the kind of the scene
     show(scene)                             # in a notebook: the player
     sample()                                # the path of a scene that comes with the package
 
@@ -19,17 +20,33 @@ if TYPE_CHECKING:
     from pd4dgs_codec.format.decoder import decode, open_stream
     from pd4dgs_codec.format.encoder import encode
     from pd4dgs_codec.format.info import FORMAT_VERSION
+    from pd4dgs_codec.format.reader import decode_tensors
+    from pd4dgs_codec.kinds.splats import SplatScene
     from pd4dgs_codec.scene import Camera, Scene
     from pd4dgs_codec.web.page import show
 
 __version__ = "0.1.0"
-__all__ = ["Camera", "FORMAT_VERSION", "Scene", "decode", "encode", "open_stream", "render", "sample", "show"]
+__all__ = [
+    "Camera",
+    "FORMAT_VERSION",
+    "Scene",
+    "SplatScene",
+    "decode",
+    "decode_tensors",
+    "encode",
+    "open_stream",
+    "render",
+    "sample",
+    "show",
+]
 
 _HOMES = {
     "Camera": "pd4dgs_codec.scene",
     "FORMAT_VERSION": "pd4dgs_codec.format.info",
     "Scene": "pd4dgs_codec.scene",
+    "SplatScene": "pd4dgs_codec.kinds.splats",
     "decode": "pd4dgs_codec.format.decoder",
+    "decode_tensors": "pd4dgs_codec.format.reader",
     "encode": "pd4dgs_codec.format.encoder",
     "open_stream": "pd4dgs_codec.format.decoder",
     "render": "pd4dgs_codec.draw",

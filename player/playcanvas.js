@@ -194,15 +194,17 @@ export class Pd4 extends Script {
       texture.lock().set(gaussians[name]);
       texture.unlock();
     }
-    const [low, high] = [new Vec3(Infinity, Infinity, Infinity), new Vec3(-Infinity, -Infinity, -Infinity)];
-    const mean = new Vec3();
+    const { centers } = container;
+    const low = [Infinity, Infinity, Infinity];
+    const high = [-Infinity, -Infinity, -Infinity];
     for (let i = 0; i < count; i++) {
-      mean.set(means[4 * i], means[4 * i + 1], means[4 * i + 2]);
-      low.min(mean);
-      high.max(mean);
-      container.centers.set(means.subarray(4 * i, 4 * i + 3), 3 * i);
+      for (let axis = 0; axis < 3; axis++) {
+        const value = (centers[3 * i + axis] = means[4 * i + axis]);
+        if (value < low[axis]) low[axis] = value;
+        if (value > high[axis]) high[axis] = value;
+      }
     }
-    if (count) container.aabb.setMinMax(low, high);
+    if (count) container.aabb.setMinMax(new Vec3(low), new Vec3(high));
     container.update(count);
     if (this._seenThrough) this._seenThrough.clearColor = new Color(gaussians.fill);
     this.app.renderNextFrame = true;

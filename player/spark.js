@@ -119,8 +119,7 @@ export class Pd4Splats extends Playback {
     for (let i = 0, at = 0; i < count; i++, at += 4) {
       centre.fromArray(means, at);
       size.fromArray(scales, at);
-      const [w, x, y, z] = quaternions.subarray(at, at + 4);
-      quaternion.set(x, y, z, w);
+      quaternion.set(quaternions[at + 1], quaternions[at + 2], quaternions[at + 3], quaternions[at]);
       color.fromArray(colors, at);
       splats.setSplat(i, centre, size, quaternion, means[at + 3], color);
     }

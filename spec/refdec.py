@@ -197,7 +197,8 @@ def fields(value, known, required, what):
     return value
 
 
-# 3.1 Preamble: "It checks the signature, then the major version, then H against its limit, then the CRC-32."
+# 3.1 Preamble: "It checks the signature as far as it goes, that 20 bytes are there, the major version, H against its
+# limit, that H bytes follow, and the CRC-32, in this order."
 # 3.3 Scene identity: "the first 8 bytes of the SHA-256 of the header from the end of its chunk list"
 def read_preamble(data):
     need(SIGNATURE.startswith(data[:8]), "not a .pd4 file", "BadSignature")
@@ -274,9 +275,9 @@ def read_scalars(header):
     integers(header["centres"], MAX_SYMBOL, "a centre", -MAX_SYMBOL)
 
 
-# 5.4 Rows: "ids ascend"
+# 5.4 Rows: "ids ascend strictly"
 # 6.2 Layer parameters: "with the rules and limits of 5.4 but no centres"
-# 6.3 Grids and chains: "Ids of grids ascend, and so do those of chains."
+# 6.3 Grids and chains: "Ids of grids ascend strictly, and so do those of chains."
 def read_id(tensor, last):
     need(limited(tensor[0], 255, "an id") > last, f"id {tensor[0]} after {last}, expected ascending ids")
     return tensor[0]
@@ -887,7 +888,7 @@ def dequantise(symbols, step):
 
 
 # 11.1 Masks: "its code in the layer before in the file plus its rise, and MUST NOT exceed 255"
-# 12.1 Order: "sums of mask codes, each voxel at most once over the slices so far, and dequantisation"
+# 12.1 Order: "each voxel at most once over all slices of all layers so far, and dequantisation"
 def finish_last(layers):
     codes = []
     for layer in layers:

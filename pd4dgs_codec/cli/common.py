@@ -122,6 +122,11 @@ def number(value: float | None, digits: int = 2) -> str:
     return "-" if value is None else f"{value:,.{digits}f}"
 
 
+def color(fill: Sequence[int] | None) -> str:
+    """Formats RGB 0..255 as #rrggbb; "-" for None."""
+    return "-" if fill is None else f"#{bytes(fill).hex()}"
+
+
 def shown_name(path: str, stream: str = "stdin") -> str:
     """Returns the name of a file for messages; `stream` for `-`."""
     return stream if path == STDIO else path

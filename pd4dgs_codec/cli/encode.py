@@ -9,7 +9,7 @@ from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.cli import common, options
-from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError, number, progress_bar, say, shown_name, table
+from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError, color, number, progress_bar, say, shown_name, table
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.options import CHOICES, DEFAULTS, EncodeOptions
 
@@ -30,7 +30,7 @@ Fitting takes a minute or more, and longer with --slices.
 --slices 50k lets the first frame appear after 50 kB and improve with each further slice. The anchors that matter most
 in renderings come first; without target sizes others pass to a higher layer, so that motion need not wait for them.
 This lowers the levels below the highest, as the report shows; --keep-levels leaves them as trained. Ordering the
-anchors takes up to some minutes.
+anchors takes up to some minutes. A slice also holds the colour that best fills what is still open behind it.
 
 Sizes and slices are measured on renderings by cameras of --data, else by training cameras in the checkpoint, else by
 the file's own camera.
@@ -231,10 +231,14 @@ def _slice_lines(result: dict[str, Any]) -> list[str]:
         for layer, own in zip(result["layers"], sizes, strict=True)
     ]
     if over := [row["layer"] for row, own in zip(result["layers"], sizes, strict=True) if own[0] > about["size"]]:
-        lines.append(f"first slices of layers {over} exceed {about['size']:,} bytes: networks and planes stay whole")
+        what = "networks, planes and tracks stay whole"
+        lines.append(f"first slices of layers {over} exceed {about['size']:,} bytes: {what}")
     seen = f" on {about['pictures']} views: {about['cameras']}" if about["pictures"] else ""
     seen = ": the file has no camera" if about["order"].startswith("gate") else seen
     lines.append(f"anchors ordered by {about['order']}{seen}")
+    fills = [row["fill"] for layer in result["layers"] for row in layer["slices"]]
+    if any(fills):
+        lines.append(f"fill of each slice: {', '.join(map(color, fills))} (-: the background)")
     if "psnr" in about:
         lines.append(f"mPSNR after each slice: {', '.join(f'{db:.2f}' for db in about['psnr'])} dB on held-out views")
     for row in about.get("levels", ()):

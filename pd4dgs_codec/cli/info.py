@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pd4dgs_codec.cli import options
-from pd4dgs_codec.cli.common import OK, Console, command, number, read_prefix, shown_name, table
+from pd4dgs_codec.cli.common import OK, Console, color, command, number, read_prefix, shown_name, table
 
 DETAILS = """\
 The time to the first frame is 8 * (bytes to the end of the first slice) / rate, without latency.
@@ -129,10 +129,10 @@ def _slice_lines(result: dict[str, Any]) -> list[str]:
     quality = (result["metadata"] or {}).get("slices", [])
     shown = quality if len(quality) == len(parts) else [None] * len(parts)
     rows = [
-        (i, layer, number(part["end"], 0), number(part.get("anchors"), 0), number(db, 2))
+        (i, layer, number(part["end"], 0), number(part.get("anchors"), 0), color(part.get("fill")), number(db, 2))
         for i, ((layer, part), db) in enumerate(zip(parts, shown, strict=True))
     ]
-    return [table(("slice", "layer", "prefix", "new anchors", "mPSNR dB"), rows)]
+    return [table(("slice", "layer", "prefix", "new anchors", "fill", "mPSNR dB"), rows)]
 
 
 def _text(result: dict[str, Any]) -> str:

@@ -55,14 +55,17 @@ class Drawer:
 
     def picture(self, camera: Camera, t: float) -> np.ndarray:
         """Draws float32 [H, W, 3] in 0..1 at normalised time t in 0..1. Raises RenderError unless t is finite."""
+        picture: np.ndarray = np.clip(self.drawn(camera, t)[0], 0, 1)
+        return picture
+
+    def drawn(self, camera: Camera, t: float) -> tuple[np.ndarray, np.ndarray]:
+        """Returns (`picture` before it is clipped, its alpha float32 [H, W])."""
         check_time(t)
         g = self.gaussians(camera, t)
         finite = np.isfinite(g.colors).all(axis=1)  # a colour that overflowed hides its Gaussian
         opacities, colors = np.where(finite, g.opacities, np.float32(0)), np.nan_to_num(g.colors)
         near = near_plane(self.info)
-        image, _ = draw(g.means, g.quats, g.scales, opacities, colors, camera, self.background, near_plane=near)
-        picture: np.ndarray = np.clip(image, 0, 1)
-        return picture
+        return draw(g.means, g.quats, g.scales, opacities, colors, camera, self.background, near_plane=near)
 
 
 def drawer(scene: AnyScene) -> Drawer:
@@ -77,14 +80,13 @@ class SplatPlayer(Drawer):
         super().__init__(scene)
         self.scene = scene
         self._moving = Moving(scene)
-        self._time, self._latest = -1.0, self._moving.at(0.0)
+        self._time, self._latest = 0.0, self._moving.at(0.0)
 
     def splats(self, t: float) -> tuple[Splats, np.ndarray]:
         """Returns (the visible Gaussians at normalised time t, clamped to 0..1, their anchors int64 [K])."""
         t = min(max(t, 0.0), 1.0)
         if t != self._time:
-            with np.errstate(all="ignore"):
-                self._time, self._latest = t, self._moving.at(t)
+            self._time, self._latest = t, self._moving.at(t)
         return self._latest
 
     def gaussians(self, camera: Camera, t: float) -> Gaussians:

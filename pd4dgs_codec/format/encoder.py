@@ -21,6 +21,7 @@ from pd4dgs_codec.format.container import (
     write_chunk,
     write_preamble,
 )
+from pd4dgs_codec.format.decoder import every_prefix
 from pd4dgs_codec.format.header import DIGEST_SIZE, Header, pack_header, payload_digest, scene_id_of, unpack_header
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.format.metadata import CHUNK_TYPE, Metadata, write_metadata
@@ -30,6 +31,7 @@ from pd4dgs_codec.format.plan import LeftOut, SceneSymbols, plan
 from pd4dgs_codec.format.reader import read_layers
 from pd4dgs_codec.format.registry import MAX_CHUNKS
 from pd4dgs_codec.format.symbols import LayerSymbols, sliced
+from pd4dgs_codec.format.tables import Fill, with_fill
 from pd4dgs_codec.kinds import AnyScene, utility_of
 from pd4dgs_codec.threads import one_blas_thread
 
@@ -37,6 +39,7 @@ LATER = 2 / 3  #: size of the slices behind the first one of layer 0, of that on
 TRIES = 4  #: most encodes of one slice to reach its size
 SLACK = 0.97  #: share of the size that a slice aims at
 FULL = 0.92  #: share of the size that is large enough
+LONGEST = (255, 255, 255)  #: a fill that takes the most bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,14 +49,16 @@ class _Slice:
     anchors: int
     payload: bytes
     streams: list[StreamReport]
+    fill: Fill | None
 
 
 @dataclass(frozen=True)
 class SliceReport:
-    """The report of a slice. bytes: of its whole chunk."""
+    """The report of a slice. bytes: of its whole chunk. fill: RGB 0..255, None for the background."""
 
     bytes: int
     anchors: int
+    fill: Fill | None
 
 
 @dataclass(frozen=True)
@@ -114,14 +119,16 @@ def encode_with_report(
     left_out: Sequence[LeftOut] = (),
     metadata: Metadata | None = None,
     utility: Callable[[AnyScene], np.ndarray] | None = None,
+    fill: Callable[[AnyScene], Fill | None] | None = None,
     **changes: Any,
 ) -> tuple[bytes, Report]:
     """Encodes a scene; returns (bytes of the file, report).
 
     left_out: parts that the caller has removed from the scene, added to the report. metadata: stored in the file.
     utility: function of the decoded scene, float [N], the gain in image quality by each anchor. It orders the anchors
-    of sliced layers; `kinds.utility_of` if None. changes: fields of EncodeOptions that replace those of `options`.
-    Raises EncodeError.
+    of sliced layers; `kinds.utility_of` if None. fill: function of the scene that ends with a slice, its fill; called
+    for each slice but the last. If None, each slice has the fill of its layer. changes: fields of EncodeOptions that
+    replace those of `options`. Raises EncodeError.
     """
     started = time.perf_counter()
     scene, options = replace(options, **changes).apply_scale(scene)
@@ -130,13 +137,16 @@ def encode_with_report(
     symbols, omitted = planned.symbols, planned.left_out
     errors = verify_errors(planned.scene, symbols) if options.verify else []
     del planned  # as large as the scene
-    written = _write_layers(symbols, options, utility or utility_of)
+    written = _write_layers(symbols, options, utility or utility_of, None if fill is None else LONGEST)
+    if fill is not None:
+        written = _filled(symbols, options, written, fill)
     data, about_bytes = _container(symbols, options.mode, written), 0
     if metadata is not None:
         data, about_bytes = with_metadata(data, metadata)
     reports = [_layer_report(layer, slices) for layer, slices in zip(symbols.layers, written, strict=True)]
-    fingerprints = [_fingerprint(layer) for layer in symbols.layers] if options.verify else []
-    del symbols, written  # as large as what is decoded
+    pairs = zip(symbols.layers, written, strict=True)
+    fingerprints = [_fingerprint(layer, slices[-1].fill) for layer, slices in pairs] if options.verify else []
+    del symbols, written, pairs  # as large as what is decoded
     _check_file(data, fingerprints)
     kept = sum(r.anchors for r in reports)
     kept_bits = sum(r.position_bits + s.payload_bits for r in reports for s in r.streams if s.name == "attributes")
@@ -164,20 +174,20 @@ def header_size(symbols: SceneSymbols, mode: str, chunks: int, most: int) -> int
 
 
 def _write_layers(
-    symbols: SceneSymbols, options: EncodeOptions, utility: Callable[[AnyScene], np.ndarray]
+    symbols: SceneSymbols, options: EncodeOptions, utility: Callable[[AnyScene], np.ndarray], fill: Fill | None
 ) -> list[list[_Slice]]:
-    """Writes the slices of each layer. The preamble and the header count with the first slice."""
+    """Writes the slices of each layer. The preamble and the header count with the first slice. fill: of all slices,
+    None for that of each layer."""
+    layers = [replace(layer, fill=fill or layer.fill) for layer in symbols.layers]
     if not options.slices:
-        return [[_Slice(len(layer.anchor_q), *write_slice(layer, options))] for layer in symbols.layers]
+        return [[_Slice(len(layer.anchor_q), *write_slice(layer, options), layer.fill)] for layer in layers]
     ends = np.cumsum([len(layer.anchor_q) for layer in symbols.layers])[:-1]
     values = np.split(utility(symbols.scene()), ends)
     bits = sum(float(layer.bits_per_row().sum()) for layer in symbols.layers)
     most = len(values) + math.ceil(bits / 8 / (LATER * SLACK * options.slices))  # more than there will be
     header = header_size(symbols, options.mode, most, options.slices)
     sizes = [options.slices - header, *[LATER * options.slices] * (len(values) - 1)]
-    written = [
-        _write_slices(layer, options, size, u) for layer, size, u in zip(symbols.layers, sizes, values, strict=True)
-    ]
+    written = [_write_slices(layer, options, size, u) for layer, size, u in zip(layers, sizes, values, strict=True)]
     if (slices := sum(map(len, written))) > MAX_CHUNKS:
         raise EncodeError(f"{slices} slices, expected at most {MAX_CHUNKS}: let slices take more bytes")
     return written
@@ -216,13 +226,28 @@ def _write_slices(layer: LayerSymbols, options: EncodeOptions, size: float, util
             if count:
                 scale *= max(len(payload) - fixed, 1) / max(expected[count - 1] - fixed, 1)
             fits = len(payload) <= room or count <= least
-            tries.append((fits, count, _Slice(count, payload, streams), trial))
+            tries.append((fits, count, _Slice(count, payload, streams, layer.fill), trial))
             if fits and (len(payload) >= room * FULL or count in (least, len(rows) - done)):
                 break
         _, count, made, past = max(tries, key=lambda tried: (tried[0], tried[1] if tried[0] else -tried[1]))
         found.append(made)
         done += count
     return found
+
+
+def _filled(
+    symbols: SceneSymbols, options: EncodeOptions, written: list[list[_Slice]], fill: Callable[[AnyScene], Fill | None]
+) -> list[list[_Slice]]:
+    """Gives the last slice of the file the fill of its layer, every other one that of the prefix that ends with it."""
+    data, last = _container(symbols, options.mode, written), written[-1][-1]
+    _check_file(data, [])  # limits of the format
+    prefixes = every_prefix(data)
+
+    def filled(part: _Slice) -> _Slice:
+        own = symbols.layers[-1].fill if part is last else fill(next(prefixes))
+        return replace(part, payload=with_fill(part.payload, own), fill=own)
+
+    return [[filled(part) for part in slices] for slices in written]
 
 
 def _container(symbols: SceneSymbols, mode: str, written: list[list[_Slice]]) -> bytes:
@@ -256,13 +281,13 @@ def _check_file(data: bytes, fingerprints: list[bytes]) -> None:
     if len(found) != len(fingerprints):
         raise EncodeError(f"verification: the file decodes to {len(found)} layers, expected {len(fingerprints)}")
     for layer, meant in zip(found, fingerprints, strict=True):
-        if _fingerprint(layer) != meant:
+        if _fingerprint(layer, layer.fill) != meant:
             raise EncodeError(f"verification: layer {layer.layer} decodes to other symbols")
 
 
-def _fingerprint(layer: LayerSymbols) -> bytes:
-    """Returns the SHA-256 of a layer's steps and symbols, with their shapes."""
-    digest = hashlib.sha256(repr((layer.tensors.tables.steps, layer.tensors.tables.kind, layer.fill)).encode())
+def _fingerprint(layer: LayerSymbols, fill: Fill | None) -> bytes:
+    """Returns the SHA-256 of a layer's steps and symbols, with their shapes, and of its fill."""
+    digest = hashlib.sha256(repr((layer.tensors.tables.steps, layer.tensors.tables.kind, fill)).encode())
     for array in layer.arrays():
         digest.update(f"{array.dtype} {array.shape}".encode())
         digest.update(np.ascontiguousarray(array).data)
@@ -271,7 +296,7 @@ def _fingerprint(layer: LayerSymbols) -> bytes:
 
 def _layer_report(layer: LayerSymbols, slices: list[_Slice]) -> LayerReport:
     streams = _added(slices)
-    rows = [SliceReport(CHUNK_OVERHEAD + len(part.payload), part.anchors) for part in slices]
+    rows = [SliceReport(CHUNK_OVERHEAD + len(part.payload), part.anchors, part.fill) for part in slices]
     counted = [s for s in streams if s.name not in ("positions", "masks")]
     return LayerReport(
         layer=layer.layer,

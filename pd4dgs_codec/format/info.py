@@ -193,7 +193,7 @@ def _meta(scene: AnyScene) -> dict[str, np.ndarray]:
         "voxel_size": np.float32(info.voxel_size),
         "box": info.box,
         "time_range": np.array(info.time_range, np.float32),
-        "background": np.array(info.background, np.float32),
+        "background": np.array(scene.background(), np.float32),
         "near_far": np.array([info.near, info.far], np.float32),
         "up": np.array(info.up, np.float32),
         "unit": np.float32(info.unit),

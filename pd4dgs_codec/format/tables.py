@@ -223,6 +223,15 @@ def pack_parameters(rows: int, codes: int, fill: Fill | None, tables: Tables) ->
     return struct.pack("<I", len(packed)) + packed
 
 
+def with_fill(payload: bytes, fill: Fill | None) -> bytes:
+    """Returns a slice's payload with another fill, or with none."""
+    start = 4 + struct.unpack_from("<I", payload)[0]
+    fields: Any = canonical.unpack(payload[4:start])
+    fields.pop(FILL, None)
+    packed = canonical.pack(fields | ({FILL: list(fill)} if fill else {}))
+    return struct.pack("<I", len(packed)) + packed + payload[start:]
+
+
 def read_parameters(
     payload: bytes | memoryview, layer: int, table: RowTable, before: Declared, of: Tables | None = None
 ) -> tuple[Parameters, int, Declared]:

@@ -24,13 +24,13 @@ from pd4dgs_codec.interchange.pack import (
     log_scales,
     logits,
     matched,
-    product,
     sensitivity,
     turned,
 )
 from pd4dgs_codec.interchange.sampled import Sampled
+from pd4dgs_codec.interchange.splats import picture
 from pd4dgs_codec.kinds import splats
-from pd4dgs_codec.kinds.splats import Splats
+from pd4dgs_codec.kinds.splats import Splats, product
 from pd4dgs_codec.kinds.tracks import Head, Tracks
 from pd4dgs_codec.scene import Camera, SceneInfo
 
@@ -41,6 +41,9 @@ BITS = 6  #: about those of a basis at an instant
 BIT = 2 * np.log(2)  #: what a bit is worth, in units of the error that a scalar may add
 MOST_BASES = 80  #: of a head, components and a limit of the format on channels
 STRAIGHT = 0.05  #: the share of the allowed error that left-out instants may add
+CHECKED = 12  #: pictures that measure the error
+#: Windows are precise to PRECISE of the width that all but the share SHORT of them have.
+PRECISE, SHORT = 0.1, 0.01
 STATIC = 1e-12  #: the least share of a picture's squared error for which anything changes
 
 
@@ -89,7 +92,9 @@ class Packer:
         pictures = Pictures(views, info.background, info.near)
         weights = sensitivity(pictures)
         step()
-        some = Views(source, *zip(*[(views.cameras[i], views.chosen[i]) for i in _spread(len(views), 8)], strict=True))
+        some = Views(
+            source, *zip(*[(views.cameras[i], views.chosen[i]) for i in _spread(len(views), CHECKED)], strict=True)
+        )
         self.pictures, self.times = Pictures(some, info.background, info.near), source.times[some.chosen]
         self.ordered = Ordered.of(source.frame(self.key), weights)
         self.changes = self._changes() if len(source.times) > 1 else {}
@@ -106,9 +111,17 @@ class Packer:
 
         def build(theta: float) -> tuple[splats.SplatScene, float]:
             scene = self._scene(theta, 10 ** (-psnr / 10))
-            return scene, self.pictures.error(lambda i: scene.splats(self.times[i])[0])
+            return scene, self._error(scene)
 
         return matched(build, psnr, 10 ** (-psnr / 10) / scalars)
+
+    def _error(self, scene: splats.SplatScene) -> float:
+        """Returns the squared error of the pictures that stands for their mean PSNR."""
+        errors, info = [], self.info
+        for (camera, _), t, truth in zip(self.pictures.views, self.times, self.pictures.images, strict=True):
+            image = picture(scene.splats(float(t))[0], camera, info.background, info.near)
+            errors.append(np.square(image - truth, dtype=np.float64).mean())
+        return float(np.exp(np.mean(np.log(np.maximum(errors, 1e-12)))))
 
     def _scene(self, theta: float, error: float) -> splats.SplatScene:
         grid = Grid.of(self.ordered.weights, self.ordered.channels, theta)
@@ -129,10 +142,10 @@ class Packer:
             centres["color"], centres["harmonics"], steps["harmonics"] = middle[:3], middle[3:], steps["color"]
         if self.source.windows is not None:
             windows = self.source.windows[packed.rows].astype(np.float64)
+            shortest = np.quantile(windows[:, 1] + windows[:, 2], SHORT)
             windows[:, 2] = np.log(windows[:, 2])
-            finest = min(0.25 / max(len(self.source.times) - 1, 1), float(np.exp(windows[:, 2].min()) / 4))
             spacing = np.ldexp(1.0, packed.classes.astype(int))[:, None]
-            step = float(np.float32(finest / spacing[-1].max() if len(spacing) else finest))
+            step = float(np.float32(PRECISE * shortest / spacing.max()))
             middle = np.rint(np.median(windows, axis=0) / step)
             k = np.rint((windows / step - middle) / spacing)
             tensors["window"] = ((middle + k * spacing) * step).astype(np.float32)
@@ -179,7 +192,8 @@ class Packer:
         rest = np.cumsum([energy for energy, *_ in kept][::-1])[::-1]
         first = [row for row, behind in zip(kept, rest, strict=True) if behind > error]
         layers = {1: first or kept, 2: kept[len(first) :] if first else []}
-        return {layer: self._layer(own, grid) for layer, own in layers.items() if own}
+        values = {name: change.values for name, change in self.changes.items()}
+        return {layer: self._layer(own, grid, values) for layer, own in layers.items() if own}
 
     def _gain(self, change: _Change, k: int, theta: float) -> float:
         """Returns by how much a component lowers the error, less what its bits are worth."""
@@ -187,8 +201,8 @@ class Packer:
         bits = 0.5 * np.log2(1 + change_of / theta).sum() + BITS * len(change.vectors)
         return float(np.maximum(change_of - theta, 0).sum() - BIT * theta * bits)
 
-    def _layer(self, chosen: Sequence[tuple[float, str, int]], grid: Grid) -> Tracks:
-        """Quantises the bases of components, and fits the coefficients to them."""
+    def _layer(self, chosen: Sequence[tuple[float, str, int]], grid: Grid, values: dict[str, np.ndarray]) -> Tracks:
+        """Quantises the bases of components, and fits coefficients to the values, which become what is left."""
         instants, names = len(self.source.times), sorted({name for _, name, _ in chosen})
         bases, steps = {}, {}
         for name in names:
@@ -202,11 +216,11 @@ class Packer:
             scale = BASIS_STEP / min(steps[name], 0.05)
             coded = np.rint(bases[name][:, :, knots] * scale / BASIS_STEP) * BASIS_STEP
             whole = _between(times[knots], coded, times).reshape(len(coded), -1)
-            change = self.changes[name]
-            coefficients = change.values @ np.linalg.pinv(whole)
+            coefficients = values[name] @ np.linalg.pinv(whole)
             step = float(np.float32(grid.steps[name] / scale))
             spacing = step * np.ldexp(1.0, grid.classes.astype(int))[:, None]
             exact = (np.rint(coefficients / spacing) * spacing).astype(np.float32)
+            values[name] = values[name] - exact @ whole.astype(np.float32)
             heads[name] = Head(coded.astype(np.float32), exact, step)
         return Tracks.of(times[knots], BASIS_STEP, heads)
 

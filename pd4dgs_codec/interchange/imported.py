@@ -23,12 +23,14 @@ from pd4dgs_codec.interchange.teacher import SOLID, Options, Teacher, cameras_of
 from pd4dgs_codec.kinds.splats import SplatScene
 from pd4dgs_codec.quality.image import mpsnr
 from pd4dgs_codec.scene import Camera, SceneInfo
+from pd4dgs_codec.threads import one_blas_thread
 
 #: Cameras; of so many of them one measures the result and decides nothing. Width and height of a dome's pictures.
 CAMERAS, HOLDOUT, SIZE = 72, 6, 400
 BOX_INSTANTS = 5  #: number of instants whose Gaussians the box encloses
 #: A target size is met if the file has at least this share of it; most tries; dB of the first guess and the bounds.
 FULL, TRIES, LOWEST, HIGHEST = 0.95, 8, 15.0, 70.0
+METADATA_ROOM = 150  #: bytes of metadata without texts, at most
 GROWTH = 0.05  #: first guess of the change of the logarithm of bytes by dB
 BEST = 100.0  #: dB that stand for equal pictures
 
@@ -53,15 +55,12 @@ class Imported:
 
     def json(self) -> dict[str, Any]:
         """The report, with what was read and measured."""
-        names = ("psnr", "views", "gaussians", "left_out", "instants", "static", "order", "matched")
-        return (
-            self.report.json()
-            | {"gaussians_left_out": self.left_out}
-            | {n: getattr(self, n) for n in names[:3]}
-            | {name: getattr(self, name) for name in names[4:]}
-        )
+        names = ("psnr", "views", "gaussians", "instants", "static", "order", "matched")
+        measured = {name: getattr(self, name) for name in names}
+        return self.report.json() | measured | {"gaussians_left_out": self.left_out}
 
 
+@one_blas_thread()
 def import_model(
     place: str,
     *,
@@ -85,22 +84,21 @@ def import_model(
     with progress("reading", None if model.times is None else len(model.times)) as step:
         source = sampled(model, place, fps, step)
     instants, count = source.means.shape[:2]
-    seconds = seconds or model.seconds
+    about, seconds = metadata or Metadata(), seconds or model.seconds
     static = float(source.static.mean())
     tell(f"{place}: {_about(source, seconds, static)}")
     info, cameras, judges = _scene_info(place, model, source, seconds, background, up)
     with progress("packing", None) as step:
         packer = Packer(source, cameras, info, step)
-        write = _writer(packer, slices, metadata, step)
-        data, report = _of_size(write, psnr, most_bytes) if most_bytes else write(psnr)
+        write = _writer(packer, slices, step)
+        room = most_bytes and most_bytes - METADATA_ROOM - sum(len(str(text)) for text in vars(about).values())
+        data, report = write(psnr) if room is None else _of_size(write, psnr, room)
     scene = decode(data)
     assert isinstance(scene, SplatScene)
     with progress("measuring", len(judges)) as step:
         quality = _quality(model, scene, judges, step)
-    data, about = with_metadata(data, replace(metadata or Metadata(), quality=quality))
-    report = replace(report, bytes=len(data), metadata_bytes=about)
-    if most_bytes and len(data) > most_bytes:
-        raise EncodeError(f"target size: the file takes {len(data):,} bytes with its metadata, expected {most_bytes:,}")
+    data, size = with_metadata(data, replace(about, quality=quality))
+    report = replace(report, bytes=len(data), metadata_bytes=size)
     return Imported(
         data, report, quality, len(judges), len(scene.anchor_q), count - len(scene.anchor_q), instants, static,
         source.order, source.matched,
@@ -137,13 +135,11 @@ def _scene_info(
     return SceneInfo(1.0, box, times, behind, near, far, up or level, 0.0, front), fitting, judges
 
 
-def _writer(
-    packer: Packer, slices: int | None, metadata: Metadata | None, step: Callable[[], None]
-) -> Callable[[float], tuple[bytes, Report]]:
-    """Returns the function from dB to (file without measured quality, report)."""
+def _writer(packer: Packer, slices: int | None, step: Callable[[], None]) -> Callable[[float], tuple[bytes, Report]]:
+    """Returns the function from dB to (file without metadata, report)."""
 
     def write(psnr: float) -> tuple[bytes, Report]:
-        made = encode_with_report(packer.scene(psnr), slices=slices, metadata=metadata)
+        made = encode_with_report(packer.scene(psnr), slices=slices)
         step()
         return made
 
@@ -152,14 +148,14 @@ def _writer(
 
 def _of_size(write: Callable[[float], tuple[bytes, Report]], psnr: float, most: int) -> tuple[bytes, Report]:
     """Returns the file of the most dB that has at most `most` bytes. Raises EncodeError if there is none."""
-    room, low, high = most - 256, LOWEST, HIGHEST  # the quality takes some bytes
+    low, high = LOWEST, HIGHEST
     best, tried = None, list[tuple[float, float]]()
     for _ in range(TRIES):
         made = write(psnr)
         tried.append((psnr, math.log(len(made[0]))))
-        if len(made[0]) <= room:
+        if len(made[0]) <= most:
             best, low = made, psnr
-            if len(made[0]) >= FULL * room or psnr == HIGHEST:
+            if len(made[0]) >= FULL * most or psnr == HIGHEST:
                 return best
         elif psnr == LOWEST:
             break
@@ -167,12 +163,14 @@ def _of_size(write: Callable[[float], tuple[bytes, Report]], psnr: float, most: 
             high = psnr
         (a, la), (b, lb) = (tried[-2] if len(tried) > 1 else (psnr - 1, tried[-1][1] - GROWTH)), tried[-1]
         slope = (lb - la) / (b - a) if b != a else GROWTH
-        psnr = min(max(b + (math.log(room * (1 + FULL) / 2) - lb) / max(slope, GROWTH / 3), LOWEST), HIGHEST)
+        psnr = min(max(b + (math.log(most * (1 + FULL) / 2) - lb) / max(slope, GROWTH / 3), LOWEST), HIGHEST)
         if len(tried) > 1 and not low < psnr < high:
             psnr = (low + high) / 2
     if best is None:
         found = min(math.exp(size) for _, size in tried)
-        raise EncodeError(f"target size: the smallest file tried takes {found:,.0f} bytes, expected at most {most:,}")
+        raise EncodeError(
+            f"target size: the smallest file tried takes {found:,.0f} bytes, expected {most:,}, less metadata"
+        )
     return best
 
 

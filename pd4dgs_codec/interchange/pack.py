@@ -17,20 +17,23 @@ from typing import TypeVar
 import numpy as np
 
 from pd4dgs_codec.draw.rasteriser import Geometry, backward, composite, project
-from pd4dgs_codec.interchange.splats import SH_C0, Splats, picture, quaternions, spread, unit
+from pd4dgs_codec.interchange.splats import picture, quaternions
+from pd4dgs_codec.kinds.splats import SH_C0, Splats, product
 from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import MAX_CLASS, Camera
 
-#: Red, green and blue -> Y, Co, Cg, and back.
+#: Red, green and blue -> Y, Co, Cg.
 YCOCG = np.array([[0.25, 0.5, 0.25], [0.5, 0.0, -0.5], [-0.25, 0.5, -0.25]])
-RGB = np.array([[1.0, 1.0, -1.0], [1.0, 0.0, 1.0], [1.0, -1.0, -1.0]])
 #: Opacities and scales are bounded before their logits and logarithms: a Gaussian thinner than this share of its length
 #: looks like a sheet.
 LEAST_OPACITY, LEAST_SHARE = 1e-3, np.exp(-6)
 FINEST = 0.01  #: the share of Gaussians that would have finer steps than class 0 gives
 LONELY = 0.85  #: the share of Gaussians that have a voxel for themselves, at least
+FARTHEST = 2.0**18  #: most voxels between 0 and a position, far within the range of voxels
+KEYS = np.array([1, 1 << 21, 1 << 42])  #: of voxels, which are numbers
 DRAWN = 0.3  #: the most by which a symbol is drawn to 0, in steps
-CHECKED, ROUNDS, CLOSE = 8, 5, 0.05  #: pictures that measure the error, rounds of matching a PSNR, and how close, dB
+PROBES = 4  #: random pictures of signs per view
+ROUNDS, CLOSE, SLOPE = 7, 0.15, 3.0  #: of matching a PSNR; how close, dB; and the least slope, dB for a factor of 10
 
 T = TypeVar("T")
 Tensors = dict[str, np.ndarray]
@@ -38,18 +41,9 @@ View = tuple[Camera, Splats]  #: a camera, and Gaussians that it sees
 Triple = tuple[float, float, float]
 
 
-def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The products of quaternions [..., 4] wxyz."""
-    (w, x, y, z), (i, j, k, l) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
-    return np.stack(
-        [w * i - x * j - y * k - z * l, w * j + x * i + y * l - z * k, w * k - x * l + y * i + z * j,
-         w * l + x * k - y * j + z * i], axis=-1,
-    )  # fmt: skip
-
-
 def conjugate(q: np.ndarray) -> np.ndarray:
     """The inverse rotations of unit quaternions [..., 4]."""
-    return q * np.array([1, -1, -1, -1], q.dtype)
+    return np.asarray(q * np.array([1, -1, -1, -1], q.dtype))
 
 
 def _turns() -> tuple[np.ndarray, np.ndarray]:
@@ -100,24 +94,6 @@ def tensors_of(splats: Splats) -> Tensors:
     }
 
 
-def quats_of(xyz: np.ndarray) -> np.ndarray:
-    """The quaternions [n, 4] wxyz whose x, y and z are given, with w >= 0."""
-    w = np.sqrt(np.maximum(1 - np.square(xyz).sum(axis=1, keepdims=True), 0))
-    return unit(np.concatenate([w, xyz], axis=1))
-
-
-def splats_of(tensors: Tensors) -> Splats:
-    """The inverse of `tensors_of`, float32."""
-    parts = (
-        tensors["position"],
-        quats_of(tensors["rotation"]),
-        np.exp(tensors["scale"]),
-        1 / (1 + np.exp(-tensors["opacity"][:, 0])),
-        tensors["color"].reshape(len(tensors["color"]), -1, 3) @ RGB.T.astype(tensors["color"].dtype),
-    )
-    return Splats(*(np.ascontiguousarray(part, np.float32) for part in parts))
-
-
 # -- what pictures depend on -------------------------------------------------------------------------------------------
 
 
@@ -134,19 +110,20 @@ def sensitivity(pictures: Pictures) -> Tensors:
         geometry = Geometry(splats.means, splats.quats, splats.scales, splats.opacities)
         projected, colors = project(geometry, camera, pictures.near), splats.colors(camera.eye)
         image, transmittance = composite(projected, colors, np.array(pictures.background, np.float32))
-        signs = (2 * rng.integers(0, 2, image.shape) - 1).astype(np.float32)
-        g = backward(projected, geometry, colors, image, transmittance, signs, np.zeros_like(transmittance))
-        slopes = {
-            "position": g.geometry.means,
-            # squares of a degree's harmonics have a constant sum; Y, Co and Cg change 8/3 of the colours on average
-            "color": g.colors * np.float32(SH_C0 * np.sqrt(8 / 3)),
-            "opacity": (g.geometry.opacities * splats.opacities * (1 - splats.opacities))[:, None],
-            "scale": g.geometry.scales * splats.scales,
-            "rotation": product(conjugate(splats.quats), g.geometry.quats)[:, 1:],
-        }
-        for name, slope in slopes.items():
-            mean = np.square(slope, dtype=np.float64).mean(axis=1) / (image.size * len(pictures.views))
-            total[name] = total.get(name, 0) + mean
+        for _ in range(PROBES):
+            signs = (2 * rng.integers(0, 2, image.shape) - 1).astype(np.float32)
+            g = backward(projected, geometry, colors, image, transmittance, signs, np.zeros_like(transmittance))
+            slopes = {
+                "position": g.geometry.means,
+                # squares of a degree's harmonics have a constant sum; Y, Co and Cg change 8/3 of the colours on average
+                "color": g.colors * np.float32(SH_C0 * np.sqrt(8 / 3)),
+                "opacity": (g.geometry.opacities * splats.opacities * (1 - splats.opacities))[:, None],
+                "scale": g.geometry.scales * splats.scales,
+                "rotation": product(conjugate(splats.quats), g.geometry.quats)[:, 1:],
+            }
+            for name, slope in slopes.items():
+                mean = np.square(slope, dtype=np.float64).mean(axis=1) / (image.size * len(pictures.views) * PROBES)
+                total[name] = total.get(name, 0) + mean
     return total
 
 
@@ -163,28 +140,24 @@ class Pictures:
         """float32 [H, W, 3] of each view."""
         return [picture(splats, camera, self.background, self.near) for camera, splats in self.views]
 
-    def error(self, shown: Callable[[int], Splats]) -> float:
-        """Returns the mean squared error of shown(i), which stands for the Gaussians of views[i]."""
-        errors = []
-        for i, ((camera, _), image) in enumerate(zip(self.views, self.images, strict=True)):
-            other = picture(shown(i), camera, self.background, self.near)
-            errors.append(np.square(other - image, dtype=np.float64).mean())
-        return float(np.mean(errors))
-
-    def some(self) -> Pictures:
-        """Returns CHECKED of the views, evenly spread, or all if there are fewer."""
-        return Pictures(spread(self.views, CHECKED), self.background, self.near)
-
 
 def matched(build: Callable[[float], tuple[T, float]], psnr: float, theta: float) -> T:
-    """Returns what build(theta) makes at the theta where its error, the second result, is `psnr` dB."""
+    """Returns what build(theta) makes at the theta where its error, the second result, is nearest to `psnr` dB: by
+    secants of dB over the logarithm of theta, within the bracket that is known."""
+    tried, low, high, place = list[tuple[float, float, T]](), -np.inf, np.inf, float(np.log10(theta))
     for _ in range(ROUNDS):
-        made, error = build(theta)
+        made, error = build(10**place)
         excess = -10 * np.log10(max(error, 1e-20)) - psnr
+        tried.append((place, excess, made))
         if abs(excess) < CLOSE:
             break
-        theta *= 10 ** (excess / 10)
-    return made
+        low, high = (max(low, place), high) if excess > 0 else (low, min(high, place))
+        (p, e, _), (q, f, _) = tried[-2:] if len(tried) > 1 else ((place + 0.1, excess - 1.5, made), tried[-1])
+        slope = (f - e) / (q - p)
+        place = q - f / slope if slope < -SLOPE else q + f / 15
+        if not low < place < high:
+            place = (low + high) / 2
+    return min(tried, key=lambda row: abs(row[1]))[2]
 
 
 # -- quantisation ------------------------------------------------------------------------------------------------------
@@ -208,7 +181,7 @@ class Grid:
             steps = {name: np.sqrt(12 * theta / np.mean(h * 4.0**classes)) for name, h in weights.items()}
             if turn == 5:
                 break
-            added = sum(h * (channels[name] * steps[name] ** 2 / 12) for name, h in weights.items())
+            added = np.sum([h * (channels[name] * steps[name] ** 2 / 12) for name, h in weights.items()], axis=0)
             own = 0.5 * np.log2(theta * sum(channels.values()) / np.maximum(added, 1e-12 * added.max()))
             classes = np.clip(np.rint(own - np.quantile(own, FINEST)), 0, MAX_CLASS)
         return Grid(theta, weights, {k: float(np.float32(q)) for k, q in steps.items()}, classes.astype(np.uint8))
@@ -246,16 +219,6 @@ class Packed:
     centres: dict[str, np.ndarray]
     classes: np.ndarray
     rows: np.ndarray
-
-    @property
-    def values(self) -> Tensors:
-        """The tensors with position, float64 [n, 3], scene units."""
-        return self.tensors | {"position": (self.cells + self.tensors["offset"].astype(np.float64)) * self.voxel_size}
-
-    @property
-    def splats(self) -> Splats:
-        """The decoded Gaussians."""
-        return splats_of(self.values)
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,39 +267,53 @@ class Ordered:
 def voxels(at: np.ndarray) -> tuple[float, np.ndarray]:
     """Returns (side, a power of two, of voxels that LONELY of the positions [n, 3] have for themselves; distinct voxels
     int64 [n, 3] near them)."""
-    size = 2.0 ** np.ceil(np.log2(max(float(np.ptp(at, axis=0).max(initial=0)), 1e-9)))
-    keys = np.array([1, 1 << 21, 1 << 42])
-    while np.abs(at).max(initial=0) < 1e5 * size:  # far within the range of voxels
-        if len(np.unique(np.rint(at / size).astype(np.int64) @ keys)) >= LONELY * len(at):
+    far = float(np.abs(at).max(initial=0))
+    size = 2.0 ** np.ceil(np.log2(max(float(np.ptp(at, axis=0).max(initial=0)), far / FARTHEST, 1e-9)))
+    while far < FARTHEST / 2 * size:
+        if len(np.unique(np.rint(at / size).astype(np.int64) @ KEYS)) >= LONELY * len(at):
             break
         size /= 2
-    cells, near = np.rint(at / size).astype(np.int64), 1
-    taken, first = np.unique(cells @ keys, return_index=True)
+    own = np.rint(at / size).astype(np.int64)
+    cells = own.copy()
+    taken, first = np.unique(own @ KEYS, return_index=True)
     rows = np.setdiff1d(np.arange(len(at)), first)
-    while len(rows):  # move the others to the nearest free voxels
-        around = np.stack(np.meshgrid(*[np.arange(-near, near + 1)] * 3), axis=-1).reshape(-1, 3)
-        own = np.rint(at[rows] / size).astype(np.int64)
-        order = np.argsort(np.square(around - (at[rows] / size - own)[:, None]).sum(axis=2), axis=1)
-        for choice in range(1, len(around)):
-            wanted = own + around[order[:, choice]]
-            key, one = np.unique(wanted @ keys, return_index=True)
-            one = one[~np.isin(key, taken)]
-            cells[rows[one]], taken = wanted[one], np.append(taken, wanted[one] @ keys)
-            left = np.delete(np.arange(len(rows)), one)
-            rows, own, order = rows[left], own[left], order[left]
-        near *= 2
+    around = _offsets(1)
+    order = np.argsort(np.square(around - (at[rows] / size - own[rows])[:, None]).sum(axis=2), axis=1)
+    for choice in range(len(around)):  # the nearest free voxels
+        won, taken = _first_come(own[rows] + around[order[:, choice]], taken)
+        cells[rows[won]] += around[order[won, choice]]
+        rows, order = rows[~won], order[~won]
+    _, group, count = np.unique(own[rows] @ KEYS, return_inverse=True, return_counts=True)
+    order, stride = np.argsort(group, kind="stable"), count[group]
+    tries = np.empty(len(rows), np.int64)
+    tries[order] = np.arange(len(rows)) - np.repeat(np.cumsum(count) - count, count)
+    reach = 2
+    while len(rows):  # many at one place: each begins with another voxel
+        around = _offsets(reach)
+        near = np.flatnonzero(tries < len(around))
+        if not len(near):
+            reach *= 2
+            continue
+        moved = around[tries[near]]
+        won, taken = _first_come(own[rows[near]] + moved, taken)
+        cells[rows[near[won]]] += moved[won]
+        tries[near] += stride[near]
+        left = np.ones(len(rows), bool)
+        left[near[won]] = False
+        rows, tries, stride = rows[left], tries[left], stride[left]
     return float(size), cells
 
 
-def pack(splats: Splats, pictures: Pictures, psnr: float) -> Packed:
-    """Packs still Gaussians for a PSNR, dB, of pictures of all views, each of which shows `splats`. With 50 views or
-    more, evenly around the scene, others are about as good."""
-    some, source = pictures.some(), Ordered.of(splats, sensitivity(pictures))
-    start = 10 ** (-psnr / 10) / (len(source.rows) * sum(source.channels.values()))
+def _offsets(reach: int) -> np.ndarray:
+    """Returns int64 [(2 reach + 1)^3, 3]: voxels around 0, shell by shell, in each the nearest first."""
+    grid = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 3), axis=-1).reshape(-1, 3)
+    return grid[np.lexsort((np.square(grid).sum(axis=1), np.abs(grid).max(axis=1)))]
 
-    def build(theta: float) -> tuple[Packed, float]:
-        packed = source.packed(Grid.of(source.weights, source.channels, theta))
-        shown = packed.splats
-        return packed, some.error(lambda _: shown)
 
-    return matched(build, psnr, start)
+def _first_come(wanted: np.ndarray, taken: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns (bool [m]: whether a row gets the voxel [m, 3] that it wants, the keys that are taken then)."""
+    keys, one = np.unique(wanted @ KEYS, return_index=True)
+    free = ~np.isin(keys, taken)
+    won = np.zeros(len(wanted), bool)
+    won[one[free]] = True
+    return won, np.append(taken, keys[free])

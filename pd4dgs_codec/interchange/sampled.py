@@ -159,9 +159,7 @@ def _bend(a: Splats, middle: Splats, b: Splats) -> float:
     if not seen.any():
         return 0.0
     size = middle.scales.max(axis=1)[seen]
-    aside = np.abs((a.means + b.means)[seen] / 2 - middle.means[seen]).max(axis=1, keepdims=True) / np.maximum(
-        size, 1e-9
-    )
+    aside = np.abs((a.means + b.means)[seen] / 2 - middle.means[seen]).max(axis=1) / np.maximum(size, 1e-9)
     turned = 1 - np.abs(np.einsum("nd,nd->n", _halfway(a.quats, b.quats), middle.quats))[seen]
     grown = np.abs((a.scales + b.scales)[seen] / 2 / np.maximum(middle.scales[seen], 1e-9) - 1).max(axis=1)
     faded = np.abs((a.opacities + b.opacities) / 2 - middle.opacities)[seen]

@@ -143,7 +143,7 @@ def utility_of(scene: AnyScene) -> np.ndarray:
     it has one, times the largest area, relative to other anchors, that its Gaussians may cover."""
     opacity, logs = scene.mask[-1].astype(np.float32), scene.attributes.get("scaling_log")
     if isinstance(scene, SplatScene):
-        opacity, logs = opacity / (1 + np.exp(-scene.tensors["opacity"][:, 0])), scene.tensors["scale"]
+        opacity, logs = opacity * splats.sigmoid(scene.tensors["opacity"][:, 0]), scene.tensors["scale"]
     assert logs is not None
     area = np.sort(logs[:, -3:], axis=1)[:, 1:].sum(axis=1)
     utility: np.ndarray = opacity * np.exp(area - area.max(initial=0))

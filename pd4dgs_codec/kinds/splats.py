@@ -53,8 +53,11 @@ class Splats:
 
     def colors(self, eye: np.ndarray) -> np.ndarray:
         """Returns the colours float32 [N, 3] >= 0 seen from `eye` [3], world."""
-        basis = harmonics(unit(self.means - eye.astype(np.float32)), self.degree)
-        return np.asarray(np.maximum(np.einsum("nj,njc->nc", basis, self.sh) + np.float32(0.5), 0))
+        if self.degree == 0:
+            return np.asarray(np.maximum(self.sh[:, 0] * np.float32(SH_C0) + np.float32(0.5), 0))
+        basis = harmonics(unit(np.asfortranarray(self.means - eye.astype(np.float32))), self.degree)
+        colors = np.einsum("jn,cjn->cn", basis.T, self.sh.T)  # a tenth of the time if `sh` lies in memory by columns
+        return np.ascontiguousarray(np.maximum(colors + np.float32(0.5), 0).T)
 
     def seen_from(self, eye: np.ndarray, slots: np.ndarray) -> Gaussians:
         """Returns the Gaussians with their colours seen from `eye` [3], world."""
@@ -72,7 +75,9 @@ class Splats:
 
     def taken(self, rows: np.ndarray) -> Splats:
         """Returns the Gaussians `rows`, indices or a mask."""
-        return Splats(*(part[rows] for part in vars(self).values()))
+        rows = np.flatnonzero(rows) if rows.dtype == bool else rows
+        taken = {name: part[rows] for name, part in vars(self).items() if name != "sh"}
+        return Splats(**taken, sh=np.take(self.sh.T, rows, axis=2).T)
 
     def scaled(self, factor: float) -> Splats:
         """Returns the Gaussians with all lengths multiplied by `factor`."""
@@ -81,17 +86,16 @@ class Splats:
 
 def unit(vectors: np.ndarray) -> np.ndarray:
     """Divides vectors [..., d] by their length; zero vectors stay zero."""
-    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    length = np.sqrt(np.einsum("...d,...d->...", vectors, vectors))[..., None]
     return np.asarray(vectors / np.maximum(length, np.finfo(vectors.dtype).tiny))
 
 
 def product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The Hamilton products of quaternions [..., 4] wxyz."""
     (w, x, y, z), (i, j, k, l) = np.moveaxis(a, -1, 0), np.moveaxis(b, -1, 0)
-    return np.stack(
-        [w * i - x * j - y * k - z * l, w * j + x * i + y * l - z * k, w * k - x * l + y * i + z * j,
-         w * l + x * k - y * j + z * i], axis=-1,
-    )  # fmt: skip
+    parts = (w * i - x * j - y * k - z * l, w * j + x * i + y * l - z * k, w * k - x * l + y * i + z * j,
+             w * l + x * k - y * j + z * i)  # fmt: skip
+    return np.moveaxis(np.stack(parts), 0, -1)
 
 
 def harmonics(directions: np.ndarray, degree: int) -> np.ndarray:
@@ -115,7 +119,7 @@ def harmonics(directions: np.ndarray, degree: int) -> np.ndarray:
             1.445305721320277 * z * (xx - yy),
             -0.5900435899266435 * x * (xx - 3 * yy),
         ]
-    return np.stack(rows, axis=-1).astype(directions.dtype)
+    return np.moveaxis(np.stack(rows).astype(directions.dtype, copy=False), 0, -1)
 
 
 def splats_of(tensors: Mapping[str, np.ndarray]) -> Splats:
@@ -123,26 +127,29 @@ def splats_of(tensors: Mapping[str, np.ndarray]) -> Splats:
     window."""
     xyz, color = tensors["rotation"], tensors["color"]
     w = np.sqrt(np.maximum(1 - np.square(xyz).sum(axis=1, keepdims=True), 0))
-    channels = np.concatenate([color, tensors["harmonics"]], axis=1) if "harmonics" in tensors else color
-    parts = (
-        tensors["position"],
-        _rotations(np.concatenate([w, xyz], axis=1)),
-        np.exp(tensors["scale"]),
-        _sigmoid(tensors["opacity"][:, 0]),
-        channels.reshape(len(xyz), -1, 3) @ RGB.T.astype(color.dtype),
+    channels = np.concatenate([color.T, tensors["harmonics"].T]) if "harmonics" in tensors else color.T
+    sh = RGB.astype(color.dtype) @ channels.reshape(len(channels) // 3, 3, len(xyz))
+    return Splats(
+        means=np.ascontiguousarray(tensors["position"], np.float32),
+        quats=_rotations(np.concatenate([w, xyz], axis=1)).astype(np.float32),
+        scales=np.exp(tensors["scale"]).astype(np.float32),
+        opacities=sigmoid(tensors["opacity"][:, 0]).astype(np.float32),
+        sh=np.moveaxis(sh.astype(np.float32), -1, 0),
     )
-    return Splats(*(np.ascontiguousarray(part, np.float32) for part in parts))
 
 
 def _rotations(p: np.ndarray) -> np.ndarray:
     """Returns quaternions [n, 4] divided by their length, the identity instead of 0."""
-    found = unit(p)
-    found[~found.any(axis=1), 0] = 1
-    return found
+    length = np.sqrt(np.einsum("nc,nc->n", p, p))
+    found = p / np.where(length > 0, length, 1)[:, None]
+    found[length == 0, 0] = 1
+    return np.asarray(found)
 
 
-def _sigmoid(x: np.ndarray) -> np.ndarray:
-    return np.asarray(1 / (1 + np.exp(-x)))
+def sigmoid(x: np.ndarray) -> np.ndarray:
+    """Returns 1 / (1 + exp(-x)) of logits of any shape."""
+    with np.errstate(over="ignore"):
+        return np.asarray(1 / (1 + np.exp(-x)))
 
 
 # -- the scene ---------------------------------------------------------------------------------------------------------
@@ -195,8 +202,7 @@ class SplatScene(LayeredScene):
     def splats(self, t: float, level: int | None = None) -> tuple[Splats, np.ndarray]:
         """Returns (the visible Gaussians at normalised time t in 0..1, their rows int64 [K]). Arguments and errors as
         of `gaussians`."""
-        with np.errstate(all="ignore"):
-            return Moving(self.at(t, level)).at(t)
+        return Moving(self.at(t, level)).at(t)
 
     def _evaluated(self, t: float, eye: np.ndarray) -> Gaussians:
         splats, rows = Moving(self).at(t)
@@ -206,6 +212,7 @@ class SplatScene(LayeredScene):
 class Moving:
     """The active Gaussians of a scene's highest level, prepared for any time."""
 
+    @np.errstate(all="ignore")
     def __init__(self, scene: SplatScene):
         rows = scene.active
         mask, tensors = scene.mask[-1][rows] * MASK_STEP, {name: x[rows] for name, x in scene.tensors.items()}
@@ -216,26 +223,31 @@ class Moving:
             rows, mask, self._rest = rows[seen], mask[seen], self._rest.taken(seen)
             tensors = {name: x[seen] for name, x in tensors.items()}
         self._rows, self._mask, self._fades = rows, mask, "opacity" in heads or "window" in tensors
-        self._logits, self._logs, self._window = tensors["opacity"][:, 0], tensors["scale"], tensors.get("window")
+        self._logits, self._logs, self._window = tensors["opacity"][:, 0], tensors["scale"], None
+        if "window" in tensors:
+            centre, half, log = tensors["window"].T
+            self._window = centre.copy(), half.copy(), np.exp(log)
         if "scale" not in heads:
             self._rest = replace(self._rest, scales=self._rest.scales * mask[:, None])
-        self._tracks = {layer: own.of_rows(rows) for layer, own in scene.tracks.items()}
+        self._columns = np.asfortranarray(self._rest.quats)  # products of columns take half the time
+        self._tracks = {layer: own.of_rows(rows).by_columns() for layer, own in scene.tracks.items()}
 
+    @np.errstate(all="ignore")
     def at(self, t: float) -> tuple[Splats, np.ndarray]:
         """Returns (the visible Gaussians at normalised time t in 0..1, their rows int64 [K])."""
         rest, mask, added = self._rest, self._mask, total(self._tracks, t, len(self._rows))
-        opacities = rest.opacities if "opacity" not in added else _sigmoid(self._logits + added["opacity"][:, 0])
+        opacities = rest.opacities if "opacity" not in added else sigmoid(self._logits + added["opacity"][:, 0])
         if self._window is not None:
-            centre, half, log = self._window.T
+            centre, half, softness = self._window
             excess = np.maximum(np.abs(np.float32(t) - centre) - half, 0)
-            opacities = opacities * np.where(excess > 0, np.exp(-0.5 * np.square(excess / np.exp(log))), 1)
+            opacities = opacities * np.where(excess > 0, np.exp(-0.5 * np.square(excess / softness)), 1)
         changed: dict[str, np.ndarray] = {"opacities": opacities * mask}
         if "position" in added:
             changed["means"] = rest.means + added["position"]
         if "rotation" in added:
             turn = added["rotation"]
             turn[:, 0] += 1
-            changed["quats"] = _rotations(product(turn, rest.quats))
+            changed["quats"] = _rotations(product(turn, self._columns))
         if "scale" in added:
             changed["scales"] = np.exp(self._logs + added["scale"]) * mask[:, None]
         if "color" in added:

@@ -67,8 +67,14 @@ class Tracks:
         f = np.float32((t - times[j]) / (times[j + 1] - times[j]))
         found = dict[str, np.ndarray]()
         for name, head in self.heads.items():
-            found[name] = head.coefficients @ (head.bases[:, :, j] * (1 - f) + head.bases[:, :, j + 1] * f)
+            basis = head.bases[:, :, j] * (1 - f) + head.bases[:, :, j + 1] * f
+            found[name] = (basis.T @ head.coefficients.T).T if name == "rotation" else head.coefficients @ basis
         return found
+
+    def by_columns(self) -> Tracks:
+        """Returns the tracks with coefficients in the order in memory that evaluates fastest."""
+        heads = {n: replace(head, coefficients=np.asfortranarray(head.coefficients)) for n, head in self.heads.items()}
+        return replace(self, heads=heads)
 
     def of_rows(self, rows: np.ndarray | slice) -> Tracks:
         """Returns the tracks of a scene's rows `rows`, an int64 array or the first ones."""

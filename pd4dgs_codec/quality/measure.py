@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -12,6 +13,7 @@ from pd4dgs_codec.data.view import View
 from pd4dgs_codec.draw.player import drawer
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import in_file_order, layer_symbols, passed, symbols_of, tensor_bytes
+from pd4dgs_codec.format.tables import Fill
 from pd4dgs_codec.kinds import AnyScene
 from pd4dgs_codec.model.model import Model, from_scene
 from pd4dgs_codec.model.networks import EXACT, Rounding
@@ -24,6 +26,8 @@ from pd4dgs_codec.scene import Scene, Viewpoint
 MOST_DB = 100.0
 #: A layer's bytes are divided into so many parts; the next layer may begin after any of them.
 PARTS = 16
+#: dB that a fill gains at least: for less it is not worth its bytes.
+FILL_GAIN = 0.05
 
 
 def pictures(
@@ -124,6 +128,7 @@ class RenderedLoss:
 def in_order(
     scene: Scene,
     viewpoints: Sequence[Viewpoint],
+    whole: Sequence[np.ndarray],
     options: EncodeOptions,
     step: Callable[[], None] = lambda: None,
     *,
@@ -134,10 +139,9 @@ def in_order(
 
     A layer keeps its most useful anchors until the next layer's planes and networks improve the pictures at
     `viewpoints` more per byte than its own next anchors; with `passing` the other anchors pass. The highest level is
-    unchanged. step is called after each round of `utility`.
+    unchanged. whole: its pictures at viewpoints. step is called after each round of `utility`.
     """
-    viewpoints = [(smaller(camera), time) for camera, time in viewpoints]
-    whole, found = pictures(from_scene(scene), scene.level, viewpoints), list[np.ndarray]()
+    found = list[np.ndarray]()
     for index, layer in enumerate(scene.layers):
         own = utility(scene.prefix(layer), viewpoints, step)
         if passing and layer < scene.level:
@@ -182,3 +186,30 @@ def _enough(
             return int(counts[i])
         before = after
     return len(order)
+
+
+# -- what incomplete files leave open ----------------------------------------------------------------------------------
+
+
+def best_fill(prefix: AnyScene, viewpoints: Sequence[Viewpoint], whole: Sequence[np.ndarray]) -> Fill | None:
+    """Returns the colour, RGB 0..255, behind the Gaussians of `prefix` that brings its pictures at `viewpoints` nearest
+    to `whole`, float32 [H, W, 3] each. None if that gains less than FILL_GAIN over the background of the header.
+
+    A picture over the colour b is J = C + T b, T the transmittance that is left. Over b + d its squared error against I
+    is less by 2 d <T, I - J> - d^2 <T, T> in each channel, most for d = <T, I - J> / <T, T>.
+    """
+    player, background = drawer(replace(prefix, fills=())), np.array(prefix.info.background)
+    error, slope, curve = 0.0, np.zeros(3), 0.0
+    for (camera, time), target in zip(viewpoints, whole, strict=True):
+        picture, alpha = player.drawn(camera, time)
+        missing, left = (target - picture).astype(np.float64), 1.0 - alpha.astype(np.float64)
+        error += float(np.square(missing).sum())
+        slope += np.einsum("hw,hwc->c", left, missing)
+        curve += float(np.square(left).sum())
+    fill = np.rint(255 * np.clip(background + slope / max(curve, np.finfo(float).tiny), 0, 1))
+    change = fill / 255 - background
+    gain = float((2 * change * slope - curve * change**2).sum())
+    if gain <= error * (1 - 10 ** (-FILL_GAIN / 10)):
+        return None
+    red, green, blue = fill.astype(int).tolist()
+    return red, green, blue

@@ -16,6 +16,7 @@ from pd4dgs_codec.format.encoder import Report, encode_with_report, with_metadat
 from pd4dgs_codec.format.metadata import Metadata
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.plan import LeftOut, plan
+from pd4dgs_codec.format.tables import Fill
 from pd4dgs_codec.kinds import AnyScene
 from pd4dgs_codec.quality.frames import own_frames
 from pd4dgs_codec.scene import LayeredScene, Scene, SceneInfo, Viewpoint
@@ -103,8 +104,8 @@ def pack(
     target_sizes: the most bytes that each layer may add to the file, by layer, or {None: the most bytes of the file}.
     views: for target sizes and the order of slices; without views the pictures are of the file's own camera. metadata:
     stored in the file. With options.slices anchors are ordered by the pictures' gain per byte, and without target
-    sizes or keep_levels some pass to later layers, see `measure.in_order`. Without views or a camera the largest
-    anchors come first.
+    sizes or keep_levels some pass to later layers, see `measure.in_order`. Every slice but the last gets its fill from
+    half of these pictures, see `measure.best_fill`. Without views or a camera the largest anchors come first.
 
     Only target sizes, and slices that views order, need torch. Raises EncodeError, also for target sizes of splats, and
     RenderError for target sizes without a camera.
@@ -190,22 +191,34 @@ class _Pictures:
         about["size"] = options.slices
         if self.views is None:
             return *encode_with_report(scene, options, left_out=left_out, metadata=metadata), about
-        from pd4dgs_codec.quality.measure import in_order, own_views, true_psnr
+        from pd4dgs_codec.draw.player import drawer
+        from pd4dgs_codec.model.sensitivity import smaller
+        from pd4dgs_codec.quality.measure import best_fill, in_order, own_views, true_psnr
 
-        views = self.views
+        views, planned = self.views, plan(scene, options)
+        small, player = [(smaller(camera), time) for camera, time in views.fitting], drawer(planned.scene)
+        shown = [player.picture(camera, time) for camera, time in small]
+        closed = set[int]()  # levels of which later slices would gain nothing either
+
+        def fill(prefix: AnyScene) -> Fill | None:
+            if prefix.level in closed:
+                return None
+            found = best_fill(prefix, small[::2], shown[::2])  # half of the pictures is enough for a colour
+            if found is None:
+                closed.add(prefix.level)
+            return found
+
         order: Callable[[AnyScene], np.ndarray] | None = None
-        if isinstance(scene, Scene):
-            planned = plan(scene, options)
-            assert isinstance(planned.scene, Scene)
+        if isinstance(planned.scene, Scene):
             about |= {"order": "rendered gain per byte", "cameras": views.source, "pictures": len(views.fitting)}
             left_out = [*left_out, *planned.left_out]
             with self.progress("ordering anchors") as step:
-                scene, values = in_order(planned.scene, views.fitting, options, step, passing=passing)
+                scene, values = in_order(planned.scene, small, shown, options, step, passing=passing)
 
             def order(_: AnyScene) -> np.ndarray:
                 return values
 
-        data, report = encode_with_report(scene, options, left_out=left_out, utility=order)
+        data, report = encode_with_report(scene, options, left_out=left_out, utility=order, fill=fill)
         if self.held_out:
             with self.progress("measuring slices") as step:
                 about["psnr"] = [

@@ -30,6 +30,12 @@ export class Column {
     this._room.set(values);
   }
 
+  /** Becomes an array of whole rows, nobody else's any more, where there were none. @param {A} values */
+  become(values) {
+    this._room = values;
+    this.rows = values.length / this._width;
+  }
+
   /** @param {ArrayLike<number>} values of whole rows @param {number} [growth] as in reserve */
   append(values, growth = 1) {
     const count = values.length / this._width;

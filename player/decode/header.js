@@ -45,8 +45,6 @@ export function readHeader(bytes) {
   const centres = fields.has(5) ? asIntegers(asList(fields.get(5), where, width), -MAX_SYMBOL, MAX_SYMBOL, where) : null;
   const info = readInfo(fields);
   checkBytes(fields.get(14), DIGEST_SIZE, "header: digest"); // of all layers, so that a decoder of some cannot check it
-  const layers = chunks.filter(({ type }) => type < LAYER_TYPES).map(({ type }) => type);
-  if (mode === 1 && new Set(layers).size < layers.length) throw malformed("header: mode lzma, and a layer in slices");
   if (mode === 1) throw unsupported("header: mode lzma, expected mode ans"); // an ans-only decoder (clause 16)
   return { chunks, kind, rows, width, centres, info, sceneId: sceneIdOf(bytes.subarray(firstEntryEnd)) };
 }

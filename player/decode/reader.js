@@ -7,6 +7,7 @@ import { LAYER_TYPES, readHeader } from "./header.js";
 import { dequantise, rowsOf } from "./rows.js";
 import { MOST_CODE, chainsOf, decodeSlice, gridsOf } from "./slice.js";
 import { VoxelTable, mortonOrder } from "./voxels.js";
+/** @import { Values } from "./columns.js" */
 /** @import { Header } from "./header.js" */
 /** @import { Declared } from "./parameters.js" */
 /** @import { Priors, Slice } from "./slice.js" */
@@ -215,18 +216,20 @@ export class TensorReader {
       earlier[i] = code;
     }
     this._checkVoxels(voxels);
+    /** @type {Values[]} */
     const rows = [voxels, dequantise(voxels, header.info.voxelSize), ...rowsOf(header.rows, slice.rows, own)];
-    if (stepClasses) rows.push(stepClasses);
+    if (stepClasses) rows.push(Uint8Array.from(stepClasses));
     const layerRows = rowsOf(parameters.layerRows, slice.layerRows, rises.length + own);
     const layer = had ?? this._begun(slice);
     if (!had) this._rules?.checkLayer(header, [...this._layers, layer]);
     const following = this._following[this._index + 1];
     const growth = following === null ? 1 : Math.max(1.5, 1.25 / this._share[this._index]);
-    for (const column of this._columns) column.reserve(own, growth);
+    const alone = following === null && !this._voxels.rows;
+    if (!alone) for (const column of this._columns) column.reserve(own, growth);
     for (const column of [layer.codes, ...layer.rows]) column.reserve(rises.length + own, growth);
     // from here on nothing fails, but for want of memory to sort
     if (!had) this._layers.push(layer);
-    this._columns.forEach((column, i) => column.append(rows[i]));
+    this._columns.forEach((column, i) => (alone ? column.become(rows[i]) : column.append(rows[i])));
     layer.rows.forEach((column, i) => column.append(layerRows[i]));
     layer.codes.append(earlier);
     layer.codes.append(slice.codes);

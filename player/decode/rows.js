@@ -36,14 +36,22 @@ export function decodeRows(reader, tensors, count, classes, centres, priors) {
  * @param {number} centre @param {number} predictor */
 function restore(values, classes, centre, predictor) {
   checkRange(values, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of a row");
+  if (!predictor) {
+    if (classes) for (let i = 0; i < values.length; i++) values[i] = checked(centre + (values[i] << classes[i]));
+    return;
+  }
   const last = new Int32Array(STEP_CLASSES).fill(centre);
   for (let i = 0; i < values.length; i++) {
     const c = classes ? classes[i] : 0;
-    const v = last[c] + (values[i] << c); // below 2^30 in magnitude
-    if ((v + MAX_SYMBOL) >>> 0 > 2 * MAX_SYMBOL) throw malformed(`a row's value of ${v} steps, limit ±${MAX_SYMBOL}`);
-    values[i] = v;
-    if (predictor) for (let j = c; j < STEP_CLASSES; j++) last[j] = v;
+    values[i] = checked(last[c] + (values[i] << c));
+    for (let j = c; j < STEP_CLASSES; j++) last[j] = values[i];
   }
+}
+
+/** @param {number} v of steps, below 2^30 in magnitude */
+function checked(v) {
+  if ((v + MAX_SYMBOL) >>> 0 > 2 * MAX_SYMBOL) throw malformed(`a row's value of ${v} steps, limit ±${MAX_SYMBOL}`);
+  return v;
 }
 
 /** Each tensor of rows dequantised, [count, channels]. @param {RowTensor[]} tensors @param {Int32Array} values as

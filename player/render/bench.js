@@ -1,5 +1,6 @@
 // The page that measures frame rates per level and size on the machine that opens it.
 
+import { levelOf } from "./level.js";
 import { Orbit } from "./orbit.js";
 import { Player } from "./player.js";
 
@@ -15,7 +16,7 @@ const SWING_MS = 2000;
 
 /**
  * Measures a scene; the result is shown and is `window.benchResult`. moving: pictures per second while the camera moves
- * and time stands still. playing: evaluations per second while time advances; 0 for level 0, which is static.
+ * and time stands still. playing: evaluations per second while time advances; 0 for a level that is static.
  *
  * @param {string | Blob} source @param {HTMLElement} place @param {string} [sizes]
  */
@@ -44,7 +45,8 @@ export async function bench(source, place, sizes = SIZES) {
       const moving = await perSecond(() => player.counts.drawn, swing(orbit));
       await player.settled();
       player.play();
-      const playing = level ? await perSecond(() => player.counts.evaluated) : 0;
+      const moves = player.scene && levelOf(player.scene, level).motion;
+      const playing = moves ? await perSecond(() => player.counts.evaluated) : 0;
       player.pause();
       rows.push({ level, width, height, gaussians: player.status.gaussians, moving, playing });
       if (moving < SLOWEST) break;

@@ -31,7 +31,7 @@ import { ANCHOR_BITS, NO_ENTRY } from "./sort.js";
 /** Block of an anchor's record where its features begin. */
 const FEATURE_BLOCK = 3;
 /** Block of a Gaussian's record that is its colour. */
-const COLOR_BLOCK = 3;
+export const COLOR_BLOCK = 3;
 /** Blocks of a Gaussian's record. */
 export const SPLAT_BLOCKS = GAUSSIAN_COLUMNS / 4;
 /** Limit of the textures of all anchors, bytes: beyond it devices fail in ways that cannot be distinguished. */

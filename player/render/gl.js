@@ -142,13 +142,14 @@ export class Gpu {
     return this.field(width, height, blocks, null, format);
   }
 
-  /** Overwrites the first `rows` rows of a field of floats. @param {Field} field @param {Float32Array} data [blocks,
-   * height, width, 4] @param {number} [rows] default: all */
-  write({ texture, width, height, blocks }, data, rows = height) {
+  /** Overwrites the first `rows` rows of the blocks from `first` on. @param {Field} field of floats
+   * @param {Float32Array} data [blocks, height, width, 4] @param {number} [rows] default: all @param {number} [first] */
+  write({ texture, width, height, blocks }, data, rows = height, first = 0) {
+    const from = 4 * width * height * first;
     const { gl } = this;
     gl.bindTexture(gl.TEXTURE_2D_ARRAY, texture);
     gl.pixelStorei(gl.UNPACK_IMAGE_HEIGHT, height);
-    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, 0, width, rows, blocks, gl.RGBA, gl.FLOAT, data);
+    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, first, width, rows, blocks - first, gl.RGBA, gl.FLOAT, data, from);
     gl.pixelStorei(gl.UNPACK_IMAGE_HEIGHT, 0);
   }
 

@@ -2,7 +2,7 @@
 
 import { centreOf, defaultCamera, fitted } from "./camera.js";
 import { CpuEvaluator } from "./cpu.js";
-import { GpuEvaluator, SPLAT_BLOCKS } from "./evaluator.js";
+import { COLOR_BLOCK, GpuEvaluator, SPLAT_BLOCKS } from "./evaluator.js";
 import { Gpu } from "./gl.js";
 import { levelOf, sameState, stateOf } from "./level.js";
 import { Clip } from "./loader.js";
@@ -517,8 +517,13 @@ export class Player extends Clip {
       this._cpu ??= new CpuEvaluator();
       const { count, data, means, width, height } = await this._cpu.evaluate(state);
       const field = gpu.renewed(into?.field, width, height, SPLAT_BLOCKS);
-      gpu.write(field, data, Math.ceil(count / width));
-      return { splats: { field }, means };
+      // another eye changes colours alone where Gaussians need no anchors
+      const { state: had, splats } = this._front ?? {};
+      const blind = scene.kind === "splats" && had?.scene === scene && had.level === level && had.t === t;
+      const shapes = blind ? splats?.shapes : {};
+      const kept = into?.field === field && into.shapes === shapes;
+      gpu.write(field, data, Math.ceil(count / width), kept ? COLOR_BLOCK : 0);
+      return { splats: { field, shapes }, means: blind ? null : means };
     }
     this._evaluator ??= new GpuEvaluator(gpu, /** @type {AnchorScene} */ (scene));
     return this._evaluator.evaluate(level, t, eye, into, (opacities, ...rest) =>

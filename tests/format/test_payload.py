@@ -14,7 +14,7 @@ from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.payload import Past, read_slice, write_slice
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, NO_CLASSES, Rows, RowTable
 from pd4dgs_codec.format.symbols import LayerSymbols, sliced
-from pd4dgs_codec.format.tables import Chain, Declared, Grid, Tables, Tensors
+from pd4dgs_codec.format.tables import Chain, Declared, Grid, Tables, Tensors, with_fill
 from pd4dgs_codec.morton import MAX_VOXEL, morton_order
 from pd4dgs_codec.scene import MAX_CLASS
 
@@ -118,6 +118,8 @@ def test_tensors_of_any_tables_come_back(grids, chains, data):
     if data.draw(st.booleans()):
         layer = sliced(layer, np.zeros(0, np.int64), True)
     options = data.draw(st.sampled_from((FAST, LZMA, EncodeOptions(effort=3), EncodeOptions(priors="gauss"))))
+    given = write_slice(replace(layer, fill=data.draw(st.sampled_from((None, (9, 9, 9))))), options)[0]
+    assert with_fill(given, layer.fill) == write_slice(layer, options)[0]
     found = assert_comes_back(layer, options, Declared(rows=len(layer.rises)))
     grids_of = found.tensors.grids
     assert [len(grids_of[grid.id]) for grid in grids] == [max(len(g.sides) * (len(g.sides) - 1) // 2, 1) for g in grids]

@@ -13,7 +13,7 @@ from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import DecodeError, EncodeError, Truncated
 from pd4dgs_codec.format import encoder
 from pd4dgs_codec.format.container import CHUNK_OVERHEAD, read_preamble
-from pd4dgs_codec.format.decoder import decode_partial, every_prefix
+from pd4dgs_codec.format.decoder import decode_partial, every_prefix, open_stream
 from pd4dgs_codec.format.encoder import encode_with_report
 from pd4dgs_codec.format.info import hashes, info
 from pd4dgs_codec.morton import morton_order
@@ -102,6 +102,31 @@ def test_slices_take_what_was_asked_and_the_report_says_so():
     assert [s["anchors"] for row in told for s in row["slices"]] == [row.anchors for row in rows]
     assert [(row["anchors"], row["bytes"]) for row in told] == [(r.anchors, r.bytes) for r in report.layers]
     assert "anchors" not in info(data[: ends[1]])["layers"][0]
+
+
+def test_every_slice_but_the_last_has_the_fill_of_the_prefix_that_ends_with_it():
+    asked = list[int]()
+
+    def fill(prefix):
+        asked.append(len(prefix.anchor_q))
+        return (len(asked), 0, 255) if len(asked) % 3 else None
+
+    filled = replace(scene(), fills=((1, 1, 1), None, (9, 9, 9)))  # of a file that is encoded again
+    data, report = encode_with_report(filled, effort=2, slices=1750, fill=fill)
+    prefixes, ends = list(every_prefix(data)), slice_ends(data)
+    expected = [(i, 0, 255) if i % 3 else None for i in range(1, len(ends))] + [(9, 9, 9)]
+    assert asked == [len(prefix.anchor_q) for prefix in prefixes[:-1]]
+    assert [prefix.fills[-1] for prefix in prefixes] == expected
+    assert [decode(data, max_bytes=end).fills[-1] for end in ends] == expected
+    stream = open_stream()
+    assert [stream.feed(data[a:b])[-1].fills[-1] for a, b in zip([0, *ends], ends, strict=False)] == expected
+    rows = [row for layer in report.layers for row in layer.slices]
+    assert [row.fill for row in rows] == expected and ends[0] <= 1750 and all(row.bytes <= 1750 for row in rows)
+    told = [part["fill"] for row in info(data)["layers"] for part in row["slices"]]
+    assert told == [code and list(code) for code in expected]
+    numbers = np.cumsum([len(layer.slices) for layer in report.layers]) - 1
+    assert decode(data).fills == tuple(expected[i] for i in numbers)
+    assert hashes(data) == hashes(sliced())
 
 
 def test_later_slices_are_smaller_and_none_is_a_small_rest():

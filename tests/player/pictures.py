@@ -9,9 +9,10 @@ import numpy as np
 from browser import call, pixels
 
 from pd4dgs_codec import decode
-from pd4dgs_codec.draw.player import Player
+from pd4dgs_codec.draw.player import Drawer, Player, drawer
+from pd4dgs_codec.kinds.splats import SplatScene
 from pd4dgs_codec.quality.frames import turned
-from pd4dgs_codec.scene import Camera, Gaussians, Scene
+from pd4dgs_codec.scene import Camera, Gaussians, LayeredScene, Scene
 
 
 def decibels(a: np.ndarray, b: np.ndarray) -> float:
@@ -28,13 +29,18 @@ class Rasterised(Player):
         return self.gaussians_of_eyes(self.active, t, camera.eye[None])
 
 
+def rasterised(scene: Scene | SplatScene) -> Drawer:
+    """The package's pictures of all anchors of a scene of any kind."""
+    return Rasterised(scene) if isinstance(scene, Scene) else drawer(scene)
+
+
 def resized(camera: Camera, width: int, height: int) -> Camera:
     """The same view in a picture of another size."""
     K = camera.K * np.array([[width / camera.width], [height / camera.height], [1]], np.float32)
     return replace(camera, width=width, height=height, K=K)
 
 
-def cameras(scene: Scene, turns: Sequence[tuple[float, float]]) -> Iterator[Camera]:
+def cameras(scene: LayeredScene, turns: Sequence[tuple[float, float]]) -> Iterator[Camera]:
     """The scene's own camera, then for each (angle, nearer) that camera turned about the middle of the anchors by
     `angle`, around its vertical, and brought nearer by the share `nearer`."""
     own, middle = scene.info.camera, np.median(scene.anchor, axis=0)
@@ -62,7 +68,7 @@ def shots(
 ) -> Iterator[Shot]:
     """Pictures of the file `data`, which the harness has open: each level at the times of cameras of one size."""
     scenes = [decode(data, max_layer=level) for level in levels or decode(data).layers]
-    players = [Rasterised(scene) for scene in scenes]
+    players = [rasterised(scene) for scene in scenes]
     low, high = scenes[0].info.time_range
     for number, (camera, times) in enumerate(views):
         for t in times:

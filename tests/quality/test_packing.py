@@ -5,11 +5,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from explicit import visible_splats
 from strategies import by_voxel, make_scene
 from tiny import camera_ahead
 
 from pd4dgs_codec.data.view import View, spread
-from pd4dgs_codec.format.decoder import decode
+from pd4dgs_codec.draw.player import drawer
+from pd4dgs_codec.format.decoder import decode, every_prefix
 from pd4dgs_codec.format.encoder import encode, with_metadata
 from pd4dgs_codec.format.info import hashes, info, metadata_of
 from pd4dgs_codec.format.metadata import Metadata
@@ -17,7 +19,7 @@ from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.model.sensitivity import utility, without
 from pd4dgs_codec.quality import packing, target
-from pd4dgs_codec.quality.measure import true_psnr
+from pd4dgs_codec.quality.measure import best_fill, true_psnr
 from pd4dgs_codec.quality.packing import Views, pack
 
 FAST = EncodeOptions(mode="lzma", effort=1)
@@ -89,8 +91,8 @@ def test_levels_are_measured_without_and_with_slices_and_kept_if_asked(scene):
     assert moved.slices["against"] == "the model's own pictures" and "levels" not in kept.slices
     rows = moved.slices["levels"]
     assert [row["level"] for row in rows] == [0, 1, 2] and all(row["mpsnr"] > 5 for row in rows)
-    lost = [row["mpsnr_unsliced"] - row["mpsnr"] for row in rows]  # layer 1 passes anchors on, layer 0 has few
-    assert lost[1] > 0.1 and lost[2] == pytest.approx(0, abs=0.01)
+    change = [row["mpsnr"] - row["mpsnr_unsliced"] for row in rows]
+    assert abs(change[1]) > 0.1 and change[2] == pytest.approx(0, abs=0.01)  # layer 1 passes anchors on and has a fill
     whole = decode(pack(scene, replace(SLICED, slices=0)).data)
     assert decode(kept.data).rows == whole.rows
     np.testing.assert_equal(by_voxel(decode(kept.data)), by_voxel(whole))
@@ -141,6 +143,58 @@ def test_views_held_out_are_scored_after_each_slice(scene):
     np.testing.assert_allclose(metadata_of(packed.data).slices, packed.slices["psnr"], rtol=1e-6)
     assert packed.report.bytes == len(packed.data) and packed.report.metadata_bytes > 20
     decode(packed.data)
+
+
+VIEWPOINTS = [(CAMERA, time) for time in (0.0, 0.3, 1.0)]
+TWICE = [both for both in VIEWPOINTS for _ in range(2)]  # half of the views decide on fills
+
+
+def over(scene, color):
+    """Pictures of a scene over any colour, which are not clipped."""
+    drawn = [drawer(scene).drawn(camera, time) for camera, time in VIEWPOINTS]
+    change = np.float32(color) - np.float32(scene.background())
+    return [image + (1 - alpha)[:, :, None] * change for image, alpha in drawn]
+
+
+def error(scene, whole):
+    """The squared error of a scene's pictures against `whole`."""
+    return sum(np.square(a - b).sum() for a, b in zip(over(scene, scene.background()), whole, strict=True))
+
+
+@pytest.mark.parametrize("level", [0, 2])
+def test_the_fill_is_the_colour_behind_the_pictures(scene, level):
+    shown = plan(scene).symbols.scene().prefix(level)
+    own = shown.info.background
+    other = replace(shown, fills=((9, 9, 9),) * len(shown.layers))  # of an earlier file
+    for fill in ((200, 30, 77), (0, 255, 128)):
+        targets = over(shown, np.divide(fill, 255))
+        assert best_fill(shown, VIEWPOINTS, targets) == best_fill(other, VIEWPOINTS, targets) == fill
+    assert best_fill(shown, VIEWPOINTS, over(shown, (1.7, -0.4, 0.4))) == (255, 0, 102)
+    assert best_fill(shown, VIEWPOINTS, over(shown, own)) is None
+    noise = np.random.default_rng(0).normal(size=(3, 16, 24, 3)).astype(np.float32)
+    faint, clear = (over(shown, np.add(own, np.where(np.array(own) > 0.5, -1, 1) * by)) for by in (0.02, 0.5))
+    assert best_fill(shown, VIEWPOINTS, np.stack(faint) + 0.3 * noise) is None
+    assert best_fill(shown, VIEWPOINTS, np.stack(clear) + 0.3 * noise) is not None
+
+
+def test_a_fill_brings_every_prefix_nearer_to_the_pictures_that_order_anchors(scene):
+    packed = pack(scene, SLICED, views=Views("made up", TWICE))
+    whole, left = over(plan(scene).scene, scene.info.background), list[float]()
+    *prefixes, last = every_prefix(packed.data)
+    for prefix in (prefix for prefix in prefixes if prefix.fills[-1]):
+        left.append(error(prefix, whole) / error(replace(prefix, fills=()), whole))
+    assert max(left) < 10 ** (-0.05 / 10) and min(left) < 0.85 and len(left) > 3 and last.fills[-1] is None
+    assert info(packed.data)["layers"][0]["slices"][0]["end"] <= SLICED.slices
+    rows = [row for layer in packed.json()["layers"] for row in layer["slices"]]
+    assert [row["fill"] for row in rows] == [prefix.fills[-1] for prefix in (*prefixes, last)]
+
+
+def test_slices_of_splats_have_fills_too():
+    scene = visible_splats(count=200, moving=False)
+    first, *_, last = every_prefix(pack(scene, SLICED, views=Views("made up", TWICE)).data)
+    whole = over(scene, scene.background())
+    assert first.fills[-1] and last.fills == (None,)
+    assert error(first, whole) < 0.95 * error(replace(first, fills=()), whole)
 
 
 def test_anchors_that_show_nothing_are_worth_least(scene):

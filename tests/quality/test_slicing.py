@@ -9,11 +9,17 @@ from tiny import camera_ahead
 
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import plan
+from pd4dgs_codec.model.model import from_scene
 from pd4dgs_codec.model.sensitivity import utility
-from pd4dgs_codec.quality.measure import in_order
+from pd4dgs_codec.quality.measure import in_order, pictures
 
 VIEWPOINTS = [(camera_ahead(3.0, 20.0, 24, 16), time) for time in (0.0, 0.5, 1.0)]
 OPTIONS = EncodeOptions(effort=1)
+
+
+def ordered(scene, **options):
+    whole = pictures(from_scene(scene), scene.level, VIEWPOINTS)
+    return in_order(scene, VIEWPOINTS, whole, OPTIONS, **options)
 
 
 def planned(seed=3, **options):
@@ -34,7 +40,7 @@ def moving(by):
 @pytest.mark.parametrize("seed", range(3))
 def test_the_highest_level_stays_and_masks_rise(seed):
     scene = planned(seed)
-    found, values = in_order(scene, VIEWPOINTS, OPTIONS)
+    found, values = ordered(scene)
     assert values.shape == scene.anchor_q.shape[:1] and found.rows[-1] == scene.rows[-1]
     np.testing.assert_equal(by_voxel(found), by_voxel(scene))
     assert (np.diff(np.stack(found.full_masks()).astype(int), axis=0) >= 0).all()
@@ -48,7 +54,7 @@ def test_the_highest_level_stays_and_masks_rise(seed):
 def test_values_belong_to_the_anchors_in_the_order_of_a_file():
     """Morton order depends on which anchors a layer has."""
     scene = moving(3.0)
-    found, values = in_order(scene, VIEWPOINTS, OPTIONS)
+    found, values = ordered(scene)
     assert 0 < found.rows[0] < 0.3 * scene.rows[0], "motion of everything comes before most anchors"
     of_voxel = dict(zip(map(tuple, scene.anchor_q.tolist()), utility(scene.prefix(0), VIEWPOINTS), strict=True))
     own = [of_voxel[voxel] for voxel in map(tuple, found.anchor_q[: found.rows[0]].tolist())]
@@ -59,10 +65,10 @@ def test_values_belong_to_the_anchors_in_the_order_of_a_file():
 
 def test_motion_of_nothing_comes_after_all_anchors():
     still = moving(0.0)
-    assert in_order(still, VIEWPOINTS, OPTIONS)[0].rows == still.rows
+    assert ordered(still)[0].rows == still.rows
 
 
 def test_anchors_stay_where_they_may_not_pass():
     scene = moving(3.0)
-    found, _ = in_order(scene, VIEWPOINTS, OPTIONS, passing=False)
+    found, _ = ordered(scene, passing=False)
     assert found is scene

@@ -25,7 +25,13 @@ SPEC = Path(__file__).parents[2] / "spec"
 TEXT = (SPEC / "format.md").read_text(encoding="utf-8")
 SOURCE = (SPEC / "refdec.py").read_text(encoding="utf-8")
 
-CODINGS = {"ans best": {}, "ans gauss": {"priors": "gauss"}, "lzma": {"mode": "lzma"}, "slices": {"slices": 1500}}
+CODINGS = {
+    "ans best": {},
+    "ans gauss": {"priors": "gauss"},
+    "lzma": {"mode": "lzma"},
+    "slices": {"slices": 1500},
+    "fills": {"slices": 1500, "fill": lambda prefix: (prefix.level, 0, 255)},
+}
 
 
 @given(scenes(), st.sampled_from(sorted(CODINGS)))
@@ -101,6 +107,15 @@ def test_the_tables_and_limits_of_the_specification():
     text = plain(TEXT)
     check = [int(v) for v in re.search(r"gives 0, ([\d, ]+), 2\^24", text)[1].split(",")]
     assert refdec.table_of(refdec.norm_cdf(7, 832, 0)) == [0, *check, 1 << 24]
+    sentence = r"mu8 = (\d+), si = (\d+), w = (\d+) give 0, ([\d, ]+), 2\^24"
+    (mu8,), (si,), (w,), cum = ([int(v) for v in part.split(",")] for part in re.search(sentence, text).groups())
+    first, second = refdec.norm_cdf(7, 832, 0), refdec.norm_cdf(7, mu8, si)
+    mixed = [((256 - w) * a + w * b) >> 8 for a, b in zip(first, second, strict=True)]
+    assert refdec.table_of(mixed) == [0, *cum, 1 << 24]
+    stream, symbols = re.search(r"the stream ((?:[0-9A-F]{2} )+)yields ([\d, ]+)\.", text).groups()
+    ans, symbols = refdec.Ans(bytes.fromhex(stream)), [int(v) for v in symbols.split(",")]
+    assert ans.take(len(symbols), refdec.table_of(first)) == symbols
+    ans.finish()
     activity, classes = re.search(r"activities ([\d, ]+) give A = .* and classes ([\d, ]+)\.", text).groups()
     found = refdec.classes_by_activity([int(v) for v in activity.split(",")])
     assert found == [int(v) for v in classes.split(",")]
@@ -137,6 +152,9 @@ def test_the_example_of_an_octree():
     cells = np.array([[int(v) for v in place.split(",")] for place in re.findall(r"\((.*?)\)", places)], np.int32)
     head, channels = position_channels(cells[morton_order(cells)])
     assert head == bytes.fromhex(re.search(r"codes begin ((?:[0-9A-F]{2} ?)+);", text)[1])
+    differences = re.search(r"10\.4's anchors give ([\d, −·]+)\.", plain(TEXT))[1].replace("−", "-")
+    axes = [[int(v) for v in axis.split(",")] for axis in differences.split("·")]
+    assert refdec.voxels_in_order(zip(*axes, strict=True)) == list(map(tuple, cells[morton_order(cells)].tolist()))
     printed = re.search(r"that are not empty are ([\d ·]+) · 1,", text)[1] + " · 1"
     assert [c.tolist() for c in channels if len(c)] == [[int(v) for v in c.split()] for c in printed.split("·")]
 

@@ -28,6 +28,7 @@ ERRORS = re.findall(r"^\| (\w+) \| ", TEXT.split("## 15 ")[1].split("## 16 ")[0]
 SLOW = {"valid/planes-products-over-2-53.pd4", *(v["file"] for v in MANIFEST if v["file"].startswith("worst-case/"))}
 #: Functions of the reference decoder that check on behalf of their callers.
 HELPERS = {"need", "limited", "registered", "fields", "a_list", "integers", "reals", "a_step", "ranged", "indices_of"}
+HELPERS |= {"unpack", "msgpack_items"}
 
 
 def read(vector):

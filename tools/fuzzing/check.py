@@ -28,7 +28,7 @@ from pd4dgs_codec.format.container import CHUNK_OVERHEAD, read_chunk, read_pream
 from pd4dgs_codec.format.decoder import decode_partial
 from pd4dgs_codec.format.header import unpack_header
 from pd4dgs_codec.format.info import hashes, info
-from pd4dgs_codec.format.tables import Declared, read_parameters
+from pd4dgs_codec.format.tables import Declared, Tables, read_parameters
 
 from . import ROOT
 from .mutate import Case
@@ -99,20 +99,20 @@ def junk_in_new_memory() -> Iterator[None]:
 def declared(data: bytes) -> tuple[int, bool]:
     """(symbols, whether a layer has several slices) that `data` declares within the limits, up to the first slice that
     is refused."""
-    total, layers = Declared(), list[int]()
+    total, first, sliced = Declared(), dict[int, Tables](), False
     try:
         preamble = read_preamble(data)
         header, offset = unpack_header(preamble.header), preamble.size
-        scalars = header.table.channels + header.table.graded
         for number, length in header.chunks:
             if number < 3:
                 payload = read_chunk(data, offset, length=length).payload
-                _, _, total = read_parameters(payload, number, scalars, total, number in layers)
-                layers.append(number)
+                found, _, total = read_parameters(payload, number, header.table, total, first.get(number))
+                sliced |= number in first
+                first.setdefault(number, found.tables)
             offset += CHUNK_OVERHEAD + length
     except DecodeError:
         pass
-    return total.symbols, len(layers) > len(set(layers))
+    return total.symbols, sliced
 
 
 def check_memory(data: bytes) -> float:

@@ -2,15 +2,15 @@
 
 A random file is made from its symbols: the writer of the vectors says which hashes a decoder must arrive at. Every
 choice that the format leaves is drawn, near its limits more often than not: tables of tensors, priors and their
-parameters, step classes, predictors, slices, voxels, steps, what may be ignored. Half of the files are scenes, of which
-some are bent so that their tensors decode and may make no scene.
+parameters, step classes, predictors, slices, voxels, steps, what may be ignored. Half of the files are scenes, some of
+which are bent: their tensors decode and may make no scene.
 """
 
 from __future__ import annotations
 
 import random
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -29,19 +29,20 @@ from vectors.blocks import (
     make_file,
     make_layer,
     morton_order,
-    row_values,
     ordered,
     pack,
+    row_values,
 )
 
 from pd4dgs_codec.errors import DecodeError
 from pd4dgs_codec.format.info import hashes
 
-VECTORS = Path(__file__).resolve().parents[2] / "spec" / "vectors"
+from . import ROOT
+
+VECTORS = ROOT / "spec" / "vectors"
 LARGEST_SEED = 6000  #: bytes of a vector: larger ones decode slowly
 M, K, V = 1 << 23, 1 << 24, 1 << 20  #: largest symbol of a value, of a channel, and voxel index
 LEAST, LARGEST = 2.0**-126, (2.0 - 2.0**-23) * 2.0**127
-TO_INFINITY = 2.0**128 - 2.0**103
 
 
 @dataclass(frozen=True)
@@ -71,20 +72,20 @@ def decodes(data: bytes) -> bool:
     return True
 
 
-# -- numbers -----------------------------------------------------------------------------------------------------------
+# -- numbers and priors ------------------------------------------------------------------------------------------------
 
 
 def symbols(rng: random.Random, *shape: int, most: int = M) -> np.ndarray:
     """int32 of `shape` in -most..most: alike, small, of any size, few that are large, or at the ends."""
-    numbers, kind = np.random.default_rng(rng.randrange(1 << 32)), rng.randrange(7)
-    if kind == 0:
+    numbers, form = np.random.default_rng(rng.randrange(1 << 32)), rng.randrange(7)
+    if form == 0:
         return np.full(shape, rng.choice((0, 1, -1, most, -most, rng.randint(-most, most))), np.int32)
-    if kind == 1:
+    if form == 1:
         return numbers.choice([-most, most, 0], shape).astype(np.int32)
-    if kind == 2:
+    if form == 2:
         return numbers.integers(-most, most, shape, endpoint=True).astype(np.int32)
     k = np.rint(numbers.normal(rng.choice((0, 0, 300)), rng.choice((0.4, 1.5, 40, 9000)), shape))
-    if kind == 3:
+    if form == 3:
         k[numbers.random(shape) < 0.1] = rng.choice((most, -most, 1000))
     return k.clip(-most, most).astype(np.int32)
 
@@ -94,37 +95,35 @@ def near(rng: random.Random, low: int, high: int) -> int:
     return rng.choice((low, high, rng.randint(low, high), rng.randint(low, min(high, low + 40))))
 
 
-def _single(value: float) -> float:
-    """The largest binary32 value that is not above."""
-    nearest = np.float32(value)
-    return float(nearest if float(nearest) <= value else np.nextafter(nearest, np.float32(0)))
+def some_ids(rng: random.Random, count: int) -> list[int]:
+    """Ascending."""
+    return sorted(rng.sample(range(256), count) if rng.random() < 0.5 else range(count))
 
 
-def _step(rng: random.Random, values: Sequence[np.ndarray], most: int = 1) -> float:
+def step(rng: random.Random, values: Sequence[np.ndarray], most: int = 1) -> float:
     """A step that keeps these symbols finite, and all up to `most`."""
     largest = max([most, *(int(abs(v.astype(np.int64)).max(initial=0)) for v in values)])
-    limit = _single(min(LARGEST, TO_INFINITY * (1 - 2.0**-40) / largest))
-    return rng.choice((LEAST, limit, 2.0**-7, _single(rng.random() * 2.0 ** rng.randrange(-40, 20) + LEAST)))
-
-
-# -- priors ------------------------------------------------------------------------------------------------------------
+    limit = min(LARGEST, (2.0**128 - 2.0**103) * (1 - 2.0**-40) / largest)
+    single = np.float32([limit, rng.random() * 2.0 ** rng.randrange(-40, 20) + LEAST])
+    single[0] = single[0] if float(single[0]) <= limit else np.nextafter(single[0], np.float32(0))
+    return rng.choice((LEAST, 2.0**-7, *map(float, single)))
 
 
 class Chooser:
     """Chooses priors for the channels of a slice, also of those that the lists have. left: entries it may define."""
 
-    def __init__(self, rng: random.Random, known: Known):
-        self._rng, self._known, self.left = rng, known, 0
-        self._alike = {which: rng.random() for which in range(3)}  # how often a channel has a prior of the list
+    def __init__(self, rng: random.Random, known: Known, left: int):
+        self._rng, self._known, self._left = rng, known, left
+        self._alike = [rng.random() for _ in known]  # how often a channel has a prior of the list
 
     def __call__(self, which: int, piece: str, number: int, k: list[int]) -> Prior:
         """A choice of `blocks.Choice`."""
         own, rng = self._known[which], self._rng
-        left = self.left - sum(not other for other in self._known if other is not own)  # each may need one entry
+        left = self._left - sum(not other for other in self._known if other is not own)  # each may need one entry
         if own and (rng.random() < self._alike[which] or left < 2):
             return rng.choice(own)
         made = prior(rng, min(k), max(k), min(left, 1 << 14))
-        self.left -= made.n
+        self._left -= made.n
         return made
 
 
@@ -150,68 +149,153 @@ def _normal(rng: random.Random, n: int) -> tuple[int, int]:
 
 # -- tables ------------------------------------------------------------------------------------------------------------
 
-Arrays = dict[int, list[np.ndarray]]  #: weight, bias, weight, .. of chains by id
+
+@dataclass
+class Tables:
+    """Of a layer: channels and sides of grids, inputs and outputs of chains, channels of layer rows, all by id."""
+
+    grids: dict[int, tuple[int, tuple[int, ...]]] = field(default_factory=dict)
+    chains: dict[int, tuple[int, int]] = field(default_factory=dict)
+    rows: dict[int, int] = field(default_factory=dict)
+    kind: list[int] | None = None
 
 
-class Choices:
-    """What holds for a whole file: tables of rows, centres, voxels and codes so far; of a scene, its widths and what
-    the trunks read. bent: its tensors may make no scene."""
+class Anything:
+    """Tables of no known kind. widths: channels of the rows by id."""
 
     def __init__(self, rng: random.Random):
-        self.rng, self.scene = rng, rng.random() < 0.5
-        self.bent = self.scene and rng.random() < 0.4
-        self.feature, self.slots = rng.choices(((1, 1), (2, 3), (7, 2), (32, 10), (64, 16)), (9, 9, 6, 2, 1))[0]
-        self.views = rng.randrange(8)
-        self.kind = [0, self.slots, self.views] if self.scene else self.any_kind()
-        count = rng.choices((1, 2, 3, 7, 32), (3, 6, 3, 3, 0.2))[0]
-        self.widths = [rng.choices((1, 3, 16, 256), (6, 6, 3, 0.2))[0] for _ in range(count)]
-        self.widths = (
-            [self.feature, 6, 3 * self.slots]
-            if self.scene
-            else self.widths
-            if sum(self.widths) <= 512
-            else [512 // count] * count
-        )
-        self.ids = [*range(3)] if self.scene else self.some_ids(len(self.widths))
-        if self.bent and rng.random() < 0.3:
-            where = rng.choice((self.kind, self.ids, self.widths))
-            where[rng.choice((-1, -1 if where is self.ids else 0))] += rng.choice((1, 1, 2, 60))
-        self.mode = LZMA if rng.random() < 0.1 else ANS
-        self.graded = rng.random() < 0.4
-        self.centres = symbols(rng, sum(self.widths)).tolist() if self.graded else None
-        self.table = [[i, c, 1.0, rng.randrange(2)] for i, c in zip(self.ids, self.widths, strict=True)]
-        self.layer_table = list[Any]()  # of the layer
-        self.channels = rng.choices((1, 2, 3, 5, 9, 17), (6, 6, 6, 3, 1, 1))[0]  # of the planes of a scene
-        self.read = 0  # plane channels of the layers so far
-        self.taken = set[tuple[int, ...]]()
-        self.codes = self.classes = np.zeros(0, np.int64)  # of the layers so far
+        self.rng = rng
+        self.kind = self.any_kind()
+        self.widths = self.some(rng.choices((1, 2, 3, 7, 32), (3, 6, 3, 3, 0.2))[0], ((1, 3, 16), (6, 6, 1)))
+        if rng.random() < 0.02:
+            self.widths = {0: 256, 9: 256}
 
-    def some_ids(self, count: int) -> list[int]:
-        """Ascending."""
-        return sorted(self.rng.sample(range(256), count) if self.rng.random() < 0.5 else range(count))
-
-    def some_rows(self) -> list[list[Any]]:
-        """A table of rows of a layer."""
-        rng = self.rng
-        ids = self.some_ids(rng.choices((1, 2, 5, 32), (6, 6, 2, 0.1))[0])
-        return [[i, rng.choices((1, 2, 5, 16), (6, 6, 3, 1))[0], _step(rng, (), most=M), rng.randrange(2)] for i in ids]
+    def some(self, count: int, sizes: tuple[Sequence[int], Sequence[float]]) -> dict[int, int]:
+        """So many sizes by id."""
+        return {i: self.rng.choices(*sizes)[0] for i in some_ids(self.rng, count)}
 
     def any_kind(self) -> list[int]:
         """Of a scene or a deformation."""
         rng = self.rng
-        return [rng.choice((0, 0, 1, 65535)), *(near(rng, 0, 65535) for _ in range(rng.choice((0, 1, 2, 15))))]
+        return [rng.choice((0, 1, 2, 65535)), *(near(rng, 0, 65535) for _ in range(rng.choice((0, 0, 1, 2, 15))))]
+
+    def sides(self, axes: int) -> tuple[int, ...]:
+        """Of a grid."""
+        return tuple(self.rng.choices((1, 2, 3, 5, 40), (8, 8, 8, 4, 1))[0] for _ in range(axes))
+
+    def layer(self, number: int) -> Tables:
+        """Of a layer, some of all forms."""
+        rng, made = self.rng, Tables()
+        channels, ends = ((1, 2, 3, 5, 9, 17, 33), (6, 6, 6, 3, 1, 1, 1)), ((1, 2, 5, 30), (3, 3, 3, 1))
+        if rng.random() < 0.6:
+            own = self.some(rng.choices((1, 2, 16), (9, 3, 0.1))[0], channels)
+            made.grids = {i: (c, self.sides(rng.randint(1, 4))) for i, c in own.items()}
+        if rng.random() < 0.6:
+            own = self.some(rng.choices((1, 2, 5, 64), (3, 3, 3, 0.1))[0], ends)
+            made.chains = {i: (wide, rng.choices(*ends)[0]) for i, wide in own.items()}
+        if rng.random() < 0.3:
+            made.rows = self.some(rng.choices((1, 2, 5, 32), (6, 6, 2, 0.1))[0], ((1, 2, 5, 16), (6, 6, 3, 1)))
+        made.kind = self.any_kind() if rng.random() < 0.5 else None
+        return made
+
+
+class Scaffold(Anything):
+    """A scaffold with HexPlanes."""
+
+    def __init__(self, rng: random.Random):
+        super().__init__(rng)
+        self.d, self.g = rng.choices(((1, 1), (2, 3), (7, 2), (32, 10), (64, 16)), (9, 9, 6, 2, 1))[0]
+        self.kind, self.widths = [0, self.g, rng.randrange(8)], {0: self.d, 1: 6, 2: 3 * self.g}
+        self.channels = rng.choices((1, 2, 3, 5, 9, 17), (6, 6, 6, 3, 1, 1))[0]  # of all planes
+        self.read = 0  # those of the layers so far
+
+    def layer(self, number: int) -> Tables:
+        """Of a layer."""
+        rng = self.rng
+        if number == 0:
+            inputs = [self.d + 3 * (self.kind[2] >> i & 1) for i in range(3)]
+            return Tables(chains={i: (inputs[i], k * self.g) for i, k in enumerate((1, 7, 3))})
+        if rng.random() < 0.4:
+            return Tables()
+        ids = some_ids(rng, rng.choices((1, 2, 8), (9, 3, 0.3))[0])
+        self.read += self.channels * len(ids)
+        between, heads = rng.choice((1, 2, 5)), {1: 3, 2: self.d, 3: 6, 4: 3 * self.g}
+        chains = {i: (between, heads[i]) for i in sorted(rng.sample(sorted(heads), rng.randint(1, 4)))}
+        kind = rng.choice(([0], [0, near(rng, 0, 65535)]))
+        return Tables({i: (self.channels, self.sides(4)) for i in ids}, {0: (self.read, between)} | chains, {}, kind)
+
+
+class Splats(Anything):
+    """Splats with tracks."""
+
+    def __init__(self, rng: random.Random):
+        super().__init__(rng)
+        self.kind, self.widths = [1], dict(enumerate((3, 3, 1, 3, 3)))
+        self.widths |= rng.choice(({}, {5: 9}, {5: 24}, {5: 45, 6: 3}, {6: 3}))
+
+    def layer(self, number: int) -> Tables:
+        """Of a layer."""
+        rng = self.rng
+        if number == 0 or rng.random() < 0.4:
+            return Tables()
+        side = rng.choice((2, 3, 7, 40))
+        heads = {h: near(rng, 1, 9) for h in sorted(rng.sample(range(5), rng.randint(1, 3)))}
+        grids = {1 + h: (m * (3, 4, 3, 1, 3)[h], (side,)) for h, m in heads.items()}
+        return Tables({0: (1, (side,))} | grids, {}, heads, [1])
+
+
+def bend(rng: random.Random, tables: Tables) -> None:
+    """One thing of a layer's tables becomes another, still legal."""
+    own: dict[int, Any] = rng.choice((tables.grids, tables.chains, tables.rows))
+    i, act = rng.choice([*own, 0]), rng.randrange(5)
+    if act == 0:
+        tables.kind = rng.choice((None, [0], [1], [0, 7], [1, 7], [5]))
+    elif act == 1:
+        own.pop(i, None)
+    elif act == 2 and i in own:
+        own[rng.choice((5, 255))] = own.pop(i)
+    elif own is tables.grids:
+        c, sides = own.get(i, (1, (2,) * rng.randint(1, 4)))
+        own[i] = (c + rng.randrange(2), sides[rng.randrange(2) :] or (3,))
+    elif own is tables.chains:
+        own[i] = tuple(v + rng.choice((0, 0, 1, 3)) for v in own.get(i, (1, 3)))
+    else:
+        own[i] = own.get(i, 0) + 1
+
+
+# -- slices and files --------------------------------------------------------------------------------------------------
+
+
+class Maker:
+    """Makes the slices of a file. scene: whether they are sure to make one."""
+
+    def __init__(self, rng: random.Random):
+        self.rng, self.plan = rng, rng.choice((Anything, Anything, Scaffold, Splats))(rng)
+        bent = type(self.plan) is not Anything and rng.random() < 0.4
+        self.scene, self.bent = type(self.plan) is not Anything and not bent, bent
+        self.mode = LZMA if rng.random() < 0.1 else ANS
+        if bent and rng.random() < 0.3:
+            self.plan.kind[-1] += rng.choice((1, 2, 60))
+        elif bent and rng.random() < 0.4:
+            self.plan.widths[rng.choice((1, 2, 7))] = rng.choice((1, 6, 9))
+        self.table = [[i, c, 1.0, rng.randrange(2)] for i, c in sorted(self.plan.widths.items())]
+        width = sum(c for _, c, _, _ in self.table)
+        self.centres = symbols(rng, width).tolist() if rng.random() < 0.4 else None
+        self.layer_table = list[Any]()  # of the layer
+        self.taken = set[tuple[int, ...]]()
+        self.codes = self.classes = np.zeros(0, np.int64)  # of the layers so far
 
     def cells(self, count: int) -> list[list[int]]:
         """At most so many voxels that are free, of a slice."""
         rng = self.rng
-        kind, at = rng.randrange(5), [rng.choice((0, 0, -9, V - 8, 8 - V, rng.randint(-V, V))) for _ in range(3)]
+        form, at = rng.randrange(5), [rng.choice((0, 0, -9, V - 8, 8 - V, rng.randint(-V, V))) for _ in range(3)]
         draw: Callable[[], list[int]] = [
             lambda: [rng.choice((-V, 1 - V, -1, 0, 1, V - 1, V)) for _ in range(3)],
             lambda: [rng.randint(-V, V) for _ in range(3)],
             lambda: [a + rng.randrange(2) for a in at],
             lambda: [at[0] + rng.randrange(60), at[1], at[2]],
             lambda: [a + rng.randrange(8) for a in at],
-        ][kind]
+        ][form]
         found = {tuple(min(v, V) for v in draw()) for _ in range(count)} - self.taken
         for axis in range(3):  # a slice reaches over 2^21 voxels
             if {-V, V} <= {cell[axis] for cell in found}:
@@ -219,137 +303,117 @@ class Choices:
         self.taken |= found
         return ordered(sorted(found))
 
-    def rows(self, classes: list[int], table: Sequence[Sequence[Any]], centres: Sequence[int] | None) -> list[np.ndarray]:
+    def rows(self, classes: list[int], table: Sequence[Sequence[Any]], centres: Sequence[int]) -> list[np.ndarray]:
         """int32 [C, n] of each of these tensors, in rows of these step classes."""
         made, few = list[np.ndarray](), self.rng.choice((M, M, 3, 50))
         for _, width, _, predictor in table:
             k = symbols(self.rng, width, len(classes), most=few)
-            row_values(k, classes, ([0] * width if centres is None else centres)[:width], predictor, mend=True)
-            centres = centres and centres[width:]
+            own, centres = centres[:width] or [0] * width, centres[width:]
+            row_values(k, classes, own, predictor, mend=True)
             made.append(k)
         return made
 
-    def grids(self, number: int) -> list[Grid]:
-        """Of a layer, none or some."""
-        rng = self.rng
-        if rng.random() < 0.4 or (self.scene and number == 0):
-            return []
+    def grids(self, tables: Tables) -> list[Grid]:
+        """With samples of any size; those of the first grid of tracks ascend."""
         made = list[Grid]()
-        for i in self.some_ids(rng.choices((1, 2, 8, 16), (9, 3, 0.3, 0.1 * (not self.scene)))[0]):
-            axes = 4 if self.scene else rng.randint(1, 4)
-            sides = tuple(rng.choices((1, 2, 3, 5, 40), (8, 8, 8, 4, 1))[0] for _ in range(axes))
-            channels = self.channels if self.scene else rng.choices((1, 2, 3, 5, 9, 17, 33), (6, 6, 6, 3, 1, 1, 1))[0]
+        for i, (channels, sides) in tables.grids.items():
             grid = Grid(channels, sides, id=i)
-            samples = [symbols(rng, *shape, most=rng.choice((M, 3))) for shape in grid.shapes()]
-            predictors = tuple(rng.randrange(2) for _ in samples)
+            samples = [symbols(self.rng, *shape, most=self.rng.choice((M, 3))) for shape in grid.shapes()]
+            if isinstance(self.plan, Splats) and i == 0:
+                samples = [k * 0 + np.arange(k.size).reshape(k.shape) ** self.rng.choice((1, 2)) for k in samples]
+            predictors = tuple(self.rng.randrange(2) for _ in samples)
             made.append(replace(grid, predictors=predictors, fill=lambda place, shape, samples=samples: samples[place]))  # type: ignore[misc]
         return made
 
-    def chains(self, number: int, grids: Sequence[Grid]) -> Arrays:
-        """Of a layer."""
-        rng, d, g = self.rng, self.feature, self.slots
-        self.read += sum(grid.channels for grid in grids)
-        ends: dict[int, tuple[int, int]] = {}  # inputs and outputs by id
-        if not self.scene:
-            ids = self.some_ids(rng.choices((0, 1, 2, 5, 64), (3, 3, 3, 3, 0.1))[0])
-            ends = {i: (rng.choice((1, 2, 5, 30)), rng.choice((1, 2, 5, 30))) for i in ids}
-        elif number == 0:
-            ends = {i: (d + 3 * (self.views >> i & 1), k * g) for i, k in enumerate((1, 7, 3))}
-        elif grids:
-            between, heads = rng.choice((1, 2, 5)), {1: 3, 2: d, 3: 6, 4: 3 * g}
-            ends = {0: (self.read, between)} | {
-                i: (between, heads[i]) for i in sorted(rng.sample(sorted(heads), rng.randint(1, 4)))
-            }
-        if self.bent and ends and rng.random() < 0.5:  # another id, one more or less, other ends
-            i = rng.choice([*ends])
-            wide, out = ends.pop(i)
-            bent = {
-                i: (wide + rng.choice((0, 1, 3)), out + rng.choice((0, 0, 1))),
-                rng.choice((i, 3, 5, 255)): (wide, out),
-            }
-            ends = dict(sorted((ends | rng.choice((bent, {}))).items()))
-        made: Arrays = {}
-        for key, (wide, last) in ends.items():
-            made[key] = []
-            for out in [*(rng.choice((1, 2, 4)) for _ in range(rng.choices((0, 1, 2, 15), (9, 5, 2, 0.5))[0])), last]:
-                most = rng.choice((M, M, 9))
-                made[key] += [symbols(rng, out, wide, most=most), symbols(rng, out, most=most)]
-                wide = out
+    def chain(self, wide: int, last: int) -> list[np.ndarray]:
+        """Weight, bias, weight, .. of up to 16 linear layers."""
+        rng, made = self.rng, list[np.ndarray]()
+        for out in [*(rng.choice((1, 2, 4)) for _ in range(rng.choices((0, 1, 2, 15), (9, 5, 2, 0.5))[0])), last]:
+            most = rng.choice((M, M, 9))
+            made += [symbols(rng, out, wide, most=most), symbols(rng, out, most=most)]
+            wide = out
         return made
 
-
-# -- slices and files --------------------------------------------------------------------------------------------------
-
-
-def _slice(choices: Choices, number: int, first: bool, known: Known) -> Layer:
-    rng = choices.rng
-    cells = choices.cells(rng.choices((0, 1, 2, 3, 5, 12, 40, 150), (4, 4, 4, 4, 4, 4, 1, 0.2))[0])
-    lowest, high = rng.choice((3, 3, 200, 255)), rng.choice((0, 2, 255))
-    classes = [near(rng, 0, 6) * choices.graded for _ in cells]
-    grids = choices.grids(number) if first else []
-    chains = choices.chains(number, grids) if first else {}
-    kind: list[int] | None = None
-    if first and (rng.random() < 0.5 if not choices.scene else number and grids):
-        kind = choices.any_kind() if not choices.scene else rng.choice(([0], [0, near(rng, 0, 65535)]))
-    if choices.bent and first and rng.random() < 0.2:
-        grids, kind = rng.choice(
-            ((grids[1:], kind), ([replace(x, id=x.id) for x in grids], choices.any_kind()), (grids, None))
+    def slice(self, number: int, first: bool, known: Known) -> Layer:
+        """One slice, which refers to the priors of those before."""
+        rng, tables = self.rng, self.plan.layer(number) if first else Tables()
+        if self.bent and first and rng.random() < 0.5:
+            bend(rng, tables)
+        if first:
+            self.layer_table = [[i, c, step(rng, (), M), rng.randrange(2)] for i, c in sorted(tables.rows.items())]
+        cells = self.cells(rng.choices((0, 1, 2, 3, 5, 12, 40, 150), (4, 4, 4, 4, 4, 4, 1, 0.2))[0])
+        lowest, high = rng.choice((3, 3, 200, 255)), rng.choice((0, 2, 255))
+        graded = self.centres is not None
+        classes, earlier = [near(rng, 0, 6) * graded for _ in cells], self.classes.tolist() if first else []
+        rises = [near(rng, 0, min(high, 255 - int(code))) for code in self.codes] if first else []
+        rows, layer_rows = (
+            self.rows(classes, self.table, self.centres or []),
+            self.rows(earlier + classes, self.layer_table, []),
         )
-    earlier = choices.classes.tolist() if first else []
-    rises = [near(rng, 0, min(high, 255 - int(code))) for code in choices.codes] if first else []
-    choose = Chooser(rng, known)
-    if first:
-        choices.layer_table = choices.some_rows() if rng.random() < (0.1 * choices.bent if choices.scene else 0.3) else []
-    rows = choices.rows(classes, choices.table, choices.centres)
-    layer_rows = choices.rows(earlier + classes, choices.layer_table, None)
-    planes = [plane for grid in grids for plane in grid.planes()]
-    weights = [array for own in chains.values() for array in own]
-    counted = len(rises) + (4 + choices.graded) * len(cells) + sum(map(np.size, (*rows, *layer_rows, *planes, *weights)))
-    choose.left = counted + (1 << 18 if first else 1 << 10)
-    layer = make_layer(
-        number,
-        cells,
-        rises=rises,
-        codes=[near(rng, lowest, 255) for _ in cells],
-        rows=np.concatenate(rows),
-        widths=choices.widths,
-        classes=classes if choices.graded else None,
-        earlier=earlier,
-        layer_rows=layer_rows,
-        grids=grids,
-        chains=chains,
-        kind=kind,
-        fill=[near(rng, 0, 255) for _ in range(3)] if rng.random() < 0.2 else None,
-        steps=(_step(rng, planes), _step(rng, weights)),
-        priors=choose,
-        known=known,
-    )
-    layer.meta.pop(7, None)
-    layer.meta.update({7: choices.layer_table} if first and choices.layer_table else {})
-    return layer
+        grids = self.grids(replace(tables, grids=dict(sorted(tables.grids.items()))))
+        chains = {i: self.chain(*ends) for i, ends in sorted(tables.chains.items())}
+        planes, weights = [plane for grid in grids for plane in grid.planes()], sum(chains.values(), [])
+        counted = len(rises) + (4 + graded) * len(cells) + sum(map(np.size, (*rows, *layer_rows, *planes, *weights)))
+        layer = make_layer(
+            number,
+            cells,
+            rises=rises,
+            codes=[near(rng, lowest, 255) for _ in cells],
+            rows=np.concatenate(rows),
+            widths=[c for _, c, _, _ in self.table],
+            classes=classes if graded else None,
+            earlier=earlier,
+            layer_rows={row[0]: k for row, k in zip(self.layer_table, layer_rows, strict=True)},
+            grids=grids,
+            chains=chains,
+            fill=[near(rng, 0, 255) for _ in range(3)] if rng.random() < 0.2 else None,
+            steps=(step(rng, planes), step(rng, weights)),
+            priors=Chooser(rng, known, counted + (1 << 18 if first else 1 << 10)),
+            known=known,
+            first=first,
+        )
+        meta = {key: value for key, value in layer.meta.items() if key < 6}
+        extra = {6: tables.kind, 7: self.layer_table if first else None}
+        return replace(layer, meta=meta | {key: value for key, value in extra.items() if value})
+
+    def header(self, layers: Sequence[Layer]) -> dict[int, Any]:
+        """The fields of a file of these slices."""
+        rng = self.rng
+        for i, row in enumerate(self.table):  # centres and the rows before add to symbols
+            row[2] = step(rng, [x.rows[i] for x in layers], M if self.centres is not None or row[3] else 1)
+        header: dict[int, Any] = {2: self.mode, 3: self.plan.kind, 4: self.table, 5: self.centres}
+        header[6] = step(rng, [x.cells for x in layers])
+        if rng.random() < 0.3:
+            box = sorted(rng.choice((-LARGEST, -1.0, -0.0, 2.0**-149, LARGEST)) for _ in range(2))
+            header |= {7: [box[0]] * 3 + [box[1]] * 3, 8: [-LARGEST, LARGEST], 9: [0.0, 1.0, 2.0**-149]}
+            header |= {10: [-0.0, LARGEST], 11: [LARGEST, -0.0, -LARGEST], 12: rng.choice((0.0, -0.0, LARGEST))}
+        if rng.random() < 0.3:
+            sides = {3: near(rng, 1, 65535), 4: near(rng, 1, 65535)}
+            header[13] = {1: [rng.choice((0.0, -LARGEST))] * 12, 2: [LEAST, LARGEST, -1.0, 0.0], **sides}
+        return header
 
 
 def legal(rng: random.Random) -> tuple[File, bool]:
     """(a file of random layers, slices, tables and priors, whether it is sure to make a scene). `File.hashes` says what
     it decodes to."""
-    choices, layers = Choices(rng), list[Layer]()
+    maker, layers = Maker(rng), list[Layer]()
     for number in sorted({0, *rng.sample((1, 2), rng.randrange(3))}):
-        known, count = Known(), 1 if choices.mode == LZMA else rng.choice((1, 1, 2, 3, rng.choice((5, 12))))
-        own = [_slice(choices, number, not index, known) for index in range(count)]
+        known, count = Known(), 1 if maker.mode == LZMA else rng.choice((1, 1, 2, 3, rng.choice((5, 12))))
+        own = [maker.slice(number, not index, known) for index in range(count)]
         order = morton_order(np.concatenate([x.cells for x in own]))
         codes = np.concatenate([x.codes for x in own])[order]
-        choices.codes = np.concatenate([choices.codes + own[0].rises, codes])
         classes = np.concatenate([x.codes * 0 if x.classes is None else x.classes for x in own])[order]
-        choices.classes = np.concatenate([choices.classes, classes])
+        maker.codes = np.concatenate([maker.codes + own[0].rises, codes])
+        maker.classes = np.concatenate([maker.classes, classes])
         layers += own
-    if choices.mode == LZMA:
+    if maker.mode == LZMA:
         how = {"base": rng.choice((0, 0, None, K, -K, 1000)), "stream": rng.choice((lzma2.stored, lzma2.packed))}
         layers = [layer.packed(**how, width=rng.choice((None, 2))) for layer in layers]  # type: ignore[arg-type]
-    file = make_file(*layers, header=_header(choices, layers))
+    file = make_file(*layers, header=maker.header(layers))
     if rng.random() < 0.2:  # it ends after any slice
         whole = file.fields()[14]
         file = replace(file, chunks=file.chunks[: rng.randint(1, len(file.chunks))]).with_header({14: whole})
-    return _with_what_is_ignored(rng, file), choices.scene and not choices.bent
+    return _with_what_is_ignored(rng, file), maker.scene
 
 
 @cache
@@ -358,44 +422,20 @@ def numbered(index: int) -> File:
     return legal(random.Random(index))[0]
 
 
-def _header(choices: Choices, layers: Sequence[Layer]) -> dict[int, Any]:
-    rng = choices.rng
-    for i, row in enumerate(choices.table):  # centres and the rows before add to symbols
-        row[2] = _step(rng, [x.rows[i] for x in layers], most=M if choices.graded or row[3] else 1)
-    header: dict[int, Any] = {2: choices.mode, 3: choices.kind, 4: choices.table, 5: choices.centres}
-    header[6] = _step(rng, [x.cells for x in layers])
-    if rng.random() < 0.3:
-        box = sorted(rng.choice((-LARGEST, -1.0, -0.0, 2.0**-149, LARGEST)) for _ in range(2))
-        header |= {
-            7: [box[0]] * 3 + [box[1]] * 3,
-            8: [-LARGEST, LARGEST],
-            9: [0.0, 1.0, 2.0**-149],
-            10: [-0.0, LARGEST],
-        }
-        header |= {11: [LARGEST, -0.0, -LARGEST], 12: rng.choice((0.0, -0.0, LARGEST)), 14: rng.randbytes(16)}
-    if rng.random() < 0.3:
-        sides = {3: near(rng, 1, 65535), 4: near(rng, 1, 65535)}
-        header[13] = {1: [rng.choice((0.0, -LARGEST))] * 12, 2: [LEAST, LARGEST, -1.0, 0.0], **sides}
-    return header
-
-
 def _with_what_is_ignored(rng: random.Random, file: File) -> File:
     """Ancillary chunks, keys from 64 on, a minor version."""
     extra = [0, -1, 2**64 - 1, -(2**63), True, 0.5, "é", b"\xff" * 40, [], {}, {64: [{}]}]
     if rng.random() < 0.3:
-        keys = {rng.choice((64, 255, 65536, 2**32 - 1)): rng.choice(extra) for _ in range(3)}
-        file = file.with_header(dict(sorted(keys.items())))
+        file = file.with_header({rng.choice((64, 255, 65536, 2**32 - 1)): rng.choice(extra) for _ in range(3)})
     if rng.random() < 0.3:
         file = replace(file, minor=near(rng, 0, 65535))
-    chunks = list(file.chunks)
     if rng.random() < 0.3:
-        at = rng.randrange(len(chunks))
-        layer = chunks[at].layer
-        assert layer is not None
+        at = rng.randrange(len(file.chunks))
+        layer = file.layer(at)
         packed = pack({**layer.parameters(), rng.choice((64, 70000)): rng.choice(extra)})
-        chunks[at] = replace(chunks[at], payload=layer.payload(packed))
+        file = file.with_chunk(at, payload=layer.payload(packed))
+    chunks = list(file.chunks)
     while rng.random() < 0.3:
         kind, size = rng.choice((3, 4, 1 << 15, 65535, rng.randint(3, 65535))), rng.choice((0, 1, 30, 500))
-        made = ancillary(kind, rng.randbytes(size))
-        chunks.insert(rng.randint(1, len(chunks)), made)
+        chunks.insert(rng.randint(1, len(chunks)), ancillary(kind, rng.randbytes(size)))
     return replace(file, chunks=tuple(chunks))

@@ -16,7 +16,7 @@ from typing import Any
 
 import refdec
 from vectors.blocks import Chunk as Framed
-from vectors.blocks import pack, preamble, scene_id_of, varint
+from vectors.blocks import File, pack, varint
 
 from .legal import Seed, legal
 
@@ -210,16 +210,11 @@ def take_apart(data: bytes) -> Parts:
 def put_together(parts: Parts, header: bytes | None = None) -> bytes:
     """The file of `parts`, or with other bytes for a header, which may be none. ValueError if a value has no canonical
     form."""
+    fields = {14: None} | {key: value for key, value in parts.header.items() if key != 1}
     try:
-        payloads = [chunk.packed() for chunk in parts.chunks]
-        rows = [[chunk.type, len(payload)] for chunk, payload in zip(parts.chunks, payloads, strict=True)]
-        fields = {**parts.header, 1: rows}
-        header = pack(fields) if header is None else header
+        return File(tuple(Framed(c.type, c.packed(), c.flags) for c in parts.chunks), fields, header).data()
     except (struct.error, IndexError, TypeError) as error:
         raise ValueError("a value without a form") from error
-    scene_id = scene_id_of(header, fields)
-    framed = [Framed(c.type, p, c.flags).frame(scene_id) for c, p in zip(parts.chunks, payloads, strict=True)]
-    return b"".join([preamble(header), *framed])
 
 
 def _slice(rng: random.Random, parts: Parts) -> Chunk | None:

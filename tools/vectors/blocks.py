@@ -15,7 +15,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -357,8 +357,8 @@ class Layer:
     """A slice of a layer: what it means, and its parameters, codes and stream as they are written.
 
     rows, layer_rows: symbols [C, n] and [C, earlier rows + n] of each tensor. earlier: step classes of the earlier rows
-    in a first slice. planes: samples. chains: weights and biases. meta: the parameters but that of the codes' length.
-    tree: instead of the octree of the cells. pieces: of the codes, by what they code.
+    in a first slice. chains: weights and biases. meta: the parameters but that of the codes' length. tree: head and
+    channels instead of those of the cells' octree. pieces: of the codes, by what they code.
     """
 
     number: int
@@ -369,8 +369,7 @@ class Layer:
     earlier: np.ndarray
     rows: list[np.ndarray]
     layer_rows: list[np.ndarray]
-    planes: list[np.ndarray]
-    predictors: list[int]
+    grids: Sequence[Grid]
     chains: list[np.ndarray]
     meta: dict[int, Any]
     choose: Choice
@@ -378,58 +377,57 @@ class Layer:
     pieces: dict[str, bytes] = field(default_factory=dict)
     stream: bytes = b""
 
-    @property
+    @cached_property
+    def planes(self) -> list[np.ndarray]:
+        """Samples int32 [C, H, W] of all grids."""
+        return [plane for grid in self.grids for plane in grid.planes()]
+
+    @cached_property
     def residuals(self) -> list[np.ndarray]:
-        """Of the planes."""
-        return [residual(p, k) for p, k in zip(self.predictors, self.planes, strict=True)]
+        """int64, of the planes."""
+        return [residual(p, k) for p, k in zip((p for g in self.grids for p in g.row()[3]), self.planes, strict=True)]
+
+    def channels(self) -> dict[str, list[np.ndarray]]:
+        """None split, by piece."""
+        return {
+            "rises": [self.rises],
+            "masks": [self.codes],
+            "classes": [] if self.classes is None else [self.classes],
+            "rows": [channel for tensor in self.rows for channel in tensor],
+            "layer_rows": [channel for tensor in self.layer_rows for channel in tensor],
+            "grids": [channel for e in self.residuals for channel in e],
+            "chains": self.chains,
+        }
 
     def written(self, known: Known | None = None) -> Layer:
         """With its codes and its stream in mode ans. known: the prior lists of the slices before, which it extends."""
-        known = Known() if known is None else known
-        known[2].clear()
-        coder, pieces, classes = Coder(known, self.choose), dict[str, bytes](), self.classes
-        if len(self.cells):
-            head, channels = self.tree or octree(self.cells)
-            pieces["positions"] = head + coder.codes(0, "positions", channels)
-        rows = [[channel for tensor in own for channel in tensor] for own in (self.rows, self.layer_rows)]
-        if classes is not None:
-            split = zip(rows, (classes, np.append(self.earlier, classes)), strict=True)
-            rows = [[channel[c == q] for channel in own for q in range(7)] for own, c in split]
-        pieces["rises"] = coder.codes(1, "rises", [self.rises])
-        pieces["masks"] = coder.codes(1, "masks", [self.codes])
-        pieces["classes"] = coder.codes(1, "classes", [] if classes is None else [classes])
-        pieces["rows"] = coder.codes(1, "rows", rows[0])
-        pieces["layer_rows"] = coder.codes(1, "layer_rows", rows[1])
-        pieces["grids"] = coder.codes(2, "grids", grid_channels(self.residuals))
-        pieces["chains"] = coder.codes(2, "chains", self.chains)
+        coder = Coder(Known() if known is None else known, self.choose)
+        coder.known[2].clear()
+        head, channels = (b"", []) if not len(self.cells) else self.tree or octree(self.cells)
+        pieces = {"positions": head + coder.codes(0, "positions", channels)}
+        for piece, channels in self.channels().items():
+            if piece == "grids":
+                channels = [*grid_channels(self.residuals)]
+            elif self.classes is not None and piece.endswith("rows"):
+                classes = np.append(self.earlier, self.classes) if piece == "layer_rows" else self.classes
+                channels = [channel[classes == q] for channel in channels for q in range(7)]
+            pieces[piece] = coder.codes(2 if piece in ("grids", "chains") else 1, piece, channels)
         return replace(self, pieces=pieces, stream=coder.stream())
-
-    def channels(self) -> list[np.ndarray]:
-        """Those of mode lzma."""
-        cells = np.diff(self.cells.astype(np.int64), axis=0, prepend=0).T if len(self.cells) else []
-        planes = [channel for e in self.residuals for channel in e]
-        rows = [channel for tensor in (*self.rows, *self.layer_rows) for channel in tensor]
-        return [
-            *cells,
-            self.rises,
-            self.codes,
-            *([] if self.classes is None else [self.classes]),
-            *rows,
-            *planes,
-            *self.chains,
-        ]
 
     def packed(
         self,
         stream: Callable[[bytes], bytes] = lzma2.packed,
         base: int | None = 0,
         width: int | None = None,
-        channels: Sequence[np.ndarray] | None = None,
+        cells: np.ndarray | None = None,
     ) -> Layer:
         """With its codes and its stream in mode lzma. base: of all channels; None takes the first symbol of each.
-        width: log2 of the bytes of every number; None takes the narrowest. channels: other ones."""
+        width: log2 of the bytes of every number; None takes the narrowest. cells: others, int64."""
         codes, data = b"", b""
-        for channel in self.channels() if channels is None else channels:
+        differences = np.diff(
+            self.cells.astype(np.int64) if cells is None else cells, axis=0, prepend=0 * self.cells[:1]
+        )
+        for channel in itertools.chain(differences.T, *self.channels().values()):
             k = channel.ravel().astype(np.int64)
             if k.size:
                 own = int(k[0]) if base is None else base
@@ -455,23 +453,12 @@ class Layer:
         form = 2 if size - bare - 3 < 1 << 8 else 3
         return self.payload(pack({**self.parameters(), 64: bytes(size - bare - 1 - form)}))
 
-    def with_pieces(self, **pieces: bytes) -> Layer:
-        """With other bytes in some pieces of the codes."""
-        return replace(self, pieces={**self.pieces, **pieces})
-
-    def with_meta(self, fields: Mapping[int, Any]) -> Layer:
-        """With other parameters; None takes one out."""
-        return replace(self, meta={k: v for k, v in {**self.meta, **fields}.items() if v is not None})
-
 
 def constant_chain(widths: Sequence[int], symbol: int) -> list[np.ndarray]:
     """weight, bias, weight, ..; each of one symbol of its own, such that Gaussians can be seen. widths: from the input
     on."""
-    return [
-        array
-        for i, (wide, out) in enumerate(itertools.pairwise(widths))
-        for array in (np.full((out, wide), symbol + i, np.int32), np.full(out, symbol + i + 38, np.int32))
-    ]
+    shapes = ((shape, i) for i, pair in enumerate(itertools.pairwise(widths)) for shape in (pair[::-1], pair[1:]))
+    return [np.full(shape, symbol + i + 38 * (len(shape) == 1), np.int32) for shape, i in shapes]
 
 
 def line(n: int, z: int = 0) -> list[list[int]]:
@@ -497,7 +484,7 @@ def make_layer(
     widths: Sequence[int] = (2, 6, 3),
     classes: Sequence[int] | None = None,
     earlier: Sequence[int] = (),
-    layer_rows: Sequence[np.ndarray] = (),
+    layer_rows: Mapping[int, np.ndarray] = {},  # noqa: B006  (never changed)
     grids: Sequence[Grid] = (),
     chains: Mapping[int, Any] | None = None,
     kind: list[int] | None = None,
@@ -506,62 +493,51 @@ def make_layer(
     priors: Mapping[str, Mapping[int, Prior]] | Choice = {},  # noqa: B006  (never changed)
     tree: tuple[bytes, list[np.ndarray]] | None = None,
     known: Known | None = None,
+    first: bool = True,
 ) -> Layer:
     """A slice of `cells` (in Morton order) after `before` earlier rows. below: plane channels of the layers below.
 
     Defaults: every rise 0, every code 77, rows all 2; in layer 0 the networks of a scaffold without hidden layers,
-    elsewhere a trunk and the head 1 if there are `grids`. rows: int32 [sum of widths, n]. chains: widths by id, or weight,
-    bias, weight, .. steps: of grids and of chains.
+    elsewhere a trunk and the head 1 if there are `grids`. rows: int32 [sum of widths, n]. layer_rows: int32 [C, earlier
+    rows + n] by id. chains: widths by id, or weight, bias, weight, .. steps: of grids and of chains.
     """
-    n, slots = len(cells), max(1, widths[-1] // 3)
+    n, features = len(cells), below + sum(grid.channels for grid in grids)
     if chains is None:
-        features = below + sum(grid.channels for grid in grids)
         chains = {0: (features, 3), 1: (3, 3)} if grids else {}
-        if number == 0:
-            chains = {i: (widths[0], outputs * slots) for i, outputs in enumerate((1, 7, 3))}
-    if number and grids and kind is None:
-        kind = [0]
-    symbols = itertools.accumulate([2, *(len(own) - 1 for own in chains.values())])  # a symbol of its own per array
-    made = {
-        i: constant_chain(own, s) if isinstance(own, tuple) else own for (i, own), s in zip(chains.items(), symbols)
-    }  # noqa: B905
-    meta: dict[int, Any] = {1: n}
-    if fill is not None:
-        meta[3] = fill
-    if grids:
-        meta[4] = [steps[0], *(grid.row() for grid in grids)]
-    if made:
-        meta[5] = [steps[1], *([i, own[0].shape[1], *(len(bias) for bias in own[1::2])] for i, own in made.items())]
-    if kind is not None:
-        meta[6] = kind
-    if layer_rows and chains is not LATER:
-        meta[7] = [[i, len(k), 2.0**-5, i % 2] for i, k in enumerate(layer_rows)]
-    rows = np.full((sum(widths), n), 2, np.int32) if rows is None else np.asarray(rows)
-    planes = [plane for grid in grids for plane in grid.planes()]
+        if number == 0 and first:
+            chains = {i: (widths[0], outputs * max(1, widths[-1] // 3)) for i, outputs in enumerate((1, 7, 3))}
+    symbol, made = 2, dict[int, list[np.ndarray]]()
+    for i, own in chains.items():
+        made[i] = constant_chain(own, symbol) if isinstance(own, tuple) else own
+        symbol += len(own) - 1
+    meta: dict[int, Any] = {
+        1: n,
+        3: fill,
+        4: [steps[0], *(grid.row() for grid in grids)] if grids else None,
+        5: [steps[1], *([i, own[0].shape[1], *map(len, own[1::2])] for i, own in made.items())] if made else None,
+        6: [0] if number and grids and kind is None else kind,
+        7: [[i, len(k), 2.0**-5, i % 2] for i, k in layer_rows.items()] if first and layer_rows else None,
+    }
     return Layer(
-        number=number,
-        cells=np.array(cells, np.int32).reshape(-1, 3),
-        rises=np.array([0] * before if rises is None else rises, np.int32),
-        codes=np.array([77] * n if codes is None else codes, np.int32),
-        classes=None if classes is None else np.array(classes, np.int32),
-        earlier=np.array(earlier, np.int32),
-        rows=np.split(rows, np.cumsum(widths)[:-1]),
-        layer_rows=list(layer_rows),
-        planes=planes,
-        predictors=[p for grid in grids for p in grid.row()[3]][: len(planes)],
-        chains=[array for own in made.values() for array in own],
-        meta=meta,
-        choose=priors if callable(priors) else named(priors),
-        tree=tree,
+        number,
+        np.array(cells, np.int32).reshape(-1, 3),
+        np.array([0] * before if rises is None else rises, np.int32),
+        np.array([77] * n if codes is None else codes, np.int32),
+        None if classes is None else np.array(classes, np.int32),
+        np.array(earlier, np.int32),
+        np.split(np.full((sum(widths), n), 2, np.int32) if rows is None else np.asarray(rows), np.cumsum(widths)[:-1]),
+        list(layer_rows.values()),
+        grids,
+        [array for own in made.values() for array in own],
+        {key: value for key, value in meta.items() if value is not None},
+        priors if callable(priors) else named(priors),
+        tree,
     ).written(known)
-
-
-LATER: dict[int, Any] = {}  #: the chains of a slice after the first
 
 
 def later(number: int, cells: Sequence[Sequence[int]], **fields: Any) -> Layer:
     """A slice after the first of its layer."""
-    return make_layer(number, ordered(cells), **{"chains": LATER, **fields})
+    return make_layer(number, ordered(cells), first=False, **fields)
 
 
 # -- files (clause 3) --------------------------------------------------------------------------------------------------
@@ -629,13 +605,18 @@ class File:
     @property
     def scene_id(self) -> bytes:
         """Clause 3.3, of the header as it is written. Where its chunk list is not there, of all its bytes."""
-        return scene_id_of(self.header_bytes(), self.fields())
+        header, fields = self.header_bytes(), self.fields()
+        chunk_list = pack(1) + pack(fields[1]) if 1 in fields else header
+        described = header[header.find(chunk_list) + len(chunk_list) :] if chunk_list in header else header
+        return hashlib.sha256(described).digest()[:8]
 
     def data(self) -> bytes:
         """Its bytes."""
-        frames = b"".join(c.frame(self.scene_id) for c in self.chunks)
-        front = preamble(self.header_bytes(), self.declared, self.signature, self.major, self.minor, self.crc)
-        return front + frames + self.tail
+        header, scene_id = self.header_bytes(), self.scene_id
+        declared = len(header) if self.declared is None else self.declared
+        front = struct.pack("<8sHHI", self.signature, self.major, self.minor, declared)
+        crc = zlib.crc32(header, zlib.crc32(front)) ^ self.crc
+        return front + struct.pack("<I", crc) + header + b"".join(c.frame(scene_id) for c in self.chunks) + self.tail
 
     def with_header(self, fields: Mapping[int, Any]) -> File:
         """With other fields in the header; the value None takes one out."""
@@ -647,44 +628,20 @@ class File:
         chunks[index] = replace(chunks[index], **fields)
         return replace(self, chunks=tuple(chunks))
 
-    def with_layer(self, index: int, layer: Layer, meaning: bool = False) -> File:
-        """With other bytes for a slice, which mean what they did, or what `layer` says."""
-        return self.with_chunk(index, payload=layer.payload(), **({"layer": layer} if meaning else {}))
-
     def layer(self, index: int) -> Layer:
         """The meaning of a layer's chunk."""
         layer = self.chunks[index].layer
         assert layer is not None
         return layer
 
-    def slices(self, chunks: int | None = None) -> list[int]:
-        """The layer of each slice among the first `chunks` chunks."""
-        return [c.layer.number for c in self.chunks[:chunks] if c.layer is not None]
+    def slices(self, chunks: int | None = None) -> list[Layer]:
+        """Those among the first `chunks` chunks."""
+        return [c.layer for c in self.chunks[:chunks] if c.layer is not None]
 
     def hashes(self, chunks: int | None = None) -> list[dict[str, Any]]:
         """Clause 12.4 of the layers among the first `chunks` chunks, from what they mean."""
-        layers = [c.layer for c in self.chunks[:chunks] if c.layer is not None]
-        return [_hashes(list(own), self.fields()) for _, own in itertools.groupby(layers, key=lambda x: x.number)]
-
-
-def preamble(
-    header: bytes,
-    declared: int | None = None,
-    signature: bytes = SIGNATURE,
-    major: int = MAJOR,
-    minor: int = 0,
-    crc: int = 0,
-) -> bytes:
-    """The file's bytes up to the first chunk."""
-    front = struct.pack("<8sHHI", signature, major, minor, len(header) if declared is None else declared)
-    return front + struct.pack("<I", zlib.crc32(header, zlib.crc32(front)) ^ crc) + header
-
-
-def scene_id_of(header: bytes, fields: Mapping[int, Any]) -> bytes:
-    """fields: what the header says. Where its chunk list is not there, of all its bytes."""
-    chunk_list = pack(1) + pack(fields[1]) if 1 in fields else header
-    described = header[header.find(chunk_list) + len(chunk_list) :] if chunk_list in header else header
-    return hashlib.sha256(described).digest()[:8]
+        groups = itertools.groupby(self.slices(chunks), key=lambda x: x.number)
+        return [_hashes(list(own), self.fields()) for _, own in groups]
 
 
 def make_file(*layers: Layer, header: Mapping[int, Any] | None = None) -> File:
@@ -744,24 +701,3 @@ def _hashes(slices: list[Layer], header: Mapping[int, Any]) -> dict[str, Any]:
     return {"layer": first.number} | {
         name: hashlib.sha256(b"".join(a.astype(form).tobytes() for a in own)).hexdigest() for name, form, own in forms
     }
-
-
-# -- vectors -----------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Vector:
-    """One file of spec/vectors. layers: the hashes of all layers that decode. error: a name of clause 15, None for a
-    valid file. chunk, offset: of the fault, if it lies in a chunk and at a field that the frame fixes. slices: the
-    layer of each slice that decodes. scene: the error of clause 13 where the tensors make no scene."""
-
-    name: str
-    what: str
-    clauses: tuple[str, ...]
-    data: bytes
-    layers: list[dict[str, Any]]
-    slices: list[int]
-    error: str | None = None
-    chunk: int | None = None
-    offset: int | None = None
-    scene: str | None = None

@@ -31,6 +31,7 @@ whose tensors decode. `for a: x | b: y` writes the line once for each name and v
 from __future__ import annotations
 
 import copy
+import hashlib
 import itertools
 import re
 from collections.abc import Iterator
@@ -41,7 +42,21 @@ from typing import Any
 import numpy as np
 
 from . import blocks, lzma2
-from .blocks import LZMA, File, Grid, Layer, Prior, Vector, constant, later, line, make_file, make_layer, pack, pattern
+from .blocks import (
+    LZMA,
+    File,
+    Grid,
+    Layer,
+    Prior,
+    constant,
+    later,
+    line,
+    make_file,
+    make_layer,
+    pack,
+    pattern,
+    slices_of,
+)
 
 TABLE = Path(__file__).with_name("table.txt")
 M, K, ROWS = 1 << 23, 1 << 24, 40
@@ -54,8 +69,8 @@ PREAMBLE = {"signature": 0, "major": 8, "declared": 12, "crc": 16}
 # -- the table ---------------------------------------------------------------------------------------------------------
 
 
-def vectors() -> Iterator[Vector]:
-    """All vectors, in the order of the table."""
+def vectors() -> Iterator[tuple[dict[str, Any], bytes]]:
+    """The entry in the manifest and the bytes of all vectors, in the order of the table."""
     names: dict[str, Any] = {**vars(blocks), **globals()}
     bases: dict[str, File] = {}
     group = ("", "", "", "")
@@ -89,7 +104,7 @@ def _lines() -> Iterator[str]:
                 yield head.replace("{i}", name).replace("{x}", patch)
 
 
-def _vector(text: str, folder: str, base: File, clauses: str, error: str | None, names: dict[str, Any]) -> Vector:
+def _vector(text: str, folder: str, base: File, clauses: str, error: str | None, names: dict[str, Any]) -> Any:
     text, _, what = text.partition("  # ")
     name, patches, *options = re.split(r" {2,}", text.strip())
     target = scene = None
@@ -115,10 +130,23 @@ def _vector(text: str, folder: str, base: File, clauses: str, error: str | None,
     elif at is not None and chunk is not None:
         at += file.start(chunk)
     count = None if error is None or target == "end" else chunk or 0
-    sentence = what or f"{name.replace('-', ' ').capitalize()}: {patches}"
-    layers, slices = file.hashes(count), file.slices(count)
-    place = (chunk, at) if error else (None, None)
-    return Vector(f"{folder}/{name}", sentence, tuple(clauses.split()), data, layers, slices, error, *place, scene)
+    layers, slices = file.hashes(count), [x.number for x in file.slices()]
+    row: dict[str, Any] = {
+        "file": f"{folder}/{name}.pd4",
+        "what": what or f"{name.replace('-', ' ').capitalize()}: {patches}",
+        "clauses": clauses.split(),
+        "size": len(data),
+        "sha256": hashlib.sha256(data).hexdigest(),
+        "error": error,
+        "clause": error and clauses.split()[0],
+        "chunk": chunk if error else None,
+        "offset": at if error else None,
+        "scene": scene,
+        "ans_only": "UnsupportedFeature" if file.fields().get(2) == LZMA else "same",
+        "slices": slices[: len(file.slices(count))] if len(slices) > len(set(slices)) else None,
+    }
+    row = {key: value for key, value in row.items() if value is not None}
+    return row | ({"prefix": layers[-1]["layer"] if layers else None} if error else {}) | {"layers": layers}, data
 
 
 def _patched(file: File, patch: str, edits: list[Any], names: dict[str, Any]) -> tuple[File, Any]:
@@ -155,7 +183,7 @@ def _patched(file: File, patch: str, edits: list[Any], names: dict[str, Any]) ->
         return file.with_chunk(number, payload=value(file.chunks[number].payload)), (number, None)
     layer, packed = file.layer(number), None
     if target == "codes":
-        layer = layer.with_pieces(**{keys[0]: value(layer.pieces.get(keys[0]))})
+        layer = replace(layer, pieces={**layer.pieces, keys[0]: value(layer.pieces.get(keys[0]))})
     elif target == "stream":
         layer = replace(layer, stream=value(layer.stream))
     elif op == "=":
@@ -232,11 +260,6 @@ def deformed(*grids: Grid, number: int = 1, **fields: Any) -> File:
     return make_file(make_layer(), make_layer(number, (), before=1, grids=grids, **fields))
 
 
-def with_meta(file: File, chunk: int, fields: dict[int, Any], **pieces: bytes) -> File:
-    """With other parameters (None takes one out) and pieces of the codes in one slice."""
-    return file.with_layer(chunk, file.layer(chunk).with_meta(fields).with_pieces(**pieces))
-
-
 def take(file: File, *order: int) -> File:
     """Some chunks of a file in some order, with the header's digest of the whole file."""
     return replace(file, chunks=tuple(file.chunks[i] for i in order)).with_header({14: file.fields()[14]})
@@ -273,7 +296,7 @@ def entries_of_slices(over: int) -> File:
     first = make_layer(0, line(1), widths=WIDE, rows=np.zeros((68, 1), np.int32), priors={"rows": {
         c: Prior(min(c, 15) - 20, 1 << 14) for c in range(68)}})  # fmt: skip
     wide = Prior(-20, (1 << 10) + 72 + over)
-    return blocks.slices_of(first, later(0, line(1, z=4), widths=WIDE, rows=np.ones((68, 1), np.int32),
+    return slices_of(first, later(0, line(1, z=4), widths=WIDE, rows=np.ones((68, 1), np.int32),
         codes=[3], priors=lambda *_: wide))  # fmt: skip
 
 
@@ -344,11 +367,11 @@ def lzma_file(*layers: Layer, **how: Any) -> File:
 
 def every_chunk(data: bytes) -> bytes:
     """An LZMA2 stream with chunks of every control byte."""
-    properties = [lzma2.Properties(*p) for p in ((3, 0, 2), (0, 4, 0), (2, 1, 3), (1, 3, 1))]
+    properties = [(3, 0, 2), (0, 4, 0), (2, 1, 3), (1, 3, 1)]
     controls = [0xE0, 0x80, 2, 0x80, 0xA0, 0xC0, 2, 2, 0xA0, 0xE0, 0x80, 1, 2, 0xC0, 0x80]
     sizes = [211 + 7 * i for i in range(len(controls) - 1)]
     plan = list(zip(controls, [*sizes, len(data) - sum(sizes)], strict=True))
-    return lzma2.chunks(data, plan, properties, every_repeat=True)
+    return lzma2.chunks(data, plan, properties)
 
 
 def lzma_text() -> Layer:

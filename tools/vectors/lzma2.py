@@ -3,30 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 STORED_MAX = 1 << 16  #: bytes in one stored chunk
-PACKED_MAX = 1 << 21  #: bytes that one compressed chunk may unpack to
 MATCH_MAX = 273
-_KEY = 4  # bytes of the shortest match with a distance of its own
+KEY = 4  #: bytes of the shortest match with a distance of its own
 #: Control bytes (clause 9.3); a compressed chunk's has the upper bits of its size added.
 STORED_RESET, STORED, KEPT, STATE, PROPERTIES_READ, ALL_RESET = 1, 2, 0x80, 0xA0, 0xC0, 0xE0
-
-
-@dataclass(frozen=True)
-class Properties:
-    """lc: bits of the byte before that choose a literal's probabilities. lp, pb: bits of the position that choose those
-    of literals and of matches."""
-
-    lc: int = 3
-    lp: int = 0
-    pb: int = 0
-
-    @property
-    def code(self) -> int:
-        """As they stand in one byte."""
-        return self.lc + 9 * (self.lp + 5 * self.pb)
+Properties = tuple[int, int, int]  #: lc, lp, pb
 
 
 def stored(data: bytes) -> bytes:
@@ -35,9 +19,9 @@ def stored(data: bytes) -> bytes:
     return chunks(data, [(STORED if i else STORED_RESET, size) for i, size in enumerate(sizes)])
 
 
-def packed(data: bytes, lc: int = 3, lp: int = 0, pb: int = 0, **how: Any) -> bytes:
+def packed(data: bytes, properties: Properties = (3, 0, 0), **how: Any) -> bytes:
     """A stream of one compressed chunk: literals and matches. how: see chunks."""
-    return chunks(data, [(ALL_RESET, len(data))], [Properties(lc, lp, pb)], **how)
+    return chunks(data, [(ALL_RESET, len(data))], [properties], **how)
 
 
 def chunks(
@@ -45,46 +29,41 @@ def chunks(
     plan: Sequence[tuple[int, int]],
     properties: Sequence[Properties] = (),
     *,
-    every_repeat: bool = False,
     remember: bool = False,
     body: Callable[[bytes], bytes] = lambda packed: packed,
 ) -> bytes:
     """A stream of `data` in chunks. plan: control byte and unpacked size of each. properties: of those chunks that hold
-    them, in order. every_repeat: use all four last distances, and matches of one byte. remember: match what lies before
-    a reset of the dictionary, which is wrong. body: changes the packed bytes of each compressed chunk."""
-    out, encoder, start, given = bytearray(), _Encoder(data, every_repeat), 0, iter(properties)
+    them, in order. remember: match what lies before a reset of the dictionary, which is wrong. body: changes the packed
+    bytes of each compressed chunk."""
+    out, encoder, start, given = bytearray(), _Encoder(data), 0, iter(properties)
     for control, size in plan:
         head = (size - 1 & 0xFFFF).to_bytes(2, "big")
         if control in (STORED_RESET, ALL_RESET):
             encoder.origin = start
             encoder.reach = 0 if remember else start
         if control < KEPT:
-            assert 0 < size <= STORED_MAX
             out += bytes([control]) + head + data[start : start + size]
         else:
-            assert 0 < size <= PACKED_MAX
             if control >= PROPERTIES_READ:
-                encoder.properties = next(given)
+                encoder.lc, encoder.lp, encoder.pb = next(given)
             if control >= STATE:
                 encoder.reset()
             written = body(encoder.encode(start, start + size))
-            out += bytes([control | size - 1 >> 16]) + head + (len(written) - 1).to_bytes(2, "big")
-            out += (bytes([encoder.properties.code]) if control >= PROPERTIES_READ else b"") + written
+            code = [encoder.lc + 9 * (encoder.lp + 5 * encoder.pb)] if control >= PROPERTIES_READ else []
+            out += (
+                bytes([control | size - 1 >> 16]) + head + (len(written) - 1).to_bytes(2, "big") + bytes(code) + written
+            )
         start += size
     return bytes(out) + b"\0"
 
 
 class _Encoder:
-    """LZMA's range coder with adaptive bits, as the public LZMA specification has it, and a greedy choice of matches.
+    """LZMA's range coder with adaptive bits, as the public LZMA specification has it, and a greedy choice of matches: the
+    longest of those at the last four distances, at distance 1 and at the latest place of the same bytes."""
 
-    A match is the longest of those at the distance of the match before, at distance 1 and at the latest place of the
-    same bytes; with every_repeat also of those at the three distances before.
-    """
-
-    def __init__(self, data: bytes, every_repeat: bool) -> None:
-        self._data, self._every_repeat = data, every_repeat
-        self._latest: dict[bytes, int] = {}
-        self.origin, self.reach, self.properties = 0, 0, Properties()
+    def __init__(self, data: bytes) -> None:
+        self._data, self._latest = data, dict[bytes, int]()
+        self.origin = self.reach = self.lc = self.lp = self.pb = 0
         self.reset()
 
     def reset(self) -> None:
@@ -98,23 +77,18 @@ class _Encoder:
         self._cache, self._pending = 0, 1
         data, at = self._data, start
         while at < end:
-            key = data[at : at + _KEY]
-            repeats = self._distances if self._every_repeat else self._distances[:1]
-            lengths = {d: self._matching(at, d, end) for d in (*repeats, 1, at - self._latest.get(key, at))}
-            distance = max(lengths, key=lambda d: lengths[d])
-            size = lengths[distance]
-            which = repeats.index(distance) if distance in repeats else None
-            if size >= (_KEY if which is None else 2):
-                self._match(at, distance, which, size)
-            elif self._every_repeat and lengths[repeats[0]]:
-                size = 1
-                self._match(at, repeats[0], 0, 1)
+            key, last = data[at : at + KEY], self._distances
+            lengths = {d: self._matching(at, d, end) for d in (*last, 1, at - self._latest.get(key, at))}
+            distance = max(lengths, key=lengths.__getitem__)
+            if (size := lengths[distance]) < (2 if distance in last else KEY):
+                distance, size = last[0], min(1, lengths[last[0]])
+            if size:
+                self._match(at, distance, last.index(distance) if distance in last else None, size)
             else:
-                size = 1
-                self._put_literal(at)
-            for place in range(at, at + size):
-                self._latest[data[place : place + _KEY]] = place
-            at += size
+                self._literal(at)
+            for place in range(at, at + max(1, size)):
+                self._latest[data[place : place + KEY]] = place
+            at += max(1, size)
         for _ in range(5):
             self._shift()
         return bytes(self._out)
@@ -129,13 +103,9 @@ class _Encoder:
             return longest
         return next(size for size in range(longest) if here[size] != before[size])
 
-    def _low_bits(self, at: int) -> int:
-        """Those of the position that choose the probabilities of a match."""
-        return at - self.origin & (1 << self.properties.pb) - 1
-
     def _match(self, at: int, distance: int, which: int | None, size: int) -> None:
         """A match; which: of the last distances, None for a distance of its own."""
-        state, low = self._state, self._low_bits(at)
+        state, low = self._state, at - self.origin & (1 << self.pb) - 1
         self._bit(("match", state, low), 1)
         self._bit(("rep", state), which is not None)
         if which is None:
@@ -152,34 +122,27 @@ class _Encoder:
             if which > 1:
                 self._bit(("rep2", state), which > 2)
             self._distances.insert(0, self._distances.pop(which))
-        if size == 1:
-            self._state = 9 if state < 7 else 11
-            return
-        self._length("rep", size - 2, low)
-        self._state = 8 if state < 7 else 11
+        if size > 1:
+            self._length("rep", size - 2, low)
+        self._state = (8 if size > 1 else 9) if state < 7 else 11
 
-    def _put_literal(self, at: int) -> None:
-        state = self._state
-        self._bit(("match", state, self._low_bits(at)), 0)
-        self._literal(at, self._distances[0] if state >= 7 else 0)
-        self._state = 0 if state < 4 else state - (3 if state < 10 else 6)
-
-    def _literal(self, at: int, distance: int) -> None:
+    def _literal(self, at: int) -> None:
         """The byte at `at`; behind a match, given the byte that would have gone on with it."""
-        lc, lp, place = self.properties.lc, self.properties.lp, at - self.origin
+        state, place = self._state, at - self.origin
+        self._bit(("match", state, place & (1 << self.pb) - 1), 0)
         byte, before = self._data[at], self._data[at - 1] if place else 0
-        expected = self._data[at - distance]
-        symbol, offset = 1, 0x100 if distance else 0
+        expected, symbol, offset = self._data[at - self._distances[0]], 1, 0x100 if state >= 7 else 0
         for shift in range(7, -1, -1):
             bit, match = byte >> shift & 1, expected >> shift & 1
             branch = offset + (offset if match else 0)
-            self._bit(("literal", place & (1 << lp) - 1, before >> 8 - lc, branch + symbol), bit)
+            self._bit(("literal", place & (1 << self.lp) - 1, before >> 8 - self.lc, branch + symbol), bit)
             symbol = symbol << 1 | bit
             offset = offset if match == bit else 0
+        self._state = 0 if state < 4 else state - (3 if state < 10 else 6)
 
     def _length(self, kind: str, code: int, low: int) -> None:
         """Length - 2 in 0..271."""
-        group = 0 if code < 8 else 1 if code < 16 else 2
+        group = (code >= 8) + (code >= 16)
         self._bit((kind, "choice", 0), group > 0)
         if group:
             self._bit((kind, "choice", 1), group > 1)
@@ -190,16 +153,14 @@ class _Encoder:
         bits = max(code.bit_length() - 2, 0)  # below the two leading ones
         slot = code if code < 4 else 2 * (bits + 1) + (code >> bits & 1)
         self._tree(("slot", length_state), slot, range(5, -1, -1))
-        if code < 4:
-            return
-        if slot < 14:
+        if code >= 4 and slot < 14:
             self._tree(("distance", slot), code, range(bits))
-            return
-        for shift in range(bits - 1, 3, -1):
-            self._range >>= 1
-            self._low += self._range * (code >> shift & 1)
-            self._normalise()
-        self._tree(("align",), code, range(4))
+        elif code >= 4:
+            for shift in range(bits - 1, 3, -1):
+                self._range >>= 1
+                self._low += self._range * (code >> shift & 1)
+                self._normalise()
+            self._tree(("align",), code, range(4))
 
     def _tree(self, name: tuple, value: int, shifts: Iterable[int]) -> None:
         """The bits of `value` at these shifts, each by the probability that belongs to those before it."""
@@ -215,10 +176,9 @@ class _Encoder:
         if bit:
             self._low += bound
             self._range -= bound
-            self._probabilities[context] = p - (p >> 5)
         else:
             self._range = bound
-            self._probabilities[context] = p + ((1 << 11) - p >> 5)
+        self._probabilities[context] = p - (p >> 5) if bit else p + ((1 << 11) - p >> 5)
         self._normalise()
 
     def _normalise(self) -> None:
