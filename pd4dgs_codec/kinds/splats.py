@@ -17,7 +17,7 @@ from pd4dgs_codec.format.quantise import RowTable, dequantise
 from pd4dgs_codec.format.symbols import Growing
 from pd4dgs_codec.format.tables import Kind, Tables
 from pd4dgs_codec.kinds.tracks import Tracks, total, tracks_of
-from pd4dgs_codec.scene import MASK_STEP, MIN_OPACITY, Gaussians, Grading, LayeredScene, SceneInfo
+from pd4dgs_codec.scene import MASK_STEP, MIN_OPACITY, Gaussians, Grading, LayeredScene, SceneInfo, deformation_unit
 
 NUMBER, NAME = 1, "splats"
 
@@ -230,7 +230,8 @@ class Moving:
         if "scale" not in heads:
             self._rest = replace(self._rest, scales=self._rest.scales * mask[:, None])
         self._columns = np.asfortranarray(self._rest.quats)  # products of columns take half the time
-        self._tracks = {layer: own.of_rows(rows).by_columns() for layer, own in scene.tracks.items()}
+        places = scene.anchor_at(slice(None)) / deformation_unit(scene.info.box)
+        self._tracks = {layer: own.alone(places).of_rows(rows).by_columns() for layer, own in scene.tracks.items()}
 
     @np.errstate(all="ignore")
     def at(self, t: float) -> tuple[Splats, np.ndarray]:
