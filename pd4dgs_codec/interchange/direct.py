@@ -109,7 +109,7 @@ class Packer:
         return float(np.exp(np.mean(np.log(np.maximum(errors, 1e-12)))))
 
     def _scene(self, theta: float, error: float) -> splats.SplatScene:
-        grid = Grid.of(self.ordered.weights, self.ordered.channels, theta)
+        grid = self.ordered.grid(theta)
         packed = self.ordered.packed(grid)
         tensors, steps, centres = self._tensors(packed)
         places = (packed.cells + packed.tensors["offset"].astype(np.float64)) * packed.voxel_size
