@@ -901,11 +901,13 @@ def finish_last(layers):
 # 3.2 Chunks: "Bytes after the last chunk make the file Malformed."
 # 3.6 Slices: "Bit 1 MUST be 1 if the next layer chunk in the list is of the same layer, and 0 if it is of another one."
 # 12.1 Order: "A decoder of prefix ℓ stops after the last chunk of a layer ≤ ℓ in the list and reads no further."
-def decode(data, max_layer=2):
+def decode(data, max_layer=None):
     """The layers of a file's bytes, or of prefix max_layer, with cells, symbols and tensors."""
     header, scene_id, at = read_preamble(data)
     layers, declared, chunks = [], (0, 0, 0), header[1]
-    stop = len(chunks) if max_layer == 2 else 1 + max(i for i, (kind, _) in enumerate(chunks) if kind <= max_layer)
+    stop = len(chunks)
+    if max_layer is not None:
+        stop = 1 + max(i for i, (kind, _) in enumerate(chunks) if kind <= min(max_layer, 2))
     for i, (kind, size) in enumerate(chunks[:stop]):
         payload, flags, at = read_chunk(data, at, kind, size, scene_id)
         if kind < 3:
@@ -921,12 +923,12 @@ def decode(data, max_layer=2):
                 layers.append(read)
             finish_last(layers)
             declared = read.declared
-    need(max_layer < 2 or at == len(data), "bytes follow the last chunk")
+    need(max_layer is not None or at == len(data), "bytes follow the last chunk")
     return layers
 
 
 # 12.4 Hashes: "two SHA-256 digests per layer, of its decoded slices with the rows of 12.2"
-def hashes(data, max_layer=2):
+def hashes(data, max_layer=None):
     rows = []
     for layer in decode(data, max_layer):
         symbols, tensors = hashlib.sha256(), hashlib.sha256()

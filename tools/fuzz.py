@@ -6,11 +6,11 @@
     python tools/fuzz.py --seed 7 --input 4711                  # one input again, with its recipe
 
 One of five inputs is a legal file of random choices near the limits, which every decoder must accept with the hashes
-that its writer says. Of the others, three of five have their fields, sections, tokens or bytes changed and then right
+that its writer says. Of the others, three of five have their fields, tables, codes or bytes changed and then right
 lengths, CRC-32 and scene id, and two keep the CRCs of before. Input i of a run over the same files is the same on every
 machine. A crash, an exception that is no DecodeError, too much time or memory, damage that decodes, and a decoder that
-accepts what another refuses or yields other hashes are findings; they are saved in --out, and the exit code is 1.
-Ctrl-C ends the run with what was found.
+accepts what another refuses, yields other hashes or makes a scene where another makes none are findings; they are saved
+in --out, and the exit code is 1. Ctrl-C ends the run with what was found.
 """
 
 from __future__ import annotations

@@ -131,7 +131,9 @@ def _scene_info(
     near, far = (float(np.float32(x)) for x in (near, far))
     fitting, others = held_out(cameras, HOLDOUT)
     judges = [(camera, model.nearest((i + 0.5) * GOLDEN % 1.0)) for i, camera in enumerate(others or fitting)]
-    front = max(cameras, key=lambda camera: float(camera.viewmat[2, 2]))  # the dome has one in the usual direction
+    axis = np.asarray(up or level)  # the default camera looks in the usual direction, a little downwards
+    ahead = np.array([0.0, 0.0, 1.0]) - 0.3 * axis / max(float(np.linalg.norm(axis)), 1e-12)
+    front = max(cameras, key=lambda camera: float(camera.viewmat[2, :3] @ ahead))
     return SceneInfo(1.0, box, times, behind, near, far, up or level, 0.0, front), fitting, judges
 
 

@@ -29,9 +29,6 @@ OPTIONAL = ("harmonics", "window")
 MAX_DEGREE = 3
 #: Y_0, a constant: the factor between a colour and its first coefficient.
 SH_C0 = 0.28209479177387814
-#: Y, Co, Cg -> red, green, blue.
-RGB = np.array([[1, 1, -1], [1, 0, 1], [1, -1, -1]], np.float32)
-
 
 # -- Gaussians at an instant -------------------------------------------------------------------------------------------
 
@@ -122,13 +119,19 @@ def harmonics(directions: np.ndarray, degree: int) -> np.ndarray:
     return np.moveaxis(np.stack(rows).astype(directions.dtype, copy=False), 0, -1)
 
 
+def rgb(channels: np.ndarray) -> np.ndarray:
+    """Returns red, green and blue of Y, Co and Cg, both [..., 3, n]."""
+    y, co, cg = np.moveaxis(channels, -2, 0)
+    return np.stack([y - cg + co, y + cg, y - cg - co], axis=-2)
+
+
 def splats_of(tensors: Mapping[str, np.ndarray]) -> Splats:
     """Returns the Gaussians of tensors [n, C] by the names of TENSORS, with "position" instead of "offset" and no
     window."""
     xyz, color = tensors["rotation"], tensors["color"]
     w = np.sqrt(np.maximum(1 - np.square(xyz).sum(axis=1, keepdims=True), 0))
     channels = np.concatenate([color.T, tensors["harmonics"].T]) if "harmonics" in tensors else color.T
-    sh = RGB.astype(color.dtype) @ channels.reshape(len(channels) // 3, 3, len(xyz))
+    sh = rgb(channels.reshape(len(channels) // 3, 3, len(xyz)))
     return Splats(
         means=np.ascontiguousarray(tensors["position"], np.float32),
         quats=_rotations(np.concatenate([w, xyz], axis=1)).astype(np.float32),
@@ -229,7 +232,8 @@ class Moving:
             self._window = centre.copy(), half.copy(), np.exp(log)
         if "scale" not in heads:
             self._rest = replace(self._rest, scales=self._rest.scales * mask[:, None])
-        self._columns = np.asfortranarray(self._rest.quats)  # products of columns take half the time
+        columns = {name: np.asfortranarray(getattr(self._rest, name)) for name in ("means", "quats") if heads}
+        self._rest = replace(self._rest, **columns)  # in the order in memory of what is added to them
         places = scene.anchor_at(slice(None)) / deformation_unit(scene.info.box)
         self._tracks = {layer: own.alone(places).of_rows(rows).by_columns() for layer, own in scene.tracks.items()}
 
@@ -248,16 +252,15 @@ class Moving:
         if "rotation" in added:
             turn = added["rotation"]
             turn[:, 0] += 1
-            changed["quats"] = _rotations(product(turn, self._columns))
+            changed["quats"] = _rotations(product(turn, rest.quats))
         if "scale" in added:
             changed["scales"] = np.exp(self._logs + added["scale"]) * mask[:, None]
         if "color" in added:
-            changed["sh"] = rest.sh.copy()
-            changed["sh"][:, 0] += added["color"] @ RGB.T
+            changed["sh"] = rest.sh.copy(order="K")
+            changed["sh"][:, 0] += rgb(added["color"].T).T
         splats = replace(rest, **changed)
-        if not self._fades:
+        if not self._fades or (seen := splats.opacities >= np.float32(MIN_OPACITY)).all():
             return splats, self._rows
-        seen = np.flatnonzero(splats.opacities >= np.float32(MIN_OPACITY))
         return splats.taken(seen), self._rows[seen]
 
 

@@ -26,6 +26,8 @@ HEADS = {"position": 3, "rotation": 4, "scale": 3, "opacity": 1, "color": 3}
 GROUP, CENTRES = len(HEADS), 1 + len(HEADS)
 #: `Tracks.of` states times as multiples of 1 / TICKS or of a larger fraction that all of them are multiples of.
 TICKS = 65535
+#: Products of a matrix product that OpenBLAS computes by one thread. It waits for others far longer than it computes.
+ALONE = 1 << 18
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +93,11 @@ class Tracks:
         f = np.float32((t - times[j]) / (times[j + 1] - times[j]))
         found = dict[str, np.ndarray]()
         for name, head in self.heads.items():
-            basis = head.bases[:, :, j] * (1 - f) + head.bases[:, :, j + 1] * f
-            found[name] = (basis.T @ head.coefficients.T).T if name == "rotation" else head.coefficients @ basis
+            basis, columns = head.bases[:, :, j] * (1 - f) + head.bases[:, :, j + 1] * f, head.coefficients.T
+            sums = np.empty((basis.shape[1], columns.shape[1]), np.float32)
+            for start in range(0, columns.shape[1], block := ALONE // basis.size):
+                np.matmul(basis.T, columns[:, start : start + block], out=sums[:, start : start + block])
+            found[name] = sums.T
         return found
 
     def alone(self, positions: np.ndarray) -> Tracks:

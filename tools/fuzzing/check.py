@@ -243,5 +243,6 @@ def compare(answers: Mapping[str, Answer]) -> str | None:
         if len(scenes) > 1 and DECODED in scenes:
             raise Finding("disagreement", f"the scene of {first}: {expected.scene}, of {name}: {found.scene}")
         if found.name != expected.name or len(scenes) > 1:
-            difference = f"{name} {found.name} {found.scene}, {first} {expected.name} {expected.scene}"
+            both = (f"{of} {answer.name} {answer.scene}".strip() for of, answer in ((name, found), (first, expected)))
+            difference = ", ".join(both)
     return difference

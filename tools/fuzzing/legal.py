@@ -368,7 +368,7 @@ class Maker:
             chains=chains,
             fill=[near(rng, 0, 255) for _ in range(3)] if rng.random() < 0.2 else None,
             steps=(step(rng, planes), step(rng, weights)),
-            priors=Chooser(rng, known, counted + (1 << 18 if first else 1 << 10)),
+            choose=Chooser(rng, known, counted + (1 << 18 if first else 1 << 10)),
             known=known,
             first=first,
         )
@@ -398,7 +398,8 @@ def legal(rng: random.Random) -> tuple[File, bool]:
     it decodes to."""
     maker, layers = Maker(rng), list[Layer]()
     for number in sorted({0, *rng.sample((1, 2), rng.randrange(3))}):
-        known, count = Known(), 1 if maker.mode == LZMA else rng.choice((1, 1, 2, 3, rng.choice((5, 12))))
+        known: Known = [[], [], []]
+        count = 1 if maker.mode == LZMA else rng.choice((1, 1, 2, 3, rng.choice((5, 12))))
         own = [maker.slice(number, not index, known) for index in range(count)]
         order = morton_order(np.concatenate([x.cells for x in own]))
         codes = np.concatenate([x.codes for x in own])[order]

@@ -10,7 +10,7 @@ import copy
 import itertools
 import random
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -48,71 +48,42 @@ class Case:
 # -- bytes -------------------------------------------------------------------------------------------------------------
 
 
-def _place(rng: random.Random, data: bytearray) -> int:
-    """An offset; half of them near the beginning, where parameters lie."""
-    near = len(data) if rng.random() < 0.5 else min(len(data), 40)
-    return rng.randrange(near) if near else 0
-
-
-def flip(rng: random.Random, data: bytearray, other: bytes) -> None:
-    """One to eight single bits."""
-    for _ in range(rng.choice((1, 1, 1, 2, 3, 8))):
-        if data:
-            data[_place(rng, data)] ^= 1 << rng.randrange(8)
-
-
-def burst(rng: random.Random, data: bytearray, other: bytes) -> None:
-    """A run of other bytes: random, all 0 or all 255."""
-    at = _place(rng, data)
-    size = min(rng.randint(1, LONGEST_BURST), len(data) - at)
-    data[at : at + size] = rng.choice((rng.randbytes(size), bytes(size), b"\xff" * size))
-
-
-def splice(rng: random.Random, data: bytearray, other: bytes) -> None:
-    """A run of another file over one of ours, or its tail."""
-    if other:
-        at, start = _place(rng, data), rng.randrange(len(other))
-        run = other[start : start + rng.choice((LONGEST_BURST, len(other)))]
-        data[at : at + len(run)] = run
-
-
-def insert(rng: random.Random, data: bytearray, other: bytes) -> None:
-    """Random bytes, or our own once more."""
-    at, size = _place(rng, data), rng.randint(1, LONGEST_BURST)
-    data[at:at] = rng.randbytes(size) if rng.random() < 0.5 else bytes(data[at : at + size])
-
-
-def delete(rng: random.Random, data: bytearray, other: bytes) -> None:
-    """A run is gone, or all to the end."""
-    at = _place(rng, data)
-    del data[at : at + rng.choice((1, 1, 2, 4, LONGEST_BURST, len(data)))]
-
-
-def set_integer(rng: random.Random, data: bytearray, other: bytes) -> None:
-    """A little-endian u8, u16 or u32 becomes a number near a limit."""
-    at, size = _place(rng, data), rng.choice((1, 2, 4))
-    value = rng.choice(INTEGERS) % (1 << 8 * size)
-    data[at : at + size] = (value if rng.random() < 0.8 else (1 << 8 * size) - value - 1).to_bytes(size, "little")
-
-
-def set_varint(rng: random.Random, data: bytearray, other: bytes) -> None:
-    """The variable-length integer (a token, a count, a parameter) at some place becomes another one."""
-    at = end = _place(rng, data)
-    while end < len(data) and data[end] & 0x80:
-        end += 1
-    data[at : end + 1] = varint(min(rng.choice(INTEGERS) << rng.randrange(2), VARINT_MAX))
-
-
-CHANGES = (flip, flip, burst, splice, splice, insert, delete, set_integer, set_varint, set_varint)
+#: Single bits; a run of random bytes, 0 or 255; a run of another file; bytes more; bytes less; a little-endian integer
+#: near a limit; a variable-length integer, such as a token, a count or a parameter.
+CHANGES = ("flip", "flip", "burst", "splice", "splice", "insert", "delete", "integer", "varint", "varint")
 
 
 def change_bytes(rng: random.Random, data: bytes, other: bytes, names: list[str]) -> bytes:
     """`data` after one to three changes, whose names are added to `names`."""
     changed = bytearray(data)
     for _ in range(rng.choice((1, 1, 1, 2, 3))):
-        change = rng.choice(CHANGES)
-        change(rng, changed, other)
-        names.append(change.__name__)
+        change, size = rng.choice(CHANGES), rng.randint(1, LONGEST_BURST)
+        near = len(changed) if rng.random() < 0.5 else min(len(changed), 40)  # parameters lie near the beginning
+        at = rng.randrange(near) if near else 0
+        if change == "flip" and changed:
+            for place in [at, *(rng.randrange(len(changed)) for _ in range(rng.choice((0, 0, 0, 1, 2, 7))))]:
+                changed[place] ^= 1 << rng.randrange(8)
+        elif change == "burst":
+            size = min(size, len(changed) - at)
+            changed[at : at + size] = rng.choice((rng.randbytes(size), bytes(size), b"\xff" * size))
+        elif change == "splice" and other:
+            start = rng.randrange(len(other))
+            run = other[start : start + rng.choice((LONGEST_BURST, len(other)))]
+            changed[at : at + len(run)] = run
+        elif change == "insert":
+            changed[at:at] = rng.randbytes(size) if rng.random() < 0.5 else bytes(changed[at : at + size])
+        elif change == "delete":
+            del changed[at : at + rng.choice((1, 1, 2, 4, size, len(changed)))]
+        elif change == "integer":
+            wide = rng.choice((1, 2, 4))
+            value = rng.choice(INTEGERS) * rng.choice((1, 1, 1, -1)) % (1 << 8 * wide)
+            changed[at : at + wide] = value.to_bytes(wide, "little")
+        elif change == "varint":
+            end = at
+            while end < len(changed) and changed[end] & 0x80:
+                end += 1
+            changed[at : end + 1] = varint(min(rng.choice(INTEGERS) << rng.randrange(2), VARINT_MAX))
+        names.append(change)
     return bytes(changed)
 
 
@@ -217,59 +188,41 @@ def put_together(parts: Parts, header: bytes | None = None) -> bytes:
         raise ValueError("a value without a form") from error
 
 
-def _slice(rng: random.Random, parts: Parts) -> Chunk | None:
-    slices = [chunk for chunk in parts.chunks if chunk.meta is not None]
-    return rng.choice(slices) if slices else None
+#: What `change_part` changes, and how often: bytes of codes or stream; codes, a stream or parameters from elsewhere; a
+#: value in the parameters; one in the header, half of the time in its kind or rows; bytes of a payload; chunks.
+PARTS = {"coded": 40, "swap": 8, "parameter": 22, "header": 14, "payload": 10, "chunks": 6}
 
 
-def coded_bytes(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
-    """Bytes of the codes or of the stream of a slice; the length follows."""
-    chunk, donor = _slice(rng, parts), _slice(rng, other)
-    if chunk is None:
-        return
-    name = "stream" if rng.random() < 0.2 else "codes"
-    names.append(f"in {name}")
-    setattr(chunk, name, change_bytes(rng, getattr(chunk, name), getattr(donor or chunk, name), names))
+def change_part(rng: random.Random, part: str, parts: Parts, other: Parts, names: list[str]) -> None:
+    """Changes something in place."""
+    names.append(part)
+    own, donors = ([chunk for chunk in x.chunks if chunk.meta is not None] for x in (parts, rng.choice((parts, other))))
+    if part == "chunks":
+        _change_chunks(rng, parts, other)
+    elif part == "payload":
+        chunk = rng.choice(parts.chunks)
+        chunk.payload = change_bytes(rng, chunk.packed(), rng.choice(other.chunks).packed(), names)
+        chunk.meta = None
+    elif part == "header" or not own:
+        tables = [parts.header[key] for key in (3, 4, 5) if isinstance(parts.header.get(key), list)]
+        change_value(rng, rng.choice(tables) if tables and rng.random() < 0.5 else parts.header)
+    elif part == "parameter":
+        change_value(rng, rng.choice(own).meta)
+    else:
+        chunk, donor, size = rng.choice(own), rng.choice(donors or own), rng.randint(1, 200)
+        name = rng.choice(("codes", "stream", "meta") if part == "swap" else ("codes", "codes", "codes", "stream"))
+        value = copy.deepcopy(getattr(donor, name))
+        if part == "coded":
+            value = change_bytes(rng, getattr(chunk, name), value, names)
+        elif name != "meta" and rng.random() < 0.5:
+            value = rng.choice((b"", rng.randbytes(size), bytes(size), b"\x10" * size))
+        setattr(chunk, name, value)
+        names.append(f"of {name}")
 
 
-def coded_swap(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
-    """Codes or a stream come from another layer or file, or are dropped, random, or of zeros; or the parameters do."""
-    chunk, donor = _slice(rng, parts), _slice(rng, other if rng.random() < 0.6 else parts)
-    if chunk is None or donor is None:
-        return
-    name, size = rng.choice(("codes", "stream", "meta")), rng.randint(1, 200)
-    made = (b"", rng.randbytes(size), bytes(size), b"\x10" * size) if name != "meta" else ()
-    setattr(chunk, name, rng.choice((*[copy.deepcopy(getattr(donor, name))] * 2, *made)))
-    names.append(f"{name} from elsewhere")
-
-
-def parameters(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
-    """A value in the parameters of a slice."""
-    chunk = _slice(rng, parts)
-    if chunk is not None and chunk.meta is not None:
-        change_value(rng, chunk.meta)
-        names.append("a parameter")
-
-
-def header_value(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
-    """A value in the header, half of the time in its kind or its rows; the chunk list is written anew."""
-    tables = [parts.header[key] for key in (3, 4, 5) if isinstance(parts.header.get(key), list)]
-    change_value(rng, rng.choice(tables) if tables and rng.random() < 0.5 else parts.header)
-    names.append("a header value")
-
-
-def payload_bytes(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
-    """Bytes of a whole payload, its parameters included."""
-    chunk = rng.choice(parts.chunks)
-    chunk.payload = change_bytes(rng, chunk.packed(), rng.choice(other.chunks).packed(), names)
-    chunk.meta = None
-    names.append("in a payload")
-
-
-def chunks(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
+def _change_chunks(rng: random.Random, parts: Parts, other: Parts) -> None:
     """Chunks are dropped, doubled, swapped, of another type, flagged, or from another file; then numbered, or not."""
-    i, j = rng.randrange(len(parts.chunks)), rng.randrange(len(parts.chunks))
-    act = rng.randrange(6)
+    i, j, act = rng.randrange(len(parts.chunks)), rng.randrange(len(parts.chunks)), rng.randrange(6)
     if act == 0 and len(parts.chunks) > 1:
         del parts.chunks[i]
     elif act == 1:
@@ -282,27 +235,19 @@ def chunks(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> 
         parts.chunks[i].flags ^= 1 << rng.choice((0, 1, 2, 6, 15))
     else:
         parts.chunks[i] = copy.deepcopy(rng.choice(other.chunks))
-    names.append("chunks")
     if act != 4 and rng.random() < 0.7:  # else a changed order of slices hardly gets past the flags
         for kind, run in itertools.groupby(parts.chunks, key=lambda chunk: chunk.type):
             own = list(run)
             for number, chunk in enumerate(own if kind < 3 else ()):
                 chunk.flags = number << 6 | 2 * (number + 1 < len(own))
-        names.append("renumbered")
-
-
-PartChange = Callable[[random.Random, Parts, Parts, list[str]], None]
-PART_CHANGES: dict[PartChange, int] = {
-    coded_bytes: 40, coded_swap: 8, parameters: 22, header_value: 14, payload_bytes: 10, chunks: 6
-}  # fmt: skip
 
 
 def change_parts(rng: random.Random, data: bytes, other: bytes, names: list[str]) -> bytes:
     """A file whose parts were changed, with lengths, chunk list, scene ids and CRCs right again."""
     parts, donor = take_apart(data), take_apart(other)
     try:
-        for change in rng.choices([*PART_CHANGES], [*PART_CHANGES.values()], k=rng.choice((1, 1, 1, 2))):
-            change(rng, parts, donor, names)
+        for part in rng.choices([*PARTS], [*PARTS.values()], k=rng.choice((1, 1, 1, 2))):
+            change_part(rng, part, parts, donor, names)
         return put_together(parts)
     except ValueError:  # a number that has no form
         return data

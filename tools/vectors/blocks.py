@@ -159,13 +159,7 @@ def normal(k: int, n: int, si: int, g: int) -> int:
 
 SMALL = Prior(-3, 7)
 Choice = Callable[[int, str, int, list[int]], Prior]  #: of a prior, from prior list, piece, number of channel, symbols
-
-
-class Known(list[list["Prior"]]):
-    """The three prior lists."""
-
-    def __init__(self) -> None:
-        super().__init__(([], [], []))
+Known = list[list[Prior]]  #: the three prior lists
 
 
 def default_prior(k: Sequence[int]) -> Prior:
@@ -179,11 +173,6 @@ def default_prior(k: Sequence[int]) -> Prior:
     if n > 1 << 14:  # around the median; the others are exceptions
         low, n = sorted(k)[len(k) // 2] - 7, 15
     return Prior(min(max(low, -most), most - n + 1), n, 64 * n.bit_length() - 128)
-
-
-def named(priors: Mapping[str, Mapping[int, Prior]]) -> Choice:
-    """Those of some channels, by piece and number."""
-    return lambda _, piece, number, k: priors.get(piece, {}).get(number) or default_prior(k)
 
 
 @dataclass
@@ -401,7 +390,7 @@ class Layer:
 
     def written(self, known: Known | None = None) -> Layer:
         """With its codes and its stream in mode ans. known: the prior lists of the slices before, which it extends."""
-        coder = Coder(Known() if known is None else known, self.choose)
+        coder = Coder([[], [], []] if known is None else known, self.choose)
         coder.known[2].clear()
         head, channels = (b"", []) if not len(self.cells) else self.tree or octree(self.cells)
         pieces = {"positions": head + coder.codes(0, "positions", channels)}
@@ -490,7 +479,8 @@ def make_layer(
     kind: list[int] | None = None,
     fill: list[int] | None = None,
     steps: tuple[float, float] = (2.0**-4, 2.0**-7),
-    priors: Mapping[str, Mapping[int, Prior]] | Choice = {},  # noqa: B006  (never changed)
+    priors: Mapping[str, Mapping[int, Prior]] = {},  # noqa: B006  (never changed)
+    choose: Choice | None = None,
     tree: tuple[bytes, list[np.ndarray]] | None = None,
     known: Known | None = None,
     first: bool = True,
@@ -499,7 +489,8 @@ def make_layer(
 
     Defaults: every rise 0, every code 77, rows all 2; in layer 0 the networks of a scaffold without hidden layers,
     elsewhere a trunk and the head 1 if there are `grids`. rows: int32 [sum of widths, n]. layer_rows: int32 [C, earlier
-    rows + n] by id. chains: widths by id, or weight, bias, weight, .. steps: of grids and of chains.
+    rows + n] by id. chains: widths by id, or weight, bias, weight, .. steps: of grids and of chains. priors:
+    of some channels, by piece and number; choose: of all.
     """
     n, features = len(cells), below + sum(grid.channels for grid in grids)
     if chains is None:
@@ -530,7 +521,7 @@ def make_layer(
         grids,
         [array for own in made.values() for array in own],
         {key: value for key, value in meta.items() if value is not None},
-        priors if callable(priors) else named(priors),
+        choose or (lambda _, piece, number, k: priors.get(piece, {}).get(number) or default_prior(k)),
         tree,
     ).written(known)
 
@@ -659,7 +650,7 @@ def make_file(*layers: Layer, header: Mapping[int, Any] | None = None) -> File:
 
 def slices_of(*parts: Layer) -> File:
     """A file of slices, which refer to the priors of those before."""
-    known = {part.number: Known() for part in parts}
+    known: dict[int, Known] = {part.number: [[], [], []] for part in parts}
     return make_file(*[layer.written(known[layer.number]) for layer in parts])
 
 

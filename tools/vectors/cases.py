@@ -285,7 +285,7 @@ def entries_at_limit(over: int = 0) -> File:
         own = [Prior(-(n >> 1), n, 200 + c) for c, n in enumerate([1 << 14] * 16 + [last])]
         return with_priors({c: own[c if c < 17 else 0] for c in range(68)})
 
-    layer, known = file(2).layer(0), blocks.Known()
+    layer, known = file(2).layer(0), list[list[Prior]]([[], [], []])
     layer.written(known)
     symbols = (68 + 4) * ROWS + sum(map(np.size, layer.chains))
     return file(2 + (1 << 18) + symbols + over - sum(prior.n for own in known for prior in own))
@@ -297,7 +297,7 @@ def entries_of_slices(over: int) -> File:
         c: Prior(min(c, 15) - 20, 1 << 14) for c in range(68)}})  # fmt: skip
     wide = Prior(-20, (1 << 10) + 72 + over)
     return slices_of(first, later(0, line(1, z=4), widths=WIDE, rows=np.ones((68, 1), np.int32),
-        codes=[3], priors=lambda *_: wide))  # fmt: skip
+        codes=[3], choose=lambda *_: wide))  # fmt: skip
 
 
 def large_products() -> File:

@@ -58,7 +58,7 @@ def chunks(
 
 
 class _Encoder:
-    """LZMA's range coder with adaptive bits, as the public LZMA specification has it, and a greedy choice of matches: the
+    """LZMA's range coder with adaptive bits, as the public LZMA specification has it, and greedy matches: the
     longest of those at the last four distances, at distance 1 and at the latest place of the same bytes."""
 
     def __init__(self, data: bytes) -> None:
