@@ -149,7 +149,8 @@ def check(tensors: Tensors, below: Mapping[int, Tables], widths: None, where: st
     mapped = {grid.id for grid in tables.grids if grid.id > CENTRES}
     for rows in tables.rows:
         if rows.id > GROUP or (rows.id == GROUP and (groups is None or rows.channels > 1)):
-            raise Malformed(f"{where}: layer rows {rows.id} of {rows.channels}, expected 0..{len(HEADS) - 1}")
+            known = f"0..{GROUP - 1}, or {GROUP} of one channel with centres"
+            raise Malformed(f"{where}: layer rows {rows.id}, expected {known}")
         if rows.id < GROUP:
             expected.append((1 + rows.id, rows.channels * components[rows.id]))
     if groups is not None:
@@ -160,7 +161,8 @@ def check(tensors: Tensors, below: Mapping[int, Tables], widths: None, where: st
         raise Malformed(f"{where}: grids {found} (id, channels), expected {expected}")
     wrong = [list(g.sides) for g in tables.grids if g.sides != (instants if g.id < CENTRES else groups)]
     if wrong or len(instants) != 1 or instants[0] < 2 or (groups and len(groups) != 1):
-        raise Malformed(f"{where}: grids of sides {[list(g.sides) for g in tables.grids]}, expected [T] and [M]")
+        found_sides = [list(grid.sides) for grid in tables.grids]
+        raise Malformed(f"{where}: grids of sides {found_sides}, expected one of 2.. along time, one along groups")
     if len(tensors.planes):
         times = tensors.planes[0].ravel()
         if times[0] or np.any(times[1:] <= times[:-1]):
