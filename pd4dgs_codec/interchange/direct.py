@@ -36,7 +36,7 @@ from pd4dgs_codec.kinds.tracks import Tracks
 from pd4dgs_codec.scene import Camera, SceneInfo, deformation_unit
 
 SMALLEST = 1e-30  #: unit of lengths of a scene in one point
-GROUPED = True  #: whether Gaussians that move alike share maps
+GROUPED = False  #: whether Gaussians that move alike share maps, which readers in other languages do not know yet
 #: Consecutive views without times are this share of the duration apart, so that few views cover all of it.
 GOLDEN = (5**0.5 - 1) / 2
 CHECKED = 12  #: pictures that measure the error
@@ -117,7 +117,7 @@ class Packer:
         found = splats.scene(
             replace(self.info, voxel_size=packed.voxel_size), packed.cells, tensors, steps,
             classes=packed.classes, centres=centres,
-            tracks=self._tracks(grid, error, places / max(deformation_unit(self.info.box), SMALLEST)),
+            tracks=self._tracks(grid, error, places / max(float(deformation_unit(self.info.box)), SMALLEST)),
         )  # fmt: skip
         return found
 
