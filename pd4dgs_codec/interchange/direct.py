@@ -36,7 +36,7 @@ from pd4dgs_codec.kinds.tracks import Tracks
 from pd4dgs_codec.scene import Camera, SceneInfo, deformation_unit
 
 SMALLEST = 1e-30  #: unit of lengths of a scene in one point
-GROUPED = False  #: whether Gaussians that move alike share maps, which readers in other languages do not know yet
+GROUPED = True  #: whether Gaussians that move alike share maps
 #: Consecutive views without times are this share of the duration apart, so that few views cover all of it.
 GOLDEN = (5**0.5 - 1) / 2
 CHECKED = 12  #: pictures that measure the error
