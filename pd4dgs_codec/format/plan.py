@@ -17,7 +17,7 @@ from pd4dgs_codec.entropy.fitting import entropy_bits
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.payload import write_slice
-from pd4dgs_codec.format.quantise import NO_CLASSES, WHOLE, Rows, RowTable, expect
+from pd4dgs_codec.format.quantise import NO_CLASSES, ROW_PREDICTORS, Rows, RowTable, expect
 from pd4dgs_codec.format.symbols import NO_LAYER_ROWS, Growing, LayerSymbols, first_duplicate
 from pd4dgs_codec.format.tables import NOTHING, Kind, Tensors
 from pd4dgs_codec.kinds import AnyScene, hexplane
@@ -125,9 +125,7 @@ def _predicted(table: RowTable, values: Sequence[np.ndarray], classes: np.ndarra
 
     centres = [None] * len(values) if table.centre is None else [m for _, m in table.of_each(table.centre)]
     chosen = [
-        tensor
-        if tensor.predictor == WHOLE
-        else min((replace(tensor, predictor=p) for p in (0, 1)), key=lambda one: bits(one, x, m))  # noqa: B023
+        min((replace(tensor, predictor=p) for p in ROW_PREDICTORS), key=lambda one: bits(one, x, m))  # noqa: B023
         for tensor, x, m in zip(table.tensors, values, centres, strict=True)
     ]
     return RowTable(tuple(chosen), table.centre)

@@ -113,9 +113,8 @@ def row_blocks(n: int) -> Iterator[slice]:
     yield from (slice(first, min(first + BLOCK, n)) for first in range(0, max(n, 1), BLOCK))
 
 
-#: Predictors of rows by their id in the bitstream, and the one that step classes do not concern.
-ROW_PREDICTORS = {0: "none", 1: "previous row", 2: "previous row in whole steps"}
-WHOLE = 2
+#: Predictors of rows by their id in the bitstream.
+ROW_PREDICTORS = {0: "none", 1: "previous row"}
 
 
 @dataclass(frozen=True)
@@ -133,8 +132,7 @@ class RowTable:
     """The tensors of a row. Their values are v Q with an integer v, int32 [W, n], channel-major (clause 11.2).
 
     Without a predictor v is m + k 2^c, with a symbol k, the centre m of the channel and the step class c of the row.
-    With predictor 1, k 2^c is the difference from the last row before of class c or lower, or from m. With predictor 2,
-    k is the difference from the row before, or from m, whatever the classes.
+    With predictor 1, k 2^c is the difference from the last row before of class c or lower, or from m.
 
     tensors: by ascending id. centre: int32 [W], None if rows have no step classes. Classes: int32 [n], or NO_CLASSES.
     """
@@ -180,9 +178,6 @@ class RowTable:
         v = np.empty((self.channels, len(given[0])), np.int32)
         spacing = np.int32(1) << classes if self.graded else np.ones(v.shape[1], np.int32)
         for x, name, (tensor, own, _, m) in zip(given, names, self._mapped(v, v), strict=True):
-            if tensor.predictor == WHOLE:
-                own[:] = quantise(x.reshape(-1, tensor.channels).T, tensor.step, name)
-                continue
             if tensor.predictor and self.graded:  # v is whole steps from that of the last row of a lower class
                 flat = x.reshape(-1, tensor.channels).T
                 for c, upto, of_class in _runs(classes, v.shape[1]):
@@ -212,10 +207,7 @@ class RowTable:
             return symbols
         v, shifts = np.empty_like(symbols), classes if self.graded else 0
         for tensor, k, out, m in self._mapped(symbols, v):
-            if tensor.predictor == WHOLE:
-                found = np.cumsum(k, axis=1, dtype=np.int64) + m
-            else:
-                found = _accumulated(k, m, classes) if tensor.predictor else (k << shifts) + m
+            found = _accumulated(k, m, classes) if tensor.predictor else (k << shifts) + m
             if magnitude(found) > MAX_SYMBOL:
                 raise Malformed(f"a value of a row more than {MAX_SYMBOL} steps from 0")
             out[:] = found
@@ -227,9 +219,6 @@ class RowTable:
             return v
         symbols, shifts = np.empty_like(v), classes if self.graded else 0
         for tensor, own, out, m in self._mapped(v, symbols):
-            if tensor.predictor == WHOLE:
-                out[:] = np.diff(own, axis=1, prepend=m)
-                continue
             steps = _differences(own, m, classes) if tensor.predictor else own - m
             out[:] = steps >> shifts
             expect(np.array_equal(out << shifts, steps), f"rows {tensor.id}: values between the steps of their class")

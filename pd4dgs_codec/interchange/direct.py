@@ -33,10 +33,8 @@ from pd4dgs_codec.interchange.tracks import STRAIGHT, Change, layer
 from pd4dgs_codec.kinds import splats
 from pd4dgs_codec.kinds.splats import Splats, product
 from pd4dgs_codec.kinds.tracks import Tracks
-from pd4dgs_codec.scene import Camera, SceneInfo, deformation_unit
+from pd4dgs_codec.scene import Camera, SceneInfo
 
-SMALLEST = 1e-30  #: unit of lengths of a scene in one point
-GROUPED = True  #: whether Gaussians that move alike share maps
 #: Consecutive views without times are this share of the duration apart, so that few views cover all of it.
 GOLDEN = (5**0.5 - 1) / 2
 CHECKED = 12  #: pictures that measure the error
@@ -113,11 +111,10 @@ class Packer:
         grid = self.ordered.grid(theta)
         packed = self.ordered.packed(grid)
         tensors, steps, centres = self._tensors(packed)
-        places = (packed.cells + packed.tensors["offset"].astype(np.float64)) * packed.voxel_size
         found = splats.scene(
             replace(self.info, voxel_size=packed.voxel_size), packed.cells, tensors, steps,
             classes=packed.classes, centres=centres,
-            tracks=self._tracks(grid, error, places / max(float(deformation_unit(self.info.box)), SMALLEST)),
+            tracks=self._tracks(grid, error),
         )  # fmt: skip
         return found
 
@@ -159,9 +156,8 @@ class Packer:
                 found[name] = change
         return found
 
-    def _tracks(self, grid: Grid, error: float, places: np.ndarray) -> dict[int, Tracks]:
-        """Returns the tracks of layers 1 and 2. error: the mean squared error of pictures that is aimed at. places:
-        decoded positions, in units of `deformation_unit`."""
+    def _tracks(self, grid: Grid, error: float) -> dict[int, Tracks]:
+        """Returns the tracks of layers 1 and 2. error: the mean squared error of pictures that is aimed at."""
         kept = [
             (change.energies[k], name, int(k))
             for name, change in self.changes.items()
@@ -178,8 +174,7 @@ class Packer:
                 continue
             chosen = {name: np.array([k for _, other, k in own if other == name]) for name in changes}
             chosen = {name: ks for name, ks in chosen.items() if len(ks)}
-            shared = places if GROUPED and number == 1 else None
-            found[number], done = layer(changes, chosen, grid, self.source.times, self.key, allowed, shared)
+            found[number], done = layer(changes, chosen, grid, self.source.times, self.key, allowed)
             for name, values in done.items():
                 changes = changes | {name: replace(changes[name], values=changes[name].values - values)}
         return found

@@ -17,7 +17,7 @@ from pd4dgs_codec.format.quantise import RowTable, dequantise
 from pd4dgs_codec.format.symbols import Growing
 from pd4dgs_codec.format.tables import Kind, Tables
 from pd4dgs_codec.kinds.tracks import Tracks, total, tracks_of
-from pd4dgs_codec.scene import MASK_STEP, MIN_OPACITY, Gaussians, Grading, LayeredScene, SceneInfo, deformation_unit
+from pd4dgs_codec.scene import MASK_STEP, MIN_OPACITY, Gaussians, Grading, LayeredScene, SceneInfo
 
 NUMBER, NAME = 1, "splats"
 
@@ -234,8 +234,7 @@ class Moving:
             self._rest = replace(self._rest, scales=self._rest.scales * mask[:, None])
         columns = {name: np.asfortranarray(getattr(self._rest, name)) for name in ("means", "quats") if heads}
         self._rest = replace(self._rest, **columns)  # in the order in memory of what is added to them
-        places = scene.anchor_at(slice(None)) / deformation_unit(scene.info.box)
-        self._tracks = {layer: own.alone(places).of_rows(rows).by_columns() for layer, own in scene.tracks.items()}
+        self._tracks = {layer: own.of_rows(rows).by_columns() for layer, own in scene.tracks.items()}
 
     @np.errstate(all="ignore")
     def at(self, t: float) -> tuple[Splats, np.ndarray]:

@@ -1,9 +1,7 @@
 """The deformation kind "tracks" of splats: bases over time that all Gaussians share, and coefficients of each (clause
 13.8).
 
-Grids of one axis, time: the instants (id 0), and the bases of head h (id 1 + h). Layer rows h: its coefficients. With
-groups also layer rows GROUP: the group of each row, and grids along the groups: their centres (id CENTRES), and their
-maps of head h (id CENTRES + 1 + h), which tell the coefficients from the position.
+Grids of one axis, time: the instants (id 0), and the bases of head h (id 1 + h). Layer rows h: its coefficients.
 """
 
 from __future__ import annotations
@@ -15,15 +13,13 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.errors import Malformed
-from pd4dgs_codec.format.quantise import WHOLE, Rows
+from pd4dgs_codec.format.quantise import Rows
 from pd4dgs_codec.format.tables import Grid, Tables, Tensors
 
 NUMBER, NAME = 1, "tracks"
 
 #: Components of each head, in the order of their numbers.
 HEADS = {"position": 3, "rotation": 4, "scale": 3, "opacity": 1, "color": 3}
-#: Ids of the layer rows of groups, and of the grid of their centres.
-GROUP, CENTRES = len(HEADS), 1 + len(HEADS)
 #: `Tracks.of` states times as multiples of 1 / TICKS or of a larger fraction that all of them are multiples of.
 TICKS = 65535
 #: Products of a matrix product that OpenBLAS computes by one thread. It waits for others far longer than it computes.
@@ -44,41 +40,21 @@ class Head:
 
 
 @dataclass(frozen=True, eq=False)
-class Groups:
-    """M groups of Gaussians that move alike. rows: float32 [n, 1], the group of each row. centres: float32 [M, 3], in
-    units of `deformation_unit`. maps: by head, float32 [M, 4, K]: with d the position less the centre, (d, 1) times
-    the map of a row's group is added to its coefficients."""
-
-    rows: np.ndarray
-    centres: np.ndarray
-    maps: dict[str, np.ndarray]
-
-    def added(self, name: str, positions: np.ndarray) -> np.ndarray | float:
-        """What a head's coefficients get at positions [n, 3], in units of `deformation_unit`: float32 [n, K]."""
-        if name not in self.maps:
-            return 0.0
-        groups = self.rows[:, 0].astype(np.int64)
-        apart, maps = positions[: len(groups)] - self.centres[groups], self.maps[name]
-        return np.asarray(np.einsum("nd,ndk->nk", apart, maps[groups, :3]) + maps[groups, 3], np.float32)
-
-
-@dataclass(frozen=True, eq=False)
 class Tracks:
     """The deformation that a layer adds to those of the layers below. instants: float32 [T], from 0, ascending, in any
-    unit; the last stands for normalised time 1. step: of all grids. heads: by name."""
+    unit; the last stands for normalised time 1. step: of instants and bases. heads: by name."""
 
     instants: np.ndarray
     step: float
     heads: dict[str, Head]
-    groups: Groups | None = None
 
     @staticmethod
-    def of(times: np.ndarray, step: float, heads: dict[str, Head], groups: Groups | None = None) -> Tracks:
+    def of(times: np.ndarray, step: float, heads: dict[str, Head]) -> Tracks:
         """Returns the tracks with these normalised times [T], the first 0 and the last 1, up to 1 / (2 TICKS)."""
         exact = np.asarray(times, np.float64)
         fits = (n for n in range(1, TICKS) if np.abs(exact * n - np.rint(exact * n)).max() < 0.01)
         ticks = np.rint(exact * next(fits, TICKS))
-        return Tracks((ticks * float(step)).astype(np.float32), step, heads, groups)
+        return Tracks((ticks * float(step)).astype(np.float32), step, heads)
 
     @property
     def times(self) -> np.ndarray:
@@ -100,17 +76,6 @@ class Tracks:
             found[name] = sums.T
         return found
 
-    def alone(self, positions: np.ndarray) -> Tracks:
-        """Returns the tracks without groups, whose coefficients have what the groups add. positions: [N, 3] of the
-        scene's rows, in units of `deformation_unit`."""
-        if self.groups is None:
-            return self
-        heads = {
-            name: replace(head, coefficients=head.coefficients + self.groups.added(name, positions))
-            for name, head in self.heads.items()
-        }
-        return replace(self, heads=heads, groups=None)
-
     def by_columns(self) -> Tracks:
         """Returns the tracks with coefficients in the order in memory that evaluates fastest."""
         heads = {n: replace(head, coefficients=np.asfortranarray(head.coefficients)) for n, head in self.heads.items()}
@@ -126,15 +91,12 @@ class Tracks:
             return values[rows]
 
         heads = {name: replace(head, coefficients=taken(head.coefficients)) for name, head in self.heads.items()}
-        groups = self.groups and replace(self.groups, rows=taken(self.groups.rows))
-        return replace(self, heads=heads, groups=groups)
+        return replace(self, heads=heads)
 
     def scaled(self, factor: float) -> Tracks:
         """Returns the tracks with every step times `factor`, rounded to binary32, at the same normalised times."""
         heads = {n: replace(head, step=float(np.float32(head.step * factor))) for n, head in self.heads.items()}
-        return replace(
-            self, instants=self.instants * np.float32(factor), step=float(np.float32(self.step * factor)), heads=heads
-        )
+        return Tracks(self.instants * np.float32(factor), float(np.float32(self.step * factor)), heads)
 
 
 def check(tensors: Tensors, below: Mapping[int, Tables], widths: None, where: str) -> None:
@@ -144,70 +106,47 @@ def check(tensors: Tensors, below: Mapping[int, Tables], widths: None, where: st
         raise Malformed(f"{where}: deformation {list(tables.kind)}, expected [{NUMBER}]")
     if tables.chains or not (tables.grids and tables.rows):
         raise Malformed(f"{where}: tracks, expected grids and layer rows and no chains")
-    components, expected = list(HEADS.values()), [(0, 1)]
-    instants, groups = tables.grids[0].sides, next((g.sides for g in tables.grids if g.id == CENTRES), None)
-    mapped = {grid.id for grid in tables.grids if grid.id > CENTRES}
+    sides = {grid.sides for grid in tables.grids}
+    if len(sides) > 1 or not (len(side := sides.pop()) == 1 and side[0] > 1):
+        raise Malformed(f"{where}: grids of sides {[list(grid.sides) for grid in tables.grids]}, expected one of 2..")
+    components = list(HEADS.values())
+    expected = [(0, 1)]
     for rows in tables.rows:
-        if rows.id > GROUP or (rows.id == GROUP and (groups is None or rows.channels > 1)):
-            known = f"0..{GROUP - 1}, or {GROUP} of one channel with centres"
-            raise Malformed(f"{where}: layer rows {rows.id}, expected {known}")
-        if rows.id < GROUP:
-            expected.append((1 + rows.id, rows.channels * components[rows.id]))
-    if groups is not None:
-        maps = {CENTRES + 1 + rows.id: rows.channels * 4 for rows in tables.rows if rows.id < GROUP}
-        expected += [(CENTRES, 3), *((i, maps.get(i, 0)) for i in sorted(mapped))]
+        if rows.id >= len(HEADS):
+            raise Malformed(f"{where}: layer rows {rows.id}, expected 0..{len(HEADS) - 1}")
+        expected.append((1 + rows.id, rows.channels * components[rows.id]))
     found = [(grid.id, grid.channels) for grid in tables.grids]
-    if found != expected or (groups is None) != (tables.rows[-1].id < GROUP):
+    if found != expected:
         raise Malformed(f"{where}: grids {found} (id, channels), expected {expected}")
-    wrong = [list(g.sides) for g in tables.grids if g.sides != (instants if g.id < CENTRES else groups)]
-    if wrong or len(instants) != 1 or instants[0] < 2 or (groups and len(groups) != 1):
-        found_sides = [list(grid.sides) for grid in tables.grids]
-        raise Malformed(f"{where}: grids of sides {found_sides}, expected one of 2.. along time, one along groups")
     if len(tensors.planes):
-        times = tensors.planes[0].ravel()
-        if times[0] or np.any(times[1:] <= times[:-1]):
+        instants = tensors.planes[0].ravel()
+        if instants[0] or np.any(instants[1:] <= instants[:-1]):
             raise Malformed(f"{where}: instants do not ascend from 0")
 
 
 def tensors_of(tracks: Tracks) -> Tensors:
     """Returns the grids of tracks; `coefficients` has the layer rows."""
-    heads = [(i, name, tracks.heads[name]) for i, name in enumerate(HEADS) if name in tracks.heads]
-    planes = {0: tracks.instants[None, None]}
-    planes |= {1 + i: head.bases.reshape(-1, 1, head.bases.shape[2]) for i, _, head in heads}
-    rows = [Rows(i, head.coefficients.shape[1], head.step) for i, _, head in heads]
-    if groups := tracks.groups:
-        planes[CENTRES] = groups.centres.T[:, None]
-        for i, name, _ in heads:
-            if name in groups.maps:
-                planes[CENTRES + 1 + i] = groups.maps[name].reshape(len(groups.centres), -1).T[:, None]
-        rows.append(Rows(GROUP, 1, 1.0, WHOLE))
-    grids = tuple(Grid(i, len(plane), plane.shape[2:]) for i, plane in planes.items())
-    arrays = [np.ascontiguousarray(plane, np.float32) for plane in planes.values()]
-    return Tensors(Tables(grids, grid_step=tracks.step, kind=(NUMBER,), rows=tuple(rows)), arrays)
+    heads = [(i, tracks.heads[name]) for i, name in enumerate(HEADS) if name in tracks.heads]
+    planes = [tracks.instants[None, None], *(head.bases.reshape(-1, 1, head.bases.shape[2]) for _, head in heads)]
+    grids = tuple(Grid(i, len(p), p.shape[2:]) for i, p in zip((0, *(1 + i for i, _ in heads)), planes, strict=True))
+    rows = tuple(Rows(i, head.coefficients.shape[1], head.step) for i, head in heads)
+    return Tensors(Tables(grids, grid_step=tracks.step, kind=(NUMBER,), rows=rows), planes)
 
 
 def coefficients(tracks: Tracks, count: int) -> dict[str, np.ndarray]:
-    """Returns the layer rows of the scene's first `count` rows, float32 [count, K] by name in coding order."""
-    taken = tracks.of_rows(np.arange(count))
-    found = {name: taken.heads[name].coefficients for name in HEADS if name in taken.heads}
-    return found | ({"group": taken.groups.rows} if taken.groups else {})
+    """Returns the coefficients of the scene's first `count` rows, float32 [count, K] by head in the order of HEADS."""
+    rows = tracks.of_rows(np.arange(count))
+    return {name: rows.heads[name].coefficients for name in HEADS if name in rows.heads}
 
 
 def tracks_of(tensors: Tensors, rows: list[np.ndarray]) -> Tracks:
     """The inverse of `tensors_of` and `coefficients`."""
-    names, heads, maps = list(HEADS), dict[str, Head](), dict[str, np.ndarray]()
-    planes = {grid.id: plane[:, 0] for grid, plane in zip(tensors.tables.grids, tensors.planes, strict=True)}
-    for tensor, values in zip(tensors.tables.rows, rows, strict=True):
-        if tensor.id == GROUP:
-            continue
-        bases = planes[1 + tensor.id]
-        heads[names[tensor.id]] = Head(bases.reshape(tensor.channels, -1, bases.shape[1]), values, tensor.step)
-        if (own := planes.get(CENTRES + 1 + tensor.id)) is not None:
-            maps[names[tensor.id]] = own.T.reshape(-1, 4, tensor.channels)
-    groups = Groups(rows[-1], planes[CENTRES].T, maps) if CENTRES in planes else None
-    if groups and len(groups.rows) and not 0 <= groups.rows.min() <= groups.rows.max() < len(groups.centres):
-        raise Malformed(f"a row in group {groups.rows.max():g}, expected 0..{len(groups.centres) - 1}")
-    return Tracks(planes[0][0], tensors.tables.grid_step, heads, groups)
+    names, (instants, *planes) = list(HEADS), tensors.planes
+    heads = {}
+    for tensor, plane, values in zip(tensors.tables.rows, planes, rows, strict=True):
+        bases = plane.reshape(tensor.channels, -1, plane.shape[2])
+        heads[names[tensor.id]] = Head(bases, values, tensor.step)
+    return Tracks(instants.ravel(), tensors.tables.grid_step, heads)
 
 
 def json_of_layer(tables: Tables) -> dict[str, Any]:
@@ -215,7 +154,7 @@ def json_of_layer(tables: Tables) -> dict[str, Any]:
     are empty without tracks."""
     if not tables.grids:
         return {"steps": {}, "instants": 0, "heads": {}}
-    names = [*HEADS, "group"]
+    names = list(HEADS)
     steps = {names[rows.id]: rows.step for rows in tables.rows} | {"bases": tables.grid_step}
     heads = {names[rows.id]: rows.channels for rows in tables.rows}
     return {"steps": steps, "instants": tables.grids[0].sides[0], "heads": heads}
@@ -223,8 +162,8 @@ def json_of_layer(tables: Tables) -> dict[str, Any]:
 
 def array_names(tables: Tables) -> list[str]:
     """Returns the names of the planes in coding order."""
-    names = ["instants", *(f"bases.{name}" for name in HEADS), "centres", *(f"maps.{name}" for name in HEADS)]
-    return [f"tracks.{names[grid.id]}" for grid in tables.grids]
+    names = list(HEADS)
+    return ["tracks.instants", *(f"tracks.bases.{names[grid.id - 1]}" for grid in tables.grids[1:])]
 
 
 def total(layers: Mapping[int, Tracks], t: float, count: int) -> dict[str, np.ndarray]:

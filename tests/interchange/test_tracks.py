@@ -1,25 +1,15 @@
-"""Packing without training: ellipsoids stay, voxels are distinct, errors are as predicted, bodies move in groups."""
-
-from dataclasses import replace
+"""Packing without training: ellipsoids stay, voxels are distinct, errors are as predicted, bodies move."""
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from pd4dgs_codec.data.view import rotation_matrix
-from pd4dgs_codec.errors import Malformed
-from pd4dgs_codec.format.decoder import decode
-from pd4dgs_codec.format.encoder import encode
-from pd4dgs_codec.format.quantise import WHOLE, Rows, RowTable
 from pd4dgs_codec.interchange.pack import Grid, Pictures, sensitivity, tensors_of, turned, voxels
 from pd4dgs_codec.interchange.splats import picture
-from pd4dgs_codec.interchange.tracks import Change, _runs, between, knots, layer
-from pd4dgs_codec.kinds import splats
-from pd4dgs_codec.kinds.splats import Moving, Splats, splats_of, unit
-from pd4dgs_codec.kinds.tracks import Groups
+from pd4dgs_codec.interchange.tracks import Change, between, knots, layer
+from pd4dgs_codec.kinds.splats import Splats, splats_of, unit
 from pd4dgs_codec.morton import morton_order
-from pd4dgs_codec.scene import Camera, SceneInfo
+from pd4dgs_codec.scene import Camera
 
 UPRIGHT = np.array([1.0, 0, 0, 0])
 
@@ -119,37 +109,27 @@ def bodies(per_body=600, instants=21):
     return (values - values[:, :, key : key + 1]).astype(np.float32), np.concatenate(parts)[order], times
 
 
-def fitted(grouped):
+def fitted():
     values, places, times = bodies()
     n = len(values)
     change = Change.of(values, np.ones(n))
     grid = Grid(1e-6, {"position": np.ones(n)}, {"position": 2e-3}, np.zeros(n, np.uint8))
     chosen = {"position": np.flatnonzero(change.gains(grid.theta) > 0)}
     return (
-        layer({"position": change}, chosen, grid, times, 10, 1e-9, places if grouped else None),
+        layer({"position": change}, chosen, grid, times, 10, 1e-9),
         change,
         places,
         times,
     )
 
 
-@pytest.mark.parametrize("grouped", (False, True))
-def test_tracks_follow_the_bodies(grouped):
-    (tracks, done), change, places, times = fitted(grouped)
+def test_tracks_follow_the_bodies():
+    (whole, done), change, places, times = fitted()
     assert np.sqrt(np.mean(np.square(done["position"] - change.values))) < 4e-3
-    whole = tracks.alone(places.astype(np.float32))
     for i in (0, 7, 20):
         moved = change.values.reshape(len(places), 3, -1)[:, :, i]
         np.testing.assert_allclose(whole.residuals(times[i])["position"], moved, atol=0.03)
     assert np.abs(whole.residuals(times[10])["position"]).max() < 0.01  # the key instant stays
-
-
-def test_groups_leave_little_to_code():
-    (plain, _), *_ = fitted(False)
-    (shared, _), *_ = fitted(True)
-    assert shared.groups is not None and plain.groups is None
-    counts = [np.count_nonzero(tracks.heads["position"].coefficients) for tracks in (plain, shared)]
-    assert counts[1] < 0.1 * counts[0]
 
 
 def test_knots_are_where_paths_bend():
@@ -158,70 +138,3 @@ def test_knots_are_where_paths_bend():
     found = knots(paths, times, 5, 1e-12)
     assert found.tolist() == [0, 5, 12, 20, 30]
     np.testing.assert_allclose(between(times[found], paths[:, found], times), paths, atol=1e-12)
-
-
-@given(st.integers(1, 6), st.integers(1, 3), st.integers(0, 10**6))
-def test_runs_have_the_least_cost(n, groups, seed):
-    costs = np.random.default_rng(seed).uniform(0, 3, (n, groups)).astype(np.float32)
-
-    def cost(labels):
-        return costs[np.arange(n), labels].sum() + 1.5 * np.count_nonzero(np.diff(labels))
-
-    every = np.stack(np.meshgrid(*[np.arange(groups)] * n), axis=-1).reshape(-1, n)
-    assert cost(_runs(costs, np.float32(1.5))) == pytest.approx(min(map(cost, every)), abs=1e-4)
-
-
-# -- groups in files ---------------------------------------------------------------------------------------------------
-
-
-@given(st.lists(st.tuples(st.integers(-9, 9), st.integers(0, 6)), max_size=20))
-def test_classes_do_not_concern_the_predictor_of_groups(pairs):
-    k, classes = np.array(pairs, np.int32).reshape(-1, 2).T
-    table = RowTable((Rows(5, 1, 1.0, WHOLE),), np.zeros(1, np.int32))
-    v = table.values(k[None], classes)
-    np.testing.assert_array_equal(v[0], np.cumsum(k))
-    np.testing.assert_array_equal(table.symbols(v, classes), k[None])
-
-
-def scene_of_groups():
-    (tracks, _), _, places, _ = fitted(True)
-    n, rng = len(places), np.random.default_rng(5)
-    box = np.array([places.min(axis=0), places.max(axis=0)], np.float32)
-    info = SceneInfo(0.25, box, (0.0, 1.0), (0.0, 0.0, 0.0), 0.1, 9.0, (0.0, 0.0, 1.0), 0.0, None)
-    _, cells = voxels(places)
-    sizes = {"offset": 3, "color": 3, "opacity": 1, "scale": 3, "rotation": 3}
-    tensors = {name: np.rint(rng.normal(0, 3, (n, c))).astype(np.float32) / 16 for name, c in sizes.items()}
-    tensors["opacity"] += 3
-    classes, centres = (
-        rng.integers(0, 7, n).astype(np.uint8),
-        {name: np.zeros(c, np.int32) for name, c in sizes.items()},
-    )
-    steps = dict.fromkeys(sizes, 1 / 1024)
-    return splats.scene(
-        info, cells.astype(np.int32), tensors, steps, classes=classes, centres=centres, tracks={1: tracks}
-    )
-
-
-def test_groups_come_back_from_a_file_and_move_the_same():
-    scene = scene_of_groups()
-    found = decode(encode(scene, effort=1))
-    here, there = np.lexsort(scene.anchor_q.T), np.lexsort(found.anchor_q.T)
-    given_, read = scene.tracks[1].groups, found.tracks[1].groups
-    np.testing.assert_array_equal(read.rows[there], given_.rows[here])
-    np.testing.assert_array_equal(read.centres, given_.centres)
-    np.testing.assert_array_equal(read.maps["position"], given_.maps["position"])
-    (before, rows), (after, others) = Moving(scene).at(0.0), Moving(found).at(0.0)
-    rows, others = (np.argsort(order)[kept] for order, kept in ((here, rows), (there, others)))
-    still = scene.anchor_at(slice(None)).std()
-    moved = before.means[np.argsort(rows)] - after.means[np.argsort(others)]
-    assert np.abs(moved).max() < 0.1 * still
-
-
-def test_a_group_that_is_not_there_is_malformed():
-    scene = scene_of_groups()
-    groups = scene.tracks[1].groups
-    rows = groups.rows.copy()
-    rows[7] = len(groups.centres)
-    wrong = replace(scene.tracks[1], groups=Groups(rows, groups.centres, groups.maps))
-    with pytest.raises(Malformed, match="a row in group"):
-        decode(encode(replace(scene, tracks={1: wrong}), effort=1, verify=False))
