@@ -9,7 +9,7 @@ all bases are nearly straight are left out. Layer 2 takes the components that ma
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -29,22 +29,17 @@ from pd4dgs_codec.interchange.pack import (
 )
 from pd4dgs_codec.interchange.sampled import Sampled
 from pd4dgs_codec.interchange.splats import picture
+from pd4dgs_codec.interchange.tracks import STRAIGHT, Change, layer
 from pd4dgs_codec.kinds import splats
 from pd4dgs_codec.kinds.splats import Splats, product
-from pd4dgs_codec.kinds.tracks import Head, Tracks
+from pd4dgs_codec.kinds.tracks import Tracks
 from pd4dgs_codec.scene import Camera, SceneInfo
 
 #: Consecutive views without times are this share of the duration apart, so that few views cover all of it.
 GOLDEN = (5**0.5 - 1) / 2
-BASIS_STEP = 2.0**-10  #: of all grids; bases are scaled to it
-BITS = 6  #: about those of a basis at an instant
-BIT = 2 * np.log(2)  #: what a bit is worth, in units of the error that a scalar may add
-MOST_BASES = 80  #: of a head, components and a limit of the format on channels
-STRAIGHT = 0.05  #: the share of the allowed error that left-out instants may add
 CHECKED = 12  #: pictures that measure the error
 #: Windows are precise to PRECISE of the width that all but the share SHORT of them have.
 PRECISE, SHORT = 0.1, 0.01
-STATIC = 1e-12  #: the least share of a picture's squared error for which anything changes
 
 
 class Views(Sequence[Any]):
@@ -69,17 +64,6 @@ class Views(Sequence[Any]):
 
     def __iter__(self) -> Iterator[tuple[Camera, Splats]]:
         return (self[i] for i in range(len(self)))
-
-
-@dataclass(frozen=True, eq=False)
-class _Change:
-    """How a head changes: values float32 [m, c T] of the moving rows, weights float64 [m], T instants, c components."""
-
-    values: np.ndarray
-    weights: np.ndarray
-    components: int
-    vectors: np.ndarray  #: float64 [c T, K], mean squares over time of 1
-    energies: np.ndarray  #: float64 [K], squared errors of pictures without each
 
 
 class Packer:
@@ -124,12 +108,13 @@ class Packer:
         return float(np.exp(np.mean(np.log(np.maximum(errors, 1e-12)))))
 
     def _scene(self, theta: float, error: float) -> splats.SplatScene:
-        grid = Grid.of(self.ordered.weights, self.ordered.channels, theta)
+        grid = self.ordered.grid(theta)
         packed = self.ordered.packed(grid)
         tensors, steps, centres = self._tensors(packed)
         found = splats.scene(
             replace(self.info, voxel_size=packed.voxel_size), packed.cells, tensors, steps,
-            classes=packed.classes, centres=centres, tracks=self._tracks(grid, error),
+            classes=packed.classes, centres=centres,
+            tracks=self._tracks(grid, error),
         )  # fmt: skip
         return found
 
@@ -154,7 +139,7 @@ class Packer:
 
     # -- what changes --------------------------------------------------------------------------------------------------
 
-    def _changes(self) -> dict[str, _Change]:
+    def _changes(self) -> dict[str, Change]:
         """Returns the principal components of what changes, by head, without heads in which nothing does."""
         s, rows, key = self.source, self.ordered.rows, self.key
         made: dict[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -167,91 +152,32 @@ class Packer:
         found = {}
         for name, make in made.items():
             values = np.ascontiguousarray(make(rows).transpose(1, 2, 0), np.float32)  # [n, c, T]
-            n, components, instants = values.shape
-            values = values.reshape(n, -1)
-            weights = self.ordered.weights[name]
-            root = np.sqrt(weights / instants)[:, None].astype(np.float32)
-            gram = (values * root).T.astype(np.float64) @ (values * root)
-            energies, vectors = np.linalg.eigh(gram)
-            order = np.argsort(-energies)[:MOST_BASES]
-            order = order[energies[order] > max(STATIC, 1e-9 * energies.max())]
-            if len(order):
-                vectors = vectors[:, order] * np.sqrt(instants)
-                found[name] = _Change(values, weights, components, vectors, energies[order])
+            if change := Change.of(values, self.ordered.weights[name]):
+                found[name] = change
         return found
 
     def _tracks(self, grid: Grid, error: float) -> dict[int, Tracks]:
         """Returns the tracks of layers 1 and 2. error: the mean squared error of pictures that is aimed at."""
         kept = [
-            (energy, name, k)
+            (change.energies[k], name, int(k))
             for name, change in self.changes.items()
-            for k, energy in enumerate(change.energies)
-            if self._gain(change, k, grid.theta) > 0
+            for k in np.flatnonzero(change.gains(grid.theta) > 0)
         ]
         kept.sort(reverse=True)
         rest = np.cumsum([energy for energy, *_ in kept][::-1])[::-1]
         first = [row for row, behind in zip(kept, rest, strict=True) if behind > error]
-        layers = {1: first or kept, 2: kept[len(first) :] if first else []}
-        values = {name: change.values for name, change in self.changes.items()}
-        return {layer: self._layer(own, grid, values) for layer, own in layers.items() if own}
-
-    def _gain(self, change: _Change, k: int, theta: float) -> float:
-        """Returns by how much a component lowers the error, less what its bits are worth."""
-        change_of = change.weights * np.square(change.values @ (change.vectors[:, k] / len(self.source.times)))
-        bits = 0.5 * np.log2(1 + change_of / theta).sum() + BITS * len(change.vectors)
-        return float(np.maximum(change_of - theta, 0).sum() - BIT * theta * bits)
-
-    def _layer(self, chosen: Sequence[tuple[float, str, int]], grid: Grid, values: dict[str, np.ndarray]) -> Tracks:
-        """Quantises the bases of components, and fits coefficients to the values, which become what is left."""
-        instants, names = len(self.source.times), sorted({name for _, name, _ in chosen})
-        bases, steps = {}, {}
-        for name in names:
-            change, columns = self.changes[name], [k for _, other, k in chosen if other == name]
-            step = np.sqrt(12 * grid.theta * instants / change.energies[columns].max())  # of bases
-            bases[name] = change.vectors[:, columns].T.reshape(len(columns), change.components, instants)
-            steps[name] = step
-        knots = self._knots(bases, chosen, grid)
-        times, heads = self.source.times, {}
-        for name in names:
-            scale = BASIS_STEP / min(steps[name], 0.05)
-            coded = np.rint(bases[name][:, :, knots] * scale / BASIS_STEP) * BASIS_STEP
-            whole = _between(times[knots], coded, times).reshape(len(coded), -1)
-            coefficients = values[name] @ np.linalg.pinv(whole)
-            step = float(np.float32(grid.steps[name] / scale))
-            spacing = step * np.ldexp(1.0, grid.classes.astype(int))[:, None]
-            exact = (np.rint(coefficients / spacing) * spacing).astype(np.float32)
-            values[name] = values[name] - exact @ whole.astype(np.float32)
-            heads[name] = Head(coded.astype(np.float32), exact, step)
-        return Tracks.of(times[knots], BASIS_STEP, heads)
-
-    def _knots(self, bases: dict[str, np.ndarray], chosen: Sequence[tuple[float, str, int]], grid: Grid) -> np.ndarray:
-        """Returns the instants that are kept, int64: the ends and the key, then the one at which straight lines are
-        farthest off, until what they add is small."""
-        times, columns = self.source.times, []
-        for name, values in bases.items():
-            energies = [energy for energy, other, _ in chosen if other == name]
-            columns.append((values * np.sqrt(energies)[:, None, None]).reshape(-1, len(times)))
-        paths, knots = np.concatenate(columns), sorted({0, self.key, len(times) - 1})
         allowed = STRAIGHT * grid.theta * len(self.ordered.rows) * sum(self.ordered.channels.values())
-        while len(knots) < len(times):
-            off = np.square(_between(times[knots], paths[:, knots], times) - paths).sum(axis=0)
-            if off.max() <= allowed:
-                break
-            ends = np.searchsorted(knots, np.arange(len(times)))
-            knots = sorted({*knots, *(int(g[off[g].argmax()]) for g in _groups(ends) if off[g].max() > allowed)})
-        return np.array(knots)
-
-
-def _groups(labels: np.ndarray) -> list[np.ndarray]:
-    """Splits the indices of sorted labels by label."""
-    return np.split(np.arange(len(labels)), np.flatnonzero(np.diff(labels)) + 1)
-
-
-def _between(knots: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Interpolates values [.., knots] linearly at times [T]: [.., T]."""
-    j = np.clip(np.searchsorted(knots, times, side="right") - 1, 0, len(knots) - 2)
-    f = (times - knots[j]) / (knots[j + 1] - knots[j])
-    return np.asarray(values[..., j] * (1 - f) + values[..., j + 1] * f)
+        changes, layers = self.changes, {1: first or kept, 2: kept[len(first) :] if first else []}
+        found = dict[int, Tracks]()
+        for number, own in layers.items():
+            if not own:
+                continue
+            chosen = {name: np.array([k for _, other, k in own if other == name]) for name in changes}
+            chosen = {name: ks for name, ks in chosen.items() if len(ks)}
+            found[number], done = layer(changes, chosen, grid, self.source.times, self.key, allowed)
+            for name, values in done.items():
+                changes = changes | {name: replace(changes[name], values=changes[name].values - values)}
+        return found
 
 
 def _spread(count: int, most: int) -> list[int]:

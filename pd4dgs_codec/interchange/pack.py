@@ -28,6 +28,9 @@ YCOCG = np.array([[0.25, 0.5, 0.25], [0.5, 0.0, -0.5], [-0.25, 0.5, -0.25]])
 #: looks like a sheet.
 LEAST_OPACITY, LEAST_SHARE = 1e-3, np.exp(-6)
 FINEST = 0.01  #: the share of Gaussians that would have finer steps than class 0 gives
+#: The largest steps: of positions in sizes of the Gaussian, and of other tensors. Steps of class 0 are less than the
+#: median by SPREAD.
+OWN_SIZE, BOUNDS, SPREAD = 4.0, {"opacity": np.array(3.0), "scale": np.array(1.0), "rotation": np.array(0.5)}, 16
 LONELY = 0.85  #: the share of Gaussians that have a voxel for themselves, at least
 FARTHEST = 2.0**18  #: most voxels between 0 and a position, far within the range of voxels
 KEYS = np.array([1, 1 << 21, 1 << 42])  #: of voxels, which are numbers
@@ -174,16 +177,21 @@ class Grid:
     classes: np.ndarray
 
     @staticmethod
-    def of(weights: Tensors, channels: dict[str, int], theta: float) -> Grid:
-        """Chooses steps and classes. channels: the number of a Gaussian's scalars by tensor."""
+    def of(weights: Tensors, channels: dict[str, int], bounds: Tensors, theta: float) -> Grid:
+        """Chooses steps and classes. channels: the number of a Gaussian's scalars by tensor. bounds: the largest step,
+        [n] or one for all, by tensor: derivatives tell nothing about larger errors, which uncover what is hidden."""
         classes, steps = np.zeros(len(weights["color"])), dict[str, float]()
-        for turn in range(6):  # steps follow from classes, and classes from steps
+        for turn in range(7):  # steps follow from classes, and classes from steps
             steps = {name: np.sqrt(12 * theta / np.mean(h * 4.0**classes)) for name, h in weights.items()}
-            if turn == 5:
+            steps |= {name: min(steps[name], np.median(most) / SPREAD) for name, most in bounds.items()}
+            if turn == 6:
                 break
             added = np.sum([h * (channels[name] * steps[name] ** 2 / 12) for name, h in weights.items()], axis=0)
             own = 0.5 * np.log2(theta * sum(channels.values()) / np.maximum(added, 1e-12 * added.max()))
-            classes = np.clip(np.rint(own - np.quantile(own, FINEST)), 0, MAX_CLASS)
+            own = np.rint(own - np.quantile(own, FINEST))
+            for name, most in bounds.items():
+                own = np.minimum(own, np.floor(np.log2(np.maximum(most / steps[name], 1))))
+            classes = np.clip(own, 0, MAX_CLASS)
         return Grid(theta, weights, {k: float(np.float32(q)) for k, q in steps.items()}, classes.astype(np.uint8))
 
     def rounded(self, values: np.ndarray, step: float, weight: np.ndarray, centre: np.ndarray | int = 0) -> np.ndarray:
@@ -243,6 +251,11 @@ class Ordered:
         return Ordered(
             tensors_of(splats.taken(rows)), {k: h[rows] for k, h in weights.items()}, voxel_size, cells, rows
         )
+
+    def grid(self, theta: float) -> Grid:
+        """Returns the grid for an error by each scalar."""
+        bounds = BOUNDS | {"position": OWN_SIZE * np.exp(self.values["scale"].max(axis=1))}
+        return Grid.of(self.weights, self.channels, bounds, theta)
 
     @property
     def channels(self) -> dict[str, int]:
