@@ -6,11 +6,11 @@ import numpy as np
 from hypothesis import strategies as st
 from strategies import LAYER_SETS, RANGES, info, symbols
 
-from pd4dgs_codec.format.quantise import dequantise
 from pd4dgs_codec.kinds import splats
 from pd4dgs_codec.kinds.splats import TENSORS, SplatScene
 from pd4dgs_codec.kinds.tracks import HEADS, Head, Tracks
 from pd4dgs_codec.scene import MAX_CLASS, Grading, SceneInfo
+from pd4dgs_codec.tensors.quantise import dequantise
 
 STEPS = {"offset": 1 / 16, "color": 1 / 32, "opacity": 1 / 4, "scale": 1 / 8, "rotation": 1 / 32, "harmonics": 1 / 32,
          "window": 1 / 64}  # fmt: skip

@@ -20,7 +20,6 @@ from pd4dgs_codec.entropy.channels import ChannelReader, ChannelWriter, split
 from pd4dgs_codec.entropy.fitting import Fitted
 from pd4dgs_codec.entropy.priors import norm_cdf28_of_each, tables_of_each
 from pd4dgs_codec.format.info import info as info_of
-from pd4dgs_codec.format.quantise import NO_CLASSES, Rows, RowTable, dequantise
 from pd4dgs_codec.scene import (
     DEFAULT_WIDTHS,
     INSTANTS,
@@ -36,6 +35,7 @@ from pd4dgs_codec.scene import (
     Widths,
     plane_shapes,
 )
+from pd4dgs_codec.tensors.quantise import NO_CLASSES, Rows, RowTable, dequantise
 
 HUGE = 1 << 23
 LAYER_SETS = ((0,), (0, 1), (0, 2), (0, 1, 2))

@@ -38,7 +38,7 @@ ALLOWED = read_map()
 #: These may import every room but `cli`: what the package measures of itself, its commands, its entry points.
 ABOVE_ALL = {"bench", "cli", "__init__", "__main__"}
 #: Rooms that a decoder is made of, and the libraries that they may use.
-DECODER = ("errors", "scene", "entropy", "format", "kinds", "web")
+DECODER = ("errors", "scene", "entropy", "tensors", "kinds", "format", "web")
 LIBRARIES = {"numpy", "constriction", "msgpack", "zstandard"}
 
 

@@ -11,8 +11,6 @@ from pd4dgs_codec import kinds
 from pd4dgs_codec.errors import DecodeError, EncodeError
 from pd4dgs_codec.format.header import MAX_CAMERA_SIDE, info_fault
 from pd4dgs_codec.format.plan import SceneSymbols
-from pd4dgs_codec.format.quantise import all_finite, dequantise, expect, expect_array, is_step, magnitude, row_blocks
-from pd4dgs_codec.format.tables import Tensors
 from pd4dgs_codec.kinds import AnyScene
 from pd4dgs_codec.kinds.tracks import Tracks
 from pd4dgs_codec.morton import MAX_VOXEL
@@ -29,6 +27,8 @@ from pd4dgs_codec.scene import (
     Scene,
     SceneInfo,
 )
+from pd4dgs_codec.tensors.quantise import all_finite, dequantise, expect, expect_array, is_step, magnitude, row_blocks
+from pd4dgs_codec.tensors.tables import Tensors
 
 
 def check_scene(scene: AnyScene) -> None:

@@ -6,8 +6,8 @@ from os import PathLike
 from pd4dgs_codec import kinds
 from pd4dgs_codec.errors import DecodeError, Truncated
 from pd4dgs_codec.format.reader import LayerReader, bytes_of
-from pd4dgs_codec.format.symbols import LayerSymbols
 from pd4dgs_codec.kinds import AnyScene
+from pd4dgs_codec.tensors.symbols import LayerSymbols
 
 
 def decode(

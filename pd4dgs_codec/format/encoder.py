@@ -26,13 +26,14 @@ from pd4dgs_codec.format.header import DIGEST_SIZE, Header, pack_header, payload
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.format.metadata import CHUNK_TYPE, Metadata, write_metadata
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
+from pd4dgs_codec.format.parameters import with_fill
 from pd4dgs_codec.format.payload import Past, StreamReport, write_slice
 from pd4dgs_codec.format.plan import LeftOut, SceneSymbols, plan
 from pd4dgs_codec.format.reader import read_layers
 from pd4dgs_codec.format.registry import MAX_CHUNKS
-from pd4dgs_codec.format.symbols import LayerSymbols, sliced
-from pd4dgs_codec.format.tables import Fill, with_fill
 from pd4dgs_codec.kinds import AnyScene, utility_of
+from pd4dgs_codec.tensors.symbols import LayerSymbols, sliced
+from pd4dgs_codec.tensors.tables import Fill
 from pd4dgs_codec.threads import one_blas_thread
 
 LATER = 2 / 3  #: size of the slices behind the first one of layer 0, of that one's

@@ -13,10 +13,11 @@ from pd4dgs_codec.format import canonical
 from pd4dgs_codec.format.canonical import Fields, as_integer, as_list, as_long
 from pd4dgs_codec.format.container import PREAMBLE_SIZE, SCENE_ID_SIZE
 from pd4dgs_codec.format.options import MODES
-from pd4dgs_codec.format.quantise import MAX_SYMBOL, RowTable
+from pd4dgs_codec.format.parameters import as_step, pack_rows, unpack_kind, unpack_rows
 from pd4dgs_codec.format.registry import LAYERS, MAX_CHUNKS, MAX_PAYLOAD
-from pd4dgs_codec.format.tables import Kind, as_step, pack_rows, unpack_kind, unpack_rows
 from pd4dgs_codec.scene import Camera, SceneInfo
+from pd4dgs_codec.tensors.quantise import MAX_SYMBOL, RowTable
+from pd4dgs_codec.tensors.tables import Kind
 
 # Keys of the header map.
 CHUNKS, MODE, KIND, ROWS, CENTRE, VOXEL_SIZE, BOX, TIME_RANGE = range(1, 9)

@@ -10,13 +10,14 @@ from pd4dgs_codec.errors import DecodeError
 from pd4dgs_codec.format.container import CHUNK_OVERHEAD, MAJOR, MINOR, read_chunk, read_preamble
 from pd4dgs_codec.format.header import unpack_header
 from pd4dgs_codec.format.metadata import CHUNK_TYPE, TEXTS, Metadata, read_metadata
-from pd4dgs_codec.format.quantise import NO_CLASSES, dequantise, quantise
+from pd4dgs_codec.format.parameters import Declared, read_parameters
 from pd4dgs_codec.format.reader import read_layers
 from pd4dgs_codec.format.registry import LAYERS
-from pd4dgs_codec.format.tables import Declared, Tables, read_parameters
 from pd4dgs_codec.kinds import AnyScene
 from pd4dgs_codec.kinds.splats import SplatScene
 from pd4dgs_codec.scene import MASK_STEP
+from pd4dgs_codec.tensors.quantise import NO_CLASSES, dequantise, quantise
+from pd4dgs_codec.tensors.tables import Tables
 
 FORMAT_VERSION = f"{MAJOR}.{MINOR}"
 

@@ -21,12 +21,13 @@ from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
 from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.format.options import EncodeOptions
-from pd4dgs_codec.format.planes import choose_predictor, read_planes, restore, write_planes
-from pd4dgs_codec.format.quantise import MAX_SYMBOL, NO_CLASSES, RowTable, magnitude
-from pd4dgs_codec.format.symbols import NO_LAYER_ROWS, LayerSymbols
-from pd4dgs_codec.format.tables import Declared, Parameters, Tables, Tensors, pack_parameters, read_parameters
+from pd4dgs_codec.format.parameters import Declared, Parameters, pack_parameters, read_parameters
 from pd4dgs_codec.morton import AXIS_BITS, MAX_VOXEL, morton_codes
 from pd4dgs_codec.scene import MASK_MIN_CODE, MAX_CLASS
+from pd4dgs_codec.tensors.planes import choose_predictor, read_planes, restore, write_planes
+from pd4dgs_codec.tensors.quantise import MAX_SYMBOL, NO_CLASSES, RowTable, magnitude
+from pd4dgs_codec.tensors.symbols import NO_LAYER_ROWS, LayerSymbols
+from pd4dgs_codec.tensors.tables import Tables, Tensors
 
 #: Groups of channels in reports, in coding order, and the one of mode lzma.
 GROUPS = ("positions", "masks", "attributes", "planes", "weights")

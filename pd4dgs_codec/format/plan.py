@@ -17,13 +17,13 @@ from pd4dgs_codec.entropy.fitting import entropy_bits
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.payload import write_slice
-from pd4dgs_codec.format.quantise import NO_CLASSES, ROW_PREDICTORS, Rows, RowTable, expect
-from pd4dgs_codec.format.symbols import NO_LAYER_ROWS, Growing, LayerSymbols, first_duplicate
-from pd4dgs_codec.format.tables import NOTHING, Kind, Tensors
 from pd4dgs_codec.kinds import AnyScene, hexplane
 from pd4dgs_codec.kinds.splats import SplatScene
 from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import MAX_CLASS, Deformation, S, Scene, SceneInfo
+from pd4dgs_codec.tensors.quantise import NO_CLASSES, ROW_PREDICTORS, Rows, RowTable, expect
+from pd4dgs_codec.tensors.symbols import NO_LAYER_ROWS, Growing, LayerSymbols, first_duplicate
+from pd4dgs_codec.tensors.tables import NOTHING, Kind, Tensors
 
 
 @dataclass(frozen=True, eq=False)

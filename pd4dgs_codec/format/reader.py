@@ -8,11 +8,12 @@ from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.errors import DecodeError, Malformed, Truncated, UnsupportedFeature
 from pd4dgs_codec.format.container import CHUNK_OVERHEAD, Chunk, read_chunk, read_preamble
 from pd4dgs_codec.format.header import Header, scene_id_of, unpack_header
+from pd4dgs_codec.format.parameters import Declared
 from pd4dgs_codec.format.payload import Past, read_slice
-from pd4dgs_codec.format.quantise import RowTable
 from pd4dgs_codec.format.registry import LAYERS
-from pd4dgs_codec.format.symbols import Growing, LayerSymbols, LayerTensors, TakenVoxels, check_slice, merged
-from pd4dgs_codec.format.tables import Declared, Kind, Tables, Tensors
+from pd4dgs_codec.tensors.quantise import RowTable
+from pd4dgs_codec.tensors.symbols import Growing, LayerSymbols, LayerTensors, TakenVoxels, check_slice, merged
+from pd4dgs_codec.tensors.tables import Kind, Tables, Tensors
 
 #: Checks a header's kind and rows and the last of the layers so far, by number: see `kinds.check`.
 Check = Callable[[Kind, RowTable, Mapping[int, Tensors]], None]

@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.errors import DecodeError, Malformed, UnsupportedFeature
-from pd4dgs_codec.format.quantise import Rows, RowTable, quantise
-from pd4dgs_codec.format.symbols import Growing
-from pd4dgs_codec.format.tables import NOTHING, Kind, Tables, Tensors
 from pd4dgs_codec.kinds import hexplane, scaffold, splats, tracks
 from pd4dgs_codec.kinds.splats import SplatScene
 from pd4dgs_codec.scene import ATTRIBUTES, PLANES, SCAFFOLD_NETWORKS, Scene, SceneInfo, Steps
+from pd4dgs_codec.tensors.quantise import Rows, RowTable, quantise
+from pd4dgs_codec.tensors.symbols import Growing
+from pd4dgs_codec.tensors.tables import NOTHING, Kind, Tables, Tensors
 
 #: A scene of any kind.
 AnyScene = Scene | SplatScene

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.errors import Malformed
-from pd4dgs_codec.format.planes import cells_read, fill_plane
-from pd4dgs_codec.format.tables import Grid, Kind, Tables, Tensors
 from pd4dgs_codec.kinds.scaffold import chains_of
 from pd4dgs_codec.scene import PLANES, TRUNK, Deformation, Widths, instant, plane_sides
+from pd4dgs_codec.tensors.planes import cells_read, fill_plane
+from pd4dgs_codec.tensors.tables import Grid, Kind, Tables, Tensors
 
 NUMBER, NAME = 0, "hexplane"
 

@@ -10,9 +10,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from pd4dgs_codec.errors import Malformed
-from pd4dgs_codec.format.quantise import RowTable
-from pd4dgs_codec.format.symbols import Growing
-from pd4dgs_codec.format.tables import Chain, Kind, Tables, Tensors
 from pd4dgs_codec.scene import (
     ATTRIBUTES,
     MAX_FEATURE,
@@ -26,6 +23,9 @@ from pd4dgs_codec.scene import (
     Steps,
     Widths,
 )
+from pd4dgs_codec.tensors.quantise import RowTable
+from pd4dgs_codec.tensors.symbols import Growing
+from pd4dgs_codec.tensors.tables import Chain, Kind, Tables, Tensors
 
 NUMBER, NAME = 0, "scaffold"
 

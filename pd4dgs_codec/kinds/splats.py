@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.errors import Malformed
-from pd4dgs_codec.format.quantise import RowTable, dequantise
-from pd4dgs_codec.format.symbols import Growing
-from pd4dgs_codec.format.tables import Kind, Tables
 from pd4dgs_codec.kinds.tracks import Tracks, total, tracks_of
 from pd4dgs_codec.scene import MASK_STEP, MIN_OPACITY, Gaussians, Grading, LayeredScene, SceneInfo
+from pd4dgs_codec.tensors.quantise import RowTable, dequantise
+from pd4dgs_codec.tensors.symbols import Growing
+from pd4dgs_codec.tensors.tables import Kind, Tables
 
 NUMBER, NAME = 1, "splats"
 

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.errors import Malformed
-from pd4dgs_codec.format.quantise import Rows
-from pd4dgs_codec.format.tables import Grid, Tables, Tensors
+from pd4dgs_codec.tensors.quantise import Rows
+from pd4dgs_codec.tensors.tables import Grid, Tables, Tensors
 
 NUMBER, NAME = 1, "tracks"
 

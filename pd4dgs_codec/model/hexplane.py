@@ -19,12 +19,12 @@ from torch.autograd.function import once_differentiable
 from pd4dgs_codec.draw import hexplane as kernels
 from pd4dgs_codec.draw.hexplane import SPATIAL, TEMPORAL, PlaneLayout
 from pd4dgs_codec.draw.simd import LANES
-from pd4dgs_codec.format.planes import rate_bits
-from pd4dgs_codec.format.quantise import quantise
 from pd4dgs_codec.model import plane_terms
 from pd4dgs_codec.model.config import DeformationConfig
 from pd4dgs_codec.model.networks import round_straight_through, rounded
 from pd4dgs_codec.scene import PLANES, Planes, plane_shapes, plane_sides
+from pd4dgs_codec.tensors.planes import rate_bits
+from pd4dgs_codec.tensors.quantise import quantise
 from pd4dgs_codec.threads import kernel_threads
 
 #: Range of the start values of spatial planes.

@@ -22,7 +22,6 @@ from torch import Tensor, nn
 
 from pd4dgs_codec.draw.gaussians import OFFSET_REACH, SIGMA_REACH, in_view
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.format.quantise import mask_codes
 from pd4dgs_codec.model import fused, reference
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.networks import EXACT, MLP, Quantisation, Rounding, level_mask, mask_logits
@@ -39,6 +38,7 @@ from pd4dgs_codec.scene import (
     Steps,
     Widths,
 )
+from pd4dgs_codec.tensors.quantise import mask_codes
 
 #: Range over which the opacity biases of an anchor's Gaussians, which start at one place, are spread at the start: some
 #: but not all of them are visible everywhere.

@@ -13,7 +13,6 @@ from pd4dgs_codec.data.view import View
 from pd4dgs_codec.draw.player import drawer
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import in_file_order, layer_symbols, passed, symbols_of, tensor_bytes
-from pd4dgs_codec.format.tables import Fill
 from pd4dgs_codec.kinds import AnyScene
 from pd4dgs_codec.model.model import Model, from_scene
 from pd4dgs_codec.model.networks import EXACT, Rounding
@@ -21,6 +20,7 @@ from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.model.sensitivity import omission_error, smaller, utility, without
 from pd4dgs_codec.quality.image import mean_scores, mpsnr, to_uint8
 from pd4dgs_codec.scene import Scene, Viewpoint
+from pd4dgs_codec.tensors.tables import Fill
 
 #: dB of a picture at most in means: one that equals its image would decide them alone.
 MOST_DB = 100.0

@@ -16,10 +16,10 @@ from pd4dgs_codec.format.encoder import Report, encode_with_report, with_metadat
 from pd4dgs_codec.format.metadata import Metadata
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.plan import LeftOut, plan
-from pd4dgs_codec.format.tables import Fill
 from pd4dgs_codec.kinds import AnyScene
 from pd4dgs_codec.quality.frames import own_frames
 from pd4dgs_codec.scene import LayeredScene, Scene, SceneInfo, Viewpoint
+from pd4dgs_codec.tensors.tables import Fill
 
 if TYPE_CHECKING:
     import numpy as np

@@ -26,9 +26,9 @@ from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.payload import write_slice
 from pd4dgs_codec.format.plan import LeftOut, Plan, in_file_order, passed, plan
 from pd4dgs_codec.format.registry import MAX_PAYLOAD
-from pd4dgs_codec.format.symbols import LayerSymbols, sliced
 from pd4dgs_codec.kinds import AnyScene, step_names
 from pd4dgs_codec.scene import Scene
+from pd4dgs_codec.tensors.symbols import LayerSymbols, sliced
 
 #: Values tried: log2 of the factor on a step, and the share of a layer's anchors that leave it.
 OCTAVES = (0.0, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0)

@@ -7,9 +7,9 @@ import pytest
 from strategies import make_scene
 
 from pd4dgs_codec.errors import EncodeError
-from pd4dgs_codec.format import quantise, tables
 from pd4dgs_codec.format.encoder import encode_with_report
 from pd4dgs_codec.scene import Widths
+from pd4dgs_codec.tensors import quantise, tables
 
 
 def scene_off_the_grid(graded=False):

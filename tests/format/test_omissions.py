@@ -11,8 +11,8 @@ from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import plan
-from pd4dgs_codec.format.planes import PREDICTORS, cells_read, fill_plane, residual
 from pd4dgs_codec.scene import DEFAULT_WIDTHS, PLANES, Deformation, Scene, Widths
+from pd4dgs_codec.tensors.planes import PREDICTORS, cells_read, fill_plane, residual
 
 SIDES = (6, 5, 7, 5)
 

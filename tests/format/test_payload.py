@@ -11,12 +11,13 @@ from strategies import assert_same_symbols
 from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.errors import EncodeError, Malformed
 from pd4dgs_codec.format.options import EncodeOptions
+from pd4dgs_codec.format.parameters import Declared, with_fill
 from pd4dgs_codec.format.payload import Past, read_slice, write_slice
-from pd4dgs_codec.format.quantise import MAX_SYMBOL, NO_CLASSES, Rows, RowTable
-from pd4dgs_codec.format.symbols import LayerSymbols, sliced
-from pd4dgs_codec.format.tables import Chain, Declared, Grid, Tables, Tensors, with_fill
 from pd4dgs_codec.morton import MAX_VOXEL, morton_order
 from pd4dgs_codec.scene import MAX_CLASS
+from pd4dgs_codec.tensors.quantise import MAX_SYMBOL, NO_CLASSES, Rows, RowTable
+from pd4dgs_codec.tensors.symbols import LayerSymbols, sliced
+from pd4dgs_codec.tensors.tables import Chain, Grid, Tables, Tensors
 
 FAST = EncodeOptions(effort=1)
 LZMA = EncodeOptions(effort=1, mode="lzma")

@@ -9,7 +9,7 @@ from strategies import assert_same_symbols, busy, memory_below
 
 from pd4dgs_codec.entropy.channels import ChannelReader, ChannelWriter, Places
 from pd4dgs_codec.entropy.priors import K_MAX
-from pd4dgs_codec.format.planes import (
+from pd4dgs_codec.tensors.planes import (
     CLASSES,
     MEDIAN,
     UP,
@@ -21,7 +21,7 @@ from pd4dgs_codec.format.planes import (
     restore,
     write_planes,
 )
-from pd4dgs_codec.format.quantise import MAX_SYMBOL
+from pd4dgs_codec.tensors.quantise import MAX_SYMBOL
 
 shapes = st.tuples(st.integers(1, 3), st.integers(1, 9), st.integers(1, 9))
 

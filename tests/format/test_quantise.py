@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pd4dgs_codec.errors import EncodeError, Malformed
-from pd4dgs_codec.format.quantise import MAX_SYMBOL, NO_CLASSES, Rows, RowTable, dequantise, mask_codes, quantise
 from pd4dgs_codec.scene import MAX_CLASS
+from pd4dgs_codec.tensors.quantise import MAX_SYMBOL, NO_CLASSES, Rows, RowTable, dequantise, mask_codes, quantise
 
 steps = st.floats(2.0**-100, 2.0**90, width=32)
 

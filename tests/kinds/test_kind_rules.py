@@ -14,9 +14,9 @@ from pd4dgs_codec.format.header import pack_header, scene_id_of
 from pd4dgs_codec.format.info import hashes, info
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.payload import write_slice
-from pd4dgs_codec.format.quantise import Rows, RowTable
 from pd4dgs_codec.format.reader import decode_tensors, read_layers
-from pd4dgs_codec.format.tables import Chain, Grid, Tables, Tensors
+from pd4dgs_codec.tensors.quantise import Rows, RowTable
+from pd4dgs_codec.tensors.tables import Chain, Grid, Tables, Tensors
 
 
 @cache

@@ -19,12 +19,12 @@ from pd4dgs_codec.format.encoder import encode_with_report
 from pd4dgs_codec.format.info import hashes, info, to_npz_dict
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import plan
-from pd4dgs_codec.format.quantise import Rows, RowTable
 from pd4dgs_codec.format.reader import decode_tensors, read_layers
-from pd4dgs_codec.format.tables import Chain, Grid
 from pd4dgs_codec.kinds import splats
 from pd4dgs_codec.kinds.splats import harmonics
 from pd4dgs_codec.kinds.tracks import HEADS, Head, Tracks
+from pd4dgs_codec.tensors.quantise import Rows, RowTable
+from pd4dgs_codec.tensors.tables import Chain, Grid
 
 CODINGS = {"ans": {}, "slices": {"slices": 1500}, "lzma": {"mode": "lzma"}}
 #: Normalised times of a scene.

@@ -17,9 +17,9 @@ from pd4dgs_codec.entropy.priors import K_MAX, NORMAL, OCTAVE
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.info import hashes
-from pd4dgs_codec.format.quantise import MAX_SYMBOL, dequantise
 from pd4dgs_codec.kinds.splats import harmonics
 from pd4dgs_codec.morton import morton_order
+from pd4dgs_codec.tensors.quantise import MAX_SYMBOL, dequantise
 
 SPEC = Path(__file__).parents[2] / "spec"
 TEXT = (SPEC / "format.md").read_text(encoding="utf-8")

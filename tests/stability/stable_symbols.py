@@ -19,9 +19,9 @@ from pd4dgs_codec.entropy import channels
 from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format import decoder, encoder
-from pd4dgs_codec.format import quantise as q
 from pd4dgs_codec.model import networks, rate
 from pd4dgs_codec.scene import MASK_THRESHOLD
+from pd4dgs_codec.tensors import quantise as q
 
 # -- rate: values and gradients against mpmath over sixteen decades of sigma / Q ---------------------------------------
 

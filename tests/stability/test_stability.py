@@ -12,8 +12,8 @@ from promises import FAIL, Promise, run_case
 
 from pd4dgs_codec.entropy import channels
 from pd4dgs_codec.errors import DataError, EncodeError
-from pd4dgs_codec.format import quantise
 from pd4dgs_codec.model import hexplane, networks, rate, reference
+from pd4dgs_codec.tensors import quantise
 from pd4dgs_codec.threads import one_torch_thread
 
 CASES = [

@@ -28,7 +28,8 @@ from pd4dgs_codec.format.container import CHUNK_OVERHEAD, read_chunk, read_pream
 from pd4dgs_codec.format.decoder import decode_partial
 from pd4dgs_codec.format.header import unpack_header
 from pd4dgs_codec.format.info import hashes, info
-from pd4dgs_codec.format.tables import Declared, Tables, read_parameters
+from pd4dgs_codec.format.parameters import Declared, read_parameters
+from pd4dgs_codec.tensors.tables import Tables
 
 from . import ROOT
 from .mutate import Case

@@ -13,7 +13,7 @@ from pd4dgs_codec.entropy.channels import ChannelReader, ChannelWriter, Places
 from pd4dgs_codec.entropy.fitting import Fitted, histogram
 from pd4dgs_codec.entropy.priors import BIT, Prior, frequency_costs
 from pd4dgs_codec.errors import Malformed
-from pd4dgs_codec.format.quantise import MAX_SYMBOL, magnitude
+from pd4dgs_codec.tensors.quantise import MAX_SYMBOL, magnitude
 
 PlaneShape = tuple[int, int, int]  #: of a plane: channels, rows, columns
 Array = np.ndarray

@@ -9,10 +9,10 @@ from itertools import chain
 import numpy as np
 
 from pd4dgs_codec.errors import Malformed
-from pd4dgs_codec.format.quantise import NO_CLASSES, RowTable, all_finite, dequantise, row_blocks
-from pd4dgs_codec.format.tables import Fill, Tables, Tensors
 from pd4dgs_codec.morton import MAX_VOXEL, morton_order
 from pd4dgs_codec.scene import Network
+from pd4dgs_codec.tensors.quantise import NO_CLASSES, RowTable, all_finite, dequantise, row_blocks
+from pd4dgs_codec.tensors.tables import Fill, Tables, Tensors
 
 NO_LAYER_ROWS = np.zeros((0, 0), np.int32)
 
