@@ -1,10 +1,10 @@
 """Renders other programs' Gaussians over time into a dataset: the source `teacher:PATH[?key=value&...]`.
 
-PATH is a folder of PLY, SPZ or .splat files, one per frame, in the order of the last number in their names, or one such
-file; a `.4dgs` file; a PLY file of SpacetimeGaussians (lite); a static gsplat checkpoint; a run of 3D Gaussian
-splatting, 4DGaussians or Deformable-3DGS or one of its `point_cloud/iteration_N`; or `module:function`, called with t
-in 0..1. The function returns means, quats (wxyz), scales, opacities and either colors or sh, as a mapping or as
-attributes, numpy arrays or tensors.
+PATH is a folder of PLY, SPZ, SOG or .splat files, one per frame, in the order of the last number in their names, or
+one such file; a `.4dgs` or `.splatv` file; a PLY file of SpacetimeGaussians (lite); a checkpoint of gsplat or 4DGS; a
+run of 3D Gaussian splatting, 4DGaussians, Deformable-3DGS or SC-GS or one of its `point_cloud/iteration_N`, or of 4DGS;
+or `module:function`, called with t in 0..1. The function returns means, quats (wxyz), scales, opacities and either
+colors or sh, as a mapping or as attributes, numpy arrays or tensors.
 
 Keys: cameras=SOURCE uses the training cameras of a dataset and their times. Otherwise views=N cameras (200) of
 size=WxH pixels (400x400) surround the Gaussians; a `cameras.json` beside them gives at most N cameras instead. fps=F
@@ -247,7 +247,7 @@ def read_model(place: str, fps: float, seconds: float | None = None) -> Teacher:
     if match := re.fullmatch(r"([A-Za-z_][\w.]*):([A-Za-z_]\w*)", place):
         return Teacher(_function(*match.groups()), None, 1.0)
     raise DataError(
-        f"{place}: found nothing, expected a folder of PLY, SPZ or .splat files, a run, a file, or module:function"
+        f"{place}: found nothing, expected a folder of PLY, SPZ, SOG or .splat files, a run, a file, or module:function"
     )
 
 
