@@ -223,7 +223,7 @@ def _fourd(path: Path, content: tuple[Any, ...], seconds: float | None) -> tuple
         block = slice(start, start + FOURD_ROWS)
         made = _conditional(quats[block], right[block], rest["scales"][block], variance[block])
         quats[block], rest["scales"][block], variance[block], speed[block] = made
-    variance += np.float32(max(Config.of(path.parent).number("prefilter_var", -1.0), 0.0))
+    variance += np.float32(max(Config.of(path.parent).number("prefilter_var", "-1"), 0.0))
     first, seconds = _span(take("t", 1), seconds)
     center, softness = (take("t", 1) - first) / seconds, np.minimum(np.sqrt(variance) / seconds, SOFTEST)
     window, terms = (center, 0 * center, softness), [speed * seconds]

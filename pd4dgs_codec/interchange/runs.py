@@ -34,7 +34,7 @@ import numpy as np
 from pd4dgs_codec.archives import read_tensors
 from pd4dgs_codec.data.files import LARGEST, WHITE, Color, array, number, read_file, read_vertices, whole_number
 from pd4dgs_codec.data.view import check_rotation, rotation_matrix, up_direction, world_to_camera
-from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.errors import DataError, one_line
 from pd4dgs_codec.interchange.splats import (
     activated,
     checked,
@@ -104,11 +104,11 @@ class Config:
             raise DataError(f"{self.path}: {name} is {found or 'missing'}, expected True or False")
         return found == "True"
 
-    def number(self, name: str, usual: float) -> float:
-        """Returns a number. usual: if the option is missing. Raises DataError."""
-        found = self.get(name)
+    def number(self, name: str, usual: str = "missing") -> float:
+        """Returns a number. usual: its text if the option is missing. Raises DataError."""
+        found = self.get(name) or usual
         try:
-            return usual if found is None else float(found)
+            return float(found)
         except ValueError:
             raise DataError(f"{self.path}: {name} is {found}, expected a number") from None
 
@@ -409,24 +409,24 @@ def _screwed(means: np.ndarray, axis: np.ndarray, way: np.ndarray) -> np.ndarray
 
 MOST_NODES, MOST_NEAR = 1 << 12, 16  #: nodes, and those that move a Gaussian
 FLOOR = 1e-7  #: added to the weights of nodes
-#: Options of SC-GS that no published setting uses.
-UNREAD_BY_NODES = ("use_hash", "skinning", "progressive_brand_time", "pred_opacity", "pred_color")
+#: Tensors of SC-GS's options use_hash, progressive_brand_time, pred_opacity and pred_color.
+UNREAD_BY_NODES = tuple(f"network.{name}" for name in ("hashgrid", "embed_time", "gaussian_opacity", "gaussian_color"))
 NODE_LAYERS = {"gaussian_warp": 3, "gaussian_scaling": 3, "gaussian_rotation": 4, "local_rotation": 4}
 
 
 def _node_move(state: State, config: Config, rest: Parts, features: np.ndarray) -> tuple[Parts, Move]:
     """Reads the nodes of SC-GS and their network. features: float32 [n, F], coordinates of Gaussians beside means, and
     perhaps the logit of their share of the motion. Returns (activated Gaussians and their nodes, Move of them)."""
-    if odd := [name for name in UNREAD_BY_NODES if config.flag(name, "False")]:
-        raise DataError(f"{config.path}: has {odd[0]}=True, expected False")
-    masked, local = (config.flag(name, "False") for name in ("gs_with_motion_mask", "local_frame"))
-    nodes, near = state.take("nodes", None, None), config.number("K", 3)
+    if odd := [name for name in state.tensors if str(name).startswith(UNREAD_BY_NODES)]:
+        raise DataError(f"{state.path}: has {one_line(odd[0], 60)}, which no published setting of SC-GS has")
+    nodes, near, local = state.take("nodes", None, None), config.number("K"), "network.local_rotation.weight"
     count, more, most = len(nodes), nodes.shape[1] - 3, min(len(nodes), MOST_NEAR)
-    if count > MOST_NODES or not 0 <= more <= features.shape[1] - masked or near not in range(1, most + 1):
+    masked = features.shape[1] - more == 1  # the option gs_with_motion_mask
+    if count > MOST_NODES or not 0 <= more == features.shape[1] - masked or near not in range(1, most + 1):
         found = f"nodes {nodes.shape}, {features.shape[1]} features in the PLY file, K={near:g}"
         raise DataError(f"{state.path}: {found}, expected at most {MOST_NODES}, 3 and the features, 1 to {most}")
-    limit, (layers_of, inputs, width) = config.number("max_d_scale", -1.0), positional(state, "network.")
-    names = [name for name in NODE_LAYERS if local or name != "local_rotation"]
+    limit, (layers_of, inputs, width) = config.number("max_d_scale", "-1"), positional(state, "network.")
+    names = [name for name in NODE_LAYERS if name != "local_rotation" or local in state.tensors]
     layers = {name: state.linear(f"network.{name}", width, NODE_LAYERS[name]) for name in names}
     radii, logits = state.take("_node_radius", count), state.take("_node_weight", count, 1)[:, 0]
     places, k = np.concatenate([rest["means"], features[:, :more]], axis=1), int(near)
@@ -458,7 +458,7 @@ def _node_move(state: State, config: Config, rest: Parts, features: np.ndarray) 
             return np.asarray(np.einsum("nk,nk...->n...", parts["weights"], values[parts["nodes"]]))
 
         shift = mean(added["gaussian_warp"])
-        if local:  # turns what is around a node
+        if "local_rotation" in added:  # turns what is around a node
             turns = rotation_matrix(unit(added["local_rotation"] + np.array([1, 0, 0, 0], np.float32)))
             around = mean(nodes - np.einsum("mab,mb->ma", turns, nodes))
             shift = shift + np.einsum("nab,nb->na", mean(turns), means) + around - means

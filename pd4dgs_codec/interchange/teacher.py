@@ -295,7 +295,7 @@ def _fourdgs(path: Path, data: bytes) -> Teacher:
         raise DataError(f"{path}: more than {most:,} numbers in a file of {len(data):,} bytes")
     try:
         with np.errstate(all="ignore"):  # `checked` drops Gaussians that are not finite
-            scene = fourdgs.read(data)
+            scene = fourdgs.read(data, recover_truncated=False)
     except (fourdgs.FourdgsError, ValueError, MemoryError, OSError) as error:
         raise DataError(f"{path}: fourdgs cannot read it: {one_line(str(error), 160)}") from None
     g, seconds = scene.gaussians, float(scene.header.duration_sec)

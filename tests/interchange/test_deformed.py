@@ -163,6 +163,8 @@ BROKEN = {
         ("_node_weight", None, "has no tensor _node_weight"),
         ("network.gaussian_warp.weight", torch.ones(3, 9), r"gaussian_warp.weight has shape \(3, 9\)"),
         ("network.linear.0.weight", None, "has no tensor network.linear.0.weight"),
+        ("network.hashgrid.encoding.params", torch.ones(3), "has network.hashgrid.encoding.params, which no published"),
+        ("network.gaussian_color.0.weight", torch.ones(3), "has network.gaussian_color.0.weight, which no published"),
     ],
 }  # fmt: skip
 
@@ -205,14 +207,10 @@ def test_broken_runs_are_one_line(tmp_path, file, content, message):
     "options, message",
     [
         (b"K=many", "K is many, expected a number"),
+        (b"L=3", "K is missing, expected a number"),
         (b"K=2.5", "K=2.5, expected at most 4096, 3 and the features, 1 to 16"),
         (b"K=1e99", "K=1e.99, expected at most"),
-        (b"use_hash=True", "has use_hash=True, expected False"),
-        (b"skinning=True", "has skinning=True"),
-        (b"pred_color=True", "has pred_color=True"),
-        (b"gs_with_motion_mask=True", "2 features in the PLY file"),
-        (b"local_frame=True", "has no tensor network.local_rotation.weight"),
-        (b"local_frame=1", "local_frame is 1, expected True or False"),
+        (b"K=3, max_d_scale=all", "max_d_scale is all, expected a number"),
     ],
 )
 def test_options_of_sc_gs_that_do_not_fit(tmp_path, options, message):

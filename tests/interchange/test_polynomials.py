@@ -231,6 +231,9 @@ def test_lines_and_windows_of_4dgs_files_are_exact(tmp_path, cli):
         mine = (bare.opacities * shown)[seen][here]
         np.testing.assert_allclose(mine, exact.opacities[exact.opacities > 0.05][there], atol=1e-5)
     packed(model, path, tmp_path / "a.pd4", cli)
+    path.write_bytes(path.read_bytes()[:-400])
+    with pytest.raises(DataError, match="a.4dgs: fourdgs cannot read it: "):
+        read_model(str(path), 30)
 
 
 # -- bad input ---------------------------------------------------------------------------------------------------------
