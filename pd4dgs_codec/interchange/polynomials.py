@@ -213,7 +213,7 @@ def _fourd(path: Path, content: tuple[Any, ...], seconds: float | None) -> tuple
         raise DataError(f"{path}: {sh.shape[1]} coefficients per colour, expected {count} for degree {degree}")
     cosines *= count == PLAIN and sh.shape[1] == 3 * PLAIN
     waves = [sh[:, PLAIN * i : PLAIN * (i + 1)] for i in range(1, cosines + 1)]
-    if parts[SKY] is not None:
+    if getattr(parts[SKY], "size", 0):
         warnings.warn(DamageWarning(f"{path}: its environment map is left out"), stacklevel=2)
     scales, quats, opacities = take("scaling", 3), take("rotation", 4), take("opacity", 1)[:, 0]
     rest = {"means": xyz, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh[:, :count]}
