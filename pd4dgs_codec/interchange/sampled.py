@@ -15,10 +15,9 @@ import numpy as np
 
 from pd4dgs_codec.draw.simd import kernel
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.interchange.runs import visible
 from pd4dgs_codec.interchange.splats import evenly
 from pd4dgs_codec.interchange.teacher import Teacher
-from pd4dgs_codec.kinds.splats import Splats
+from pd4dgs_codec.kinds.splats import Splats, visible
 
 MOST_FRAMES = 4096  #: instants of tracks, a limit of the format
 MOST_NUMBERS = 1 << 29  #: numbers of all samples, which take 2 GiB

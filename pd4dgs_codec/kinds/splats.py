@@ -149,6 +149,15 @@ def _rotations(p: np.ndarray) -> np.ndarray:
     return np.asarray(found)
 
 
+@np.errstate(all="ignore")
+def visible(windows: np.ndarray, t: float) -> np.ndarray:
+    """Returns float32 [n]: the factors on opacities at normalised time t of windows float32 [n, 3], whose columns are
+    centre, half width and softness."""
+    centre, half, softness = windows.T
+    excess = np.maximum(np.abs(np.float32(t) - centre) - half, 0)
+    return np.asarray(np.where(excess > 0, np.exp(-0.5 * np.square(excess / softness)), np.float32(1)))
+
+
 def sigmoid(x: np.ndarray) -> np.ndarray:
     """Returns 1 / (1 + exp(-x)) of logits of any shape."""
     with np.errstate(over="ignore"):
@@ -228,8 +237,8 @@ class Moving:
         self._rows, self._mask, self._fades = rows, mask, "opacity" in heads or "window" in tensors
         self._logits, self._logs, self._window = tensors["opacity"][:, 0], tensors["scale"], None
         if "window" in tensors:
-            centre, half, log = tensors["window"].T
-            self._window = centre.copy(), half.copy(), np.exp(log)
+            self._window = np.array(tensors["window"], order="F")
+            self._window[:, 2] = np.exp(self._window[:, 2])
         if "scale" not in heads:
             self._rest = replace(self._rest, scales=self._rest.scales * mask[:, None])
         columns = {name: np.asfortranarray(getattr(self._rest, name)) for name in ("means", "quats") if heads}
@@ -242,9 +251,7 @@ class Moving:
         rest, mask, added = self._rest, self._mask, total(self._tracks, t, len(self._rows))
         opacities = rest.opacities if "opacity" not in added else sigmoid(self._logits + added["opacity"][:, 0])
         if self._window is not None:
-            centre, half, softness = self._window
-            excess = np.maximum(np.abs(np.float32(t) - centre) - half, 0)
-            opacities = opacities * np.where(excess > 0, np.exp(-0.5 * np.square(excess / softness)), 1)
+            opacities = opacities * visible(self._window, t)
         changed: dict[str, np.ndarray] = {"opacities": opacities * mask}
         if "position" in added:
             changed["means"] = rest.means + added["position"]
