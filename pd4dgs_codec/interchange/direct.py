@@ -8,14 +8,13 @@ all bases are nearly straight are left out. Layer 2 takes the components that ma
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from pd4dgs_codec.interchange.pack import (
-    YCOCG,
     Grid,
     Ordered,
     Packed,
@@ -28,15 +27,14 @@ from pd4dgs_codec.interchange.pack import (
     turned,
 )
 from pd4dgs_codec.interchange.sampled import Sampled
-from pd4dgs_codec.interchange.splats import picture
+from pd4dgs_codec.interchange.splats import evenly, picture
+from pd4dgs_codec.interchange.teacher import GOLDEN
 from pd4dgs_codec.interchange.tracks import STRAIGHT, Change, layer
 from pd4dgs_codec.kinds import splats
-from pd4dgs_codec.kinds.splats import Splats, product
+from pd4dgs_codec.kinds.splats import YCOCG, product
 from pd4dgs_codec.kinds.tracks import Tracks
 from pd4dgs_codec.scene import Camera, SceneInfo
 
-#: Consecutive views without times are this share of the duration apart, so that few views cover all of it.
-GOLDEN = (5**0.5 - 1) / 2
 CHECKED = 12  #: pictures that measure the error
 #: Windows are precise to PRECISE of the width that all but the share SHORT of them have.
 PRECISE, SHORT = 0.1, 0.01
@@ -58,12 +56,7 @@ class Views(Sequence[Any]):
         return len(self.cameras)
 
     def __getitem__(self, i: Any) -> Any:
-        if isinstance(i, slice):
-            return Views(self.source, self.cameras[i], self.chosen[i])
         return self.cameras[i], self.source.frame(self.chosen[i], bare=False)
-
-    def __iter__(self) -> Iterator[tuple[Camera, Splats]]:
-        return (self[i] for i in range(len(self)))
 
 
 class Packer:
@@ -76,9 +69,7 @@ class Packer:
         pictures = Pictures(views, info.background, info.near)
         weights = sensitivity(pictures)
         step()
-        some = Views(
-            source, *zip(*[(views.cameras[i], views.chosen[i]) for i in _spread(len(views), CHECKED)], strict=True)
-        )
+        some = Views(source, evenly(views.cameras, CHECKED), evenly(views.chosen, CHECKED))
         self.pictures, self.times = Pictures(some, info.background, info.near), source.times[some.chosen]
         self.ordered = Ordered.of(source.frame(self.key), weights)
         self.changes = self._changes() if len(source.times) > 1 else {}
@@ -121,7 +112,7 @@ class Packer:
     def _tensors(self, packed: Packed) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, np.ndarray]]:
         """Returns tensors, steps and centres with the windows, exact multiples of the finest step of all classes."""
         tensors, steps, centres = dict(packed.tensors), dict(packed.steps), dict(packed.centres)
-        if "harmonics" not in tensors and tensors["color"].shape[1] > 3:
+        if tensors["color"].shape[1] > 3:
             color, middle = tensors["color"], centres["color"]
             tensors["color"], tensors["harmonics"] = color[:, :3], color[:, 3:]
             centres["color"], centres["harmonics"], steps["harmonics"] = middle[:3], middle[3:], steps["color"]
@@ -178,10 +169,6 @@ class Packer:
             for name, values in done.items():
                 changes = changes | {name: replace(changes[name], values=changes[name].values - values)}
         return found
-
-
-def _spread(count: int, most: int) -> list[int]:
-    return sorted({round(x) for x in np.linspace(0, count - 1, min(most, count))})
 
 
 def _logs(scales: np.ndarray) -> np.ndarray:

@@ -16,10 +16,10 @@ from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import Report, encode_with_report, with_metadata
 from pd4dgs_codec.format.metadata import Metadata
-from pd4dgs_codec.interchange.direct import GOLDEN, Packer
+from pd4dgs_codec.interchange.direct import Packer
 from pd4dgs_codec.interchange.sampled import Sampled, sampled
 from pd4dgs_codec.interchange.splats import evenly, picture
-from pd4dgs_codec.interchange.teacher import SOLID, Options, Teacher, cameras_of, read_model
+from pd4dgs_codec.interchange.teacher import GOLDEN, SOLID, Options, Teacher, cameras_of, read_model
 from pd4dgs_codec.kinds.splats import SplatScene
 from pd4dgs_codec.quality.image import mpsnr
 from pd4dgs_codec.scene import Camera, SceneInfo

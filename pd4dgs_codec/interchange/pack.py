@@ -18,12 +18,10 @@ import numpy as np
 
 from pd4dgs_codec.draw.rasteriser import Geometry, backward, composite, project
 from pd4dgs_codec.interchange.splats import picture, quaternions
-from pd4dgs_codec.kinds.splats import SH_C0, Splats, product
+from pd4dgs_codec.kinds.splats import SH_C0, YCOCG, Splats, product
 from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import MAX_CLASS, Camera
 
-#: Red, green and blue -> Y, Co, Cg.
-YCOCG = np.array([[0.25, 0.5, 0.25], [0.5, 0.0, -0.5], [-0.25, 0.5, -0.25]])
 #: Opacities and scales are bounded before their logits and logarithms: a Gaussian thinner than this share of its length
 #: looks like a sheet.
 LEAST_OPACITY, LEAST_SHARE = 1e-3, np.exp(-6)

@@ -119,8 +119,12 @@ def harmonics(directions: np.ndarray, degree: int) -> np.ndarray:
     return np.moveaxis(np.stack(rows).astype(directions.dtype, copy=False), 0, -1)
 
 
+#: Red, green and blue -> Y, Co and Cg.
+YCOCG = np.array([[0.25, 0.5, 0.25], [0.5, 0.0, -0.5], [-0.25, 0.5, -0.25]])
+
+
 def rgb(channels: np.ndarray) -> np.ndarray:
-    """Returns red, green and blue of Y, Co and Cg, both [..., 3, n]."""
+    """The inverse of YCOCG: both [..., 3, n]."""
     y, co, cg = np.moveaxis(channels, -2, 0)
     return np.stack([y - cg + co, y + cg, y - cg - co], axis=-2)
 
