@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from pd4dgs_codec.draw.player import SplatPlayer
 from pd4dgs_codec.interchange.pack import (
     Grid,
     Ordered,
@@ -92,9 +93,9 @@ class Packer:
 
     def _error(self, scene: splats.SplatScene) -> float:
         """Returns the squared error of the pictures that stands for their mean PSNR."""
-        errors, info = [], self.info
+        errors, info, player = [], self.info, SplatPlayer(scene)
         for (camera, _), t, truth in zip(self.pictures.views, self.times, self.pictures.images, strict=True):
-            image = picture(scene.splats(float(t))[0], camera, info.background, info.near)
+            image = picture(player.splats(float(t))[0], camera, info.background, info.near)
             errors.append(np.square(image - truth, dtype=np.float64).mean())
         return float(np.exp(np.mean(np.log(np.maximum(errors, 1e-12)))))
 

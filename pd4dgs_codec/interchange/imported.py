@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.data.view import depth_range, held_out, points_box, seconds_range
+from pd4dgs_codec.draw.player import SplatPlayer
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import Report, encode_with_report, with_metadata
@@ -180,11 +181,12 @@ def _quality(
     model: Teacher, scene: SplatScene, judges: list[tuple[Camera, float]], step: Callable[[], None]
 ) -> dict[int, float]:
     """Returns the mean PSNR in dB of each level against the source's own pictures."""
+    players = {level: SplatPlayer(scene.prefix(level)) for level in scene.layers}
     found: dict[int, list[float]] = {level: [] for level in scene.layers}
     for camera, t in judges:
         truth = picture(model.splats(t), camera, scene.info.background, scene.info.near)
-        for level, row in found.items():
-            image = picture(scene.splats(t, level)[0], camera, scene.background(level), scene.info.near)
-            row.append(min(mpsnr(image, truth), BEST))
+        for level, player in players.items():
+            image = picture(player.splats(t)[0], camera, player.background, scene.info.near)
+            found[level].append(min(mpsnr(image, truth), BEST))
         step()
     return {level: float(np.mean(row)) for level, row in found.items()}
