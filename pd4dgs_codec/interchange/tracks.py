@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pd4dgs_codec.format.registry import MAX_CHANNELS
 from pd4dgs_codec.interchange.pack import Grid
 from pd4dgs_codec.kinds.tracks import Head, Tracks
 
@@ -18,7 +19,7 @@ BASIS_STEP = 2.0**-10  #: of all grids; bases are scaled to it
 COARSEST = 0.05  #: the largest step of bases, whose mean square over time is 1
 BITS = 6  #: about those of a basis at an instant
 BIT = 2 * np.log(2)  #: what a bit is worth, in units of the error that a scalar may add
-MOST_BASES = 80  #: of a head, components and a limit of the format on channels
+MOST_BASES = 80  #: of a head, if the format allows so many channels
 STRAIGHT = 0.05  #: the share of the allowed error that left-out instants may add
 STATIC = 1e-12  #: the least share of a picture's squared error for which anything changes
 
@@ -42,7 +43,7 @@ class Change:
         values = values.reshape(len(values), -1)
         scaled = values * np.sqrt(weights / instants)[:, None].astype(np.float32)
         energies, vectors = np.linalg.eigh((scaled.T @ scaled).astype(np.float64))
-        order = np.argsort(-energies)[:MOST_BASES]
+        order = np.argsort(-energies)[: min(MOST_BASES, MAX_CHANNELS // components)]
         order = order[energies[order] > max(STATIC, 1e-7 * energies.max())]
         found = vectors[:, order] * np.sqrt(instants)
         return Change(values, weights, components, found, energies[order]) if len(order) else None
