@@ -6,17 +6,16 @@ harmonics Y_j with their signs, and max(0, 0.5 + sum c_j Y_j(d)), d the unit vec
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from pd4dgs_codec.errors import Malformed
-from pd4dgs_codec.kinds.tracks import Tracks, total, tracks_of
+from pd4dgs_codec.kinds.tracks import Tracks, total
 from pd4dgs_codec.scene import MASK_STEP, MIN_OPACITY, Gaussians, Grading, LayeredScene, SceneInfo
 from pd4dgs_codec.tensors.quantise import RowTable, dequantise
-from pd4dgs_codec.tensors.symbols import Growing
 from pd4dgs_codec.tensors.tables import Kind, Tables
 
 NUMBER, NAME = 1, "splats"
@@ -340,20 +339,14 @@ def json(kind: Kind, table: RowTable) -> dict[str, Any]:
     return {"degree": degree, "windows": "window" in steps, "steps": steps}
 
 
-def scene_of(table: RowTable, info: SceneInfo, grown: Growing, writeable: bool) -> SplatScene:
-    """Returns the scene of the slices so far, of at least one."""
+def scene_of(
+    table: RowTable, common: Mapping[str, Any], rows: Sequence[np.ndarray], tracks: dict[int, Tracks]
+) -> SplatScene:
+    """Returns a scene. common: arguments of `LayeredScene`. rows: float32 [N, C] of each tensor. tracks: by layer."""
     names = list(TENSORS)
-    (anchor_q, classes, *rows), codes, layer_rows = grown.arrays(writeable)
-    pairs = zip(grown.tensors.items(), layer_rows, strict=True)
     return SplatScene(
-        info=info,
-        layers=tuple(grown.tensors),
-        rows=tuple(len(own) for own in codes),
-        anchor_q=anchor_q,
-        mask=tuple(codes),
-        grading=Grading(classes, table.centre_values) if table.graded else None,
-        fills=tuple(grown.fills.values()),
+        **common,
         steps={names[tensor.id]: tensor.step for tensor in table.tensors},
         tensors={names[tensor.id]: x for tensor, x in zip(table.tensors, rows, strict=True)},
-        tracks={layer: tracks_of(tensors, own) for (layer, tensors), own in pairs if own},
+        tracks=tracks,
     )
