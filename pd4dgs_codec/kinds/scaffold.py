@@ -104,9 +104,10 @@ def scene_of(
     """Returns a scene. common: arguments of `LayeredScene`. rows: float32 [N, C] of each tensor. deformations: by
     layer."""
     shapes = widths_of(kind, table).attributes.items()
+    named: dict[str, Any] = {name: x.reshape(-1, *shape) for (name, shape), x in zip(shapes, rows, strict=True)}
     return Scene(
         **common,
-        **{name: x.reshape(-1, *shape) for (name, shape), x in zip(shapes, rows, strict=True)},
+        **named,
         steps=steps,
         networks=networks,
         global_deformation=deformations.get(1),
