@@ -30,10 +30,10 @@ from pd4dgs_codec.interchange.pack import (
 from pd4dgs_codec.interchange.sampled import Sampled
 from pd4dgs_codec.interchange.splats import evenly, picture
 from pd4dgs_codec.interchange.teacher import GOLDEN
-from pd4dgs_codec.interchange.tracks import STRAIGHT, Change, layer
+from pd4dgs_codec.interchange.tracks import STRAIGHT, Change, Grouping, layer
 from pd4dgs_codec.kinds import splats
 from pd4dgs_codec.kinds.splats import YCOCG, product
-from pd4dgs_codec.kinds.tracks import Tracks
+from pd4dgs_codec.kinds.tracks import Tracks, place
 from pd4dgs_codec.scene import Camera, SceneInfo
 
 CHECKED = 12  #: pictures that measure the error
@@ -73,6 +73,7 @@ class Packer:
         some = Views(source, evenly(views.cameras, CHECKED), evenly(views.chosen, CHECKED))
         self.pictures, self.times = Pictures(some, info.background, info.near), source.times[some.chosen]
         self.ordered = Ordered.of(source.frame(self.key), weights)
+        self.grouping: Grouping | None = None
         self.changes = self._changes() if len(source.times) > 1 else {}
         step()
 
@@ -83,13 +84,16 @@ class Packer:
 
     def scene(self, psnr: float) -> splats.SplatScene:
         """Returns the scene whose pictures have `psnr` dB against those of the source."""
-        scalars = len(self.ordered.rows) * sum(self.ordered.channels.values())
+        theta = 10 ** (-psnr / 10) / (len(self.ordered.rows) * sum(self.ordered.channels.values()))
+        if self.changes and not self.grouping:  # for all qualities: it takes longer than all else
+            places = place(self.ordered.values["position"], self.info.box)
+            self.grouping = Grouping.of(self.changes, places, theta)
 
         def build(theta: float) -> tuple[splats.SplatScene, float]:
             scene = self._scene(theta, 10 ** (-psnr / 10))
             return scene, self._error(scene)
 
-        return matched(build, psnr, 10 ** (-psnr / 10) / scalars)
+        return matched(build, psnr, theta)
 
     def _error(self, scene: splats.SplatScene) -> float:
         """Returns the squared error of the pictures that stands for their mean PSNR."""
@@ -106,7 +110,7 @@ class Packer:
         found = splats.scene(
             replace(self.info, voxel_size=packed.voxel_size), packed.cells, tensors, steps,
             classes=packed.classes, centres=centres,
-            tracks=self._tracks(grid, error),
+            tracks=self._tracks(grid, error, packed),
         )  # fmt: skip
         return found
 
@@ -148,7 +152,7 @@ class Packer:
                 found[name] = change
         return found
 
-    def _tracks(self, grid: Grid, error: float) -> dict[int, Tracks]:
+    def _tracks(self, grid: Grid, error: float, packed: Packed) -> dict[int, Tracks]:
         """Returns the tracks of layers 1 and 2. error: the mean squared error of pictures that is aimed at."""
         kept = [
             (change.energies[k], name, int(k))
@@ -159,6 +163,8 @@ class Packer:
         rest = np.cumsum([energy for energy, *_ in kept][::-1])[::-1]
         first = [row for row, behind in zip(kept, rest, strict=True) if behind > error]
         allowed = STRAIGHT * grid.theta * len(self.ordered.rows) * sum(self.ordered.channels.values())
+        at = (packed.cells + packed.tensors["offset"].astype(np.float64)) * packed.voxel_size
+        grouping = self.grouping and replace(self.grouping, places=place(at, self.info.box))
         changes, layers = self.changes, {1: first or kept, 2: kept[len(first) :] if first else []}
         found = dict[int, Tracks]()
         for number, own in layers.items():
@@ -166,7 +172,8 @@ class Packer:
                 continue
             chosen = {name: np.array([k for _, other, k in own if other == name]) for name in changes}
             chosen = {name: ks for name, ks in chosen.items() if len(ks)}
-            found[number], done = layer(changes, chosen, grid, self.source.times, self.key, allowed)
+            groups = grouping if number == 1 else None
+            found[number], done = layer(changes, chosen, grid, self.source.times, self.key, allowed, groups)
             for name, values in done.items():
                 changes = changes | {name: replace(changes[name], values=changes[name].values - values)}
         return found

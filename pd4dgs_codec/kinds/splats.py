@@ -246,7 +246,8 @@ class Moving:
             self._rest = replace(self._rest, scales=self._rest.scales * mask[:, None])
         columns = {name: np.asfortranarray(getattr(self._rest, name)) for name in ("means", "quats") if heads}
         self._rest = replace(self._rest, **columns)  # in the order in memory of what is added to them
-        self._tracks = {layer: own.of_rows(rows).by_columns() for layer, own in scene.tracks.items()}
+        own = {layer: tracks.of_rows(rows) for layer, tracks in scene.tracks.items()}
+        self._tracks = {i: tracks.prepared(self._rest.means, scene.info.box) for i, tracks in own.items()}
 
     @np.errstate(all="ignore")
     def at(self, t: float) -> tuple[Splats, np.ndarray]:
