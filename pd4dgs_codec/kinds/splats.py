@@ -192,6 +192,10 @@ class SplatScene(LayeredScene):
         place *= np.float32(self.info.voxel_size)
         return place.astype(np.float32)
 
+    @property
+    def still(self) -> bool:
+        return super().still and "window" not in self.tensors
+
     def deformation(self, layer: int) -> Tracks | None:
         """Returns the tracks of a layer, None without any."""
         return self.tracks.get(layer)
