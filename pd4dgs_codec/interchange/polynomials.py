@@ -23,9 +23,9 @@ import numpy as np
 
 from pd4dgs_codec.data.files import MAX_HEADER, read_vertices
 from pd4dgs_codec.errors import DamageWarning, DataError, one_line
-from pd4dgs_codec.interchange.runs import Config, State, visible
+from pd4dgs_codec.interchange.runs import Config, State
 from pd4dgs_codec.interchange.splats import activated, finite_rows, principal_axes, quaternions, usable
-from pd4dgs_codec.kinds.splats import SH_C0, Splats, unit
+from pd4dgs_codec.kinds.splats import SH_C0, Splats, unit, visible
 
 #: Beyond so many softnesses of its window a Gaussian is invisible. It stays there, which keeps polynomials small, but
 #: lines go on until they are as long as the scene: one basis is enough for them.

@@ -468,9 +468,3 @@ def _node_move(state: State, config: Config, rest: Parts, features: np.ndarray) 
         return kept | {"means": means + shift * parts["share"], "quats": quats, "scales": scales}
 
     return activated(rest) | {"nodes": rows, "weights": weights, "share": share}, move
-
-
-def visible(windows: np.ndarray, t: float) -> np.ndarray:
-    """Returns float32 [n]: the factors on opacities at time t of windows [n, 3] (centre, half width, softness)."""
-    outside = np.maximum(np.abs(t - windows[:, 0]) - windows[:, 1], 0)
-    return np.asarray(np.exp(-0.5 * np.square(outside / windows[:, 2])), np.float32)

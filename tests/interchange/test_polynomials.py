@@ -11,10 +11,9 @@ from test_import import _refused, small_views  # noqa: F401 (a fixture)
 
 from pd4dgs_codec import decode
 from pd4dgs_codec.errors import DamageWarning, DataError
-from pd4dgs_codec.interchange import polynomials
 from pd4dgs_codec.interchange.sampled import sampled
 from pd4dgs_codec.interchange.teacher import Teacher, read_model
-from pd4dgs_codec.kinds.splats import Splats
+from pd4dgs_codec.kinds.splats import Splats, visible
 
 TIMES = (0.0, 0.3, 0.5, 1.0)
 
@@ -221,7 +220,7 @@ def test_lines_and_windows_of_4dgs_files_are_exact(tmp_path, cli):
     model = read_model(str(path), 30)
     assert model.windows is not None and model.bare and not model.varies
     for t in (0.0, 0.31, 0.5, 0.69):
-        bare, shown, exact = model.bare(t), polynomials.visible(model.windows, t), model.splats(t)
+        bare, shown, exact = model.bare(t), visible(model.windows, t), model.splats(t)
         seen = bare.opacities * shown > 0.05
         here, there = (np.lexsort(np.round(x, 3).T) for x in (bare.means[seen], exact.means[exact.opacities > 0.05]))
         assert len(here) == len(there) > 20
