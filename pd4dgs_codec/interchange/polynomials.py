@@ -199,7 +199,7 @@ def _fourd(path: Path, content: tuple[Any, ...], seconds: float | None) -> tuple
         wanted = f"expected {FOURD_PARTS} as of 4DGS, or the PLY file of static Gaussians"
         raise DataError(f"{path}: is a checkpoint of {len(parts)} parts, {wanted}")
     degree, cosines, turns = numbers = tuple(parts[place] for place in (DEGREE, COSINES, TURNS))
-    if degree not in range(4) or cosines not in range(3) or not isinstance(turns, bool):
+    if [type(x) for x in numbers] != [int, int, bool] or degree not in range(4) or cosines not in range(3):
         found = f"degrees and rot_4d {one_line(repr(numbers), 60)}"
         raise DataError(f"{path}: has {found}, expected 0 to 3, 0 to 2, and True or False")
     state = State(path, {name: parts[place] for name, place in FOURD.items()})
@@ -217,6 +217,7 @@ def _fourd(path: Path, content: tuple[Any, ...], seconds: float | None) -> tuple
         warnings.warn(DamageWarning(f"{path}: its environment map is left out"), stacklevel=2)
     scales, quats, opacities = take("scaling", 3), take("rotation", 4), take("opacity", 1)[:, 0]
     rest = {"means": xyz, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh[:, :count]}
+    # without turns the scale of time is its variance
     rest, variance, speed = activated(rest), np.exp(take("scaling_t", 1)), np.zeros_like(xyz)
     right = take("rotation_r", 4) if turns else speed
     for start in range(0, len(xyz) if turns else 0, FOURD_ROWS):

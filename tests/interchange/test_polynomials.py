@@ -281,6 +281,9 @@ def replaced(path: Path, place: int, value: object) -> None:
         (1, torch.full((60, 3), torch.nan), "none of 60 Gaussians is finite"),
         (13, torch.full((60, 1), torch.nan), "none of 60 Gaussians is finite"),
         (0, 9, "has degrees and rot_4d .9, 2, True., expected 0 to 3, 0 to 2, and True or False"),
+        (0, 3.0, "has degrees and rot_4d .3.0, 2, True., expected"),
+        (0, torch.ones(2), "has degrees and rot_4d .array"),
+        (18, None, "has degrees and rot_4d .3, None, True., expected"),
         (16, "yes", "has degrees and rot_4d .3, 2, 'yes'., expected"),
     ],
 )
@@ -310,6 +313,8 @@ def test_broken_splatv_files_are_one_line(tmp_path, monkeypatch, cli):
         ("deep", data[:4] + (9000).to_bytes(4, "little") + b"[" * 9000, "is a damaged .splatv file"),
         ("none", data[:8] + b"[]".ljust(size) + data[8 + size :], "it lists 0 bytes of Gaussians, and 3,904 are there"),
         ("many", data.replace(b'"size": 3904', b'"size": 1e99'), "it lists 999,999,999"),
+        ("void", data[: 8 + size].replace(b'"size": 3904', b'"size": 0000'), "is a damaged .splatv file ("),
+        ("zero", data[: 8 + size].replace(b'"size": 3904', b'"size":    0'), "none of 0 Gaussians"),
         ("less", data.replace(b'"size": 3904', b'"size": -904'), "it lists -904 bytes"),
         ("list", data.replace(b'"splat"', b'"other"'), "it lists 3,904 bytes"),
         ("dark", data[: 8 + size] + bytes(len(data) - 8 - size), "none of 0 Gaussians"),
