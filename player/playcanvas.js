@@ -184,16 +184,18 @@ export class Pd4 extends Script {
     material.update();
   }
 
-  /** Brings Gaussians onto the screen. @param {Gaussians} gaussians @returns {Promise<void>} when a frame shows them:
-   * the engine sorts them first, and reads their textures only then */
+  /** Brings Gaussians onto the screen. @param {Gaussians & {fill: number[]}} gaussians @returns {Promise<void>} when a
+   * frame shows them: the engine sorts them first, and reads their textures only then */
   _fill(gaussians) {
-    const { count, means } = gaussians;
+    const { count, means, changed } = gaussians;
+    const had = this._container;
     const container = this._containerFor(count);
-    for (const name of STREAMS) {
+    STREAMS.forEach((name, i) => {
+      if (container === had && !changed[i]) return;
       const texture = /** @type {Texture} */ (container.getTexture(name));
       texture.lock().set(gaussians[name]);
       texture.unlock();
-    }
+    });
     const { centers } = container;
     const low = [Infinity, Infinity, Infinity];
     const high = [-Infinity, -Infinity, -Infinity];

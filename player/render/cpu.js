@@ -4,6 +4,7 @@
 import { Remote } from "./remote.js";
 import { WORKERS } from "./workers.js";
 /** @import { Scene, SplatScene } from "../kinds/index.js" */
+/** @import { Packed } from "./ext-splats.js" */
 /** @import { State, Texels } from "./level.js" */
 /** @import { Parts } from "./splats.js" */
 
@@ -14,6 +15,8 @@ export class CpuEvaluator extends Remote {
     this._scene = null;
     /** The latest result. @type {Texels | null} */
     this._spare = null;
+    /** The packed one before the latest, and the latest. @type {(Packed | null)[]} */
+    this._packed = [null, null];
   }
 
   /**
@@ -28,6 +31,16 @@ export class CpuEvaluator extends Remote {
     const { means, ...texels } = await this._of("evaluate", scene, args, spare ? [spare.data.buffer] : []);
     this._spare = texels;
     return { ...texels, means };
+  }
+
+  /** The Gaussians of a state as Spark holds them. The next call takes back those before these. @param {State} state
+   * @returns {Promise<Packed>} */
+  async pack({ scene, level, t, eye }) {
+    const [spare, latest] = this._packed;
+    const transfer = spare?.extArrays.map(({ buffer }) => buffer);
+    const found = await this._of("pack", scene, [level, t, eye, spare], transfer);
+    this._packed = [latest, found];
+    return found;
   }
 
   /** See SplatEvaluator. @param {SplatScene} scene @param {number} level @param {number} t

@@ -1,16 +1,20 @@
 // The worker of the evaluator without a GPU.
 
 import { evaluate } from "./evaluate.js";
+import { packed } from "./ext-splats.js";
 import { texelsFor } from "./level.js";
 import { serve } from "./remote.js";
 import { SplatEvaluator } from "./splats.js";
-/** @import { AnchorScene, Scene } from "../kinds/index.js" */
+/** @import { Scene } from "../kinds/index.js" */
+/** @import { Packed } from "./ext-splats.js" */
 /** @import { Texels } from "./level.js" */
 
 /** The newest scene. @type {Scene} */
 let scene;
 /** What evaluates it, if it is one of splats. @type {SplatEvaluator} */
 let splats;
+/** The latest that were packed. @type {Texels | null} */
+let kept = null;
 
 /** @param {Scene | null} next */
 function take(next) {
@@ -24,9 +28,18 @@ serve({
    * @param {Texels | null} spare an earlier result, to overwrite */
   evaluate(next, level, t, eye, spare) {
     take(next);
-    const result = scene.kind === "splats" ? splats.evaluate(level, t, eye, spare) : texelsAt(scene, level, t, eye, spare);
+    const result = texelsAt(level, t, eye, spare);
     const means = result.data.slice(0, 4 * result.count);
     return { result: { ...result, means }, transfer: [result.data.buffer, means.buffer] };
+  },
+
+  /** @param {Scene | null} next a new scene @param {number} level @param {number} t @param {number[]} eye
+   * @param {Packed | null} spare an earlier result, to overwrite */
+  pack(next, level, t, eye, spare) {
+    take(next);
+    kept = texelsAt(level, t, eye, kept);
+    const result = packed(kept, spare);
+    return { result, transfer: result.extArrays.map(({ buffer }) => buffer) };
   },
 
   /** @param {Scene | null} next of splats @param {number} level @param {number} t */
@@ -45,10 +58,11 @@ serve({
   },
 });
 
-/** @param {AnchorScene} anchors @param {number} level @param {number} t @param {number[]} eye
- * @param {Texels | null} spare @returns {Texels} */
-function texelsAt(anchors, level, t, eye, spare) {
-  const { count, records } = evaluate(anchors, level, t, eye);
+/** The Gaussians of the scene. @param {number} level @param {number} t @param {number[]} eye @param {Texels | null} spare
+ * @returns {Texels} */
+function texelsAt(level, t, eye, spare) {
+  if (scene.kind === "splats") return splats.evaluate(level, t, eye, spare);
+  const { count, records } = evaluate(scene, level, t, eye);
   const texels = texelsFor(count, spare);
   const block = texels.data.length / 4;
   for (let i = 0; i < count; i++) {
