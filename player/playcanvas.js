@@ -5,7 +5,7 @@ import { BoundingBox, Color, Mat4, Script, Vec3 } from "playcanvas";
 import { GSPLATDATA_LARGE, GSplatContainer, GSplatFormat, PIXELFORMAT_RGBA32F } from "playcanvas";
 
 import { defaultCamera, fitted } from "./render/camera.js";
-import { Playback, poseOf } from "./render/playback.js";
+import { Playback, poseOf, takeCentres } from "./render/playback.js";
 /** @import { AppBase, Asset, CameraComponent, Entity, Texture } from "playcanvas" */
 /** @import { Camera } from "./decode/tensors.js" */
 /** @import { Gaussians } from "./render/playback.js" */
@@ -196,16 +196,7 @@ export class Pd4 extends Script {
       texture.lock().set(gaussians[name]);
       texture.unlock();
     });
-    const { centers } = container;
-    const low = [Infinity, Infinity, Infinity];
-    const high = [-Infinity, -Infinity, -Infinity];
-    for (let i = 0; i < count; i++) {
-      for (let axis = 0; axis < 3; axis++) {
-        const value = (centers[3 * i + axis] = means[4 * i + axis]);
-        if (value < low[axis]) low[axis] = value;
-        if (value > high[axis]) high[axis] = value;
-      }
-    }
+    const { low, high } = takeCentres(means, count, container.centers);
     if (count) container.aabb.setMinMax(new Vec3(low), new Vec3(high));
     container.update(count);
     if (this._seenThrough) this._seenThrough.clearColor = new Color(gaussians.fill);

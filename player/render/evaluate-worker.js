@@ -1,8 +1,7 @@
 // The worker of the evaluator without a GPU.
 
-import { evaluate } from "./evaluate.js";
+import { texelsOf } from "./evaluate.js";
 import { packed } from "./ext-splats.js";
-import { texelsFor } from "./level.js";
 import { serve } from "./remote.js";
 import { SplatEvaluator } from "./splats.js";
 /** @import { Scene } from "../kinds/index.js" */
@@ -58,15 +57,7 @@ serve({
   },
 });
 
-/** The Gaussians of the scene. @param {number} level @param {number} t @param {number[]} eye @param {Texels | null} spare
- * @returns {Texels} */
+/** The Gaussians of the scene. @param {number} level @param {number} t @param {number[]} eye @param {Texels | null} spare */
 function texelsAt(level, t, eye, spare) {
-  if (scene.kind === "splats") return splats.evaluate(level, t, eye, spare);
-  const { count, records } = evaluate(scene, level, t, eye);
-  const texels = texelsFor(count, spare);
-  const block = texels.data.length / 4;
-  for (let i = 0; i < count; i++) {
-    for (let k = 0; k < 16; k++) texels.data[(k >> 2) * block + 4 * i + (k & 3)] = records[16 * i + k];
-  }
-  return { ...texels, count, still: 0 };
+  return scene.kind === "splats" ? splats.evaluate(level, t, eye, spare) : texelsOf(scene, level, t, eye, spare);
 }

@@ -36,6 +36,24 @@ export function poseOf(view) {
 }
 
 /**
+ * Takes centres, [count, 3], out of means, and returns the box around them.
+ *
+ * @param {Float32Array} means @param {number} count @param {Float32Array} centres
+ */
+export function takeCentres(means, count, centres) {
+  const low = [Infinity, Infinity, Infinity];
+  const high = [-Infinity, -Infinity, -Infinity];
+  for (let i = 0; i < count; i++) {
+    for (let axis = 0; axis < 3; axis++) {
+      const value = (centres[3 * i + axis] = means[4 * i + axis]);
+      if (value < low[axis]) low[axis] = value;
+      if (value > high[axis]) high[axis] = value;
+    }
+  }
+  return { low, high };
+}
+
+/**
  * Loads a scene, keeps its time, and hands Gaussians to a renderer whenever they change.
  *
  * Events: those of `Clip`, of which `error` leaves what was valid; `upgrade` {level, anchors, gaussians} when a higher

@@ -153,15 +153,17 @@ export class SplatEvaluator {
     const fades = !!opacity || !!this._windows;
     const shades = color || harmonics;
     const texels = texelsFor(most, spare);
+    const moving = [position, scale, rotation, shades];
+    const resting = texels.changing.filter((block) => !moving[block]);
     if (!fades) {
-      texels.changing = [0, 1, 2, 3].filter((block) => [position, scale, rotation, shades][block]);
+      texels.changing = texels.changing.filter((block) => moving[block]);
       if (texels.still !== this._still) texels.data.set(rest);
     }
     texels.still = fades ? 0 : this._still;
     for (let first = 0; first < most; first += BATCH) {
       const seen = { first, numbers: ALL, count: Math.min(BATCH, most - first), to: 4 * texels.count };
       this._sum(sums, first);
-      if (fades) this._see(seen, t, texels.data, opacity);
+      if (fades) this._see(seen, t, texels.data, opacity, resting);
       if (position) this._move(seen, texels.data, position.sums);
       if (rotation) this._turn(seen, texels.data, rotation.sums);
       if (scale) this._grow(seen, texels.data, scale.sums);
@@ -301,9 +303,10 @@ export class SplatEvaluator {
     return windows ? opacity * openness(windows, 4 * i, t) : opacity;
   }
 
-  /** Finds the Gaussians of a batch that are seen, and puts them at rest, but with their opacities. @param {Seen} seen
-   * @param {number} t @param {Float32Array} data @param {Sum | null} opacities */
-  _see(seen, t, data, opacities) {
+  /** Finds the Gaussians of a batch that are seen, and puts their opacities, and at rest the blocks that no head adds to.
+   * @param {Seen} seen @param {number} t @param {Float32Array} data @param {Sum | null} opacities
+   * @param {number[]} resting blocks */
+  _see(seen, t, data, opacities, resting) {
     const { _rest: rest, _numbers: numbers } = this;
     const block = data.length / 4;
     const sums = opacities?.sums ?? -1;
@@ -312,14 +315,15 @@ export class SplatEvaluator {
       const i = seen.first + r;
       const opacity = this._opacityOf(i, sums < 0 ? -1 : sums + r, t);
       if (!(opacity >= MIN_OPACITY)) continue;
-      let from = 4 * i;
-      let to = seen.to + 4 * n;
-      for (let b = 0; b < 4; b++, from += block, to += block) {
+      for (let k = 0; k < resting.length; k++) {
+        const from = resting[k] * block + 4 * i;
+        const to = resting[k] * block + seen.to + 4 * n;
         data[to] = rest[from];
         data[to + 1] = rest[from + 1];
         data[to + 2] = rest[from + 2];
-        data[to + 3] = b ? rest[from + 3] : opacity;
+        data[to + 3] = rest[from + 3];
       }
+      data[seen.to + 4 * n + 3] = opacity;
       numbers[n++] = r;
     }
     seen.numbers = numbers;
