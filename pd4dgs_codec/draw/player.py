@@ -48,6 +48,7 @@ class Drawer:
     def __init__(self, scene: AnyScene):
         self.info, self.level, self.background = scene.info, scene.level, scene.background()
         self.active = scene.active  #: int64 [n]: the anchors active at this level, ascending
+        self.still = scene.still  #: whether all times look alike
 
     def gaussians(self, camera: Camera, t: float) -> Gaussians:
         """Returns the Gaussians that the camera may see at normalised time t in 0..1."""

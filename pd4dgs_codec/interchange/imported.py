@@ -12,14 +12,15 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.data.view import depth_range, held_out, points_box, seconds_range
+from pd4dgs_codec.draw.player import SplatPlayer
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import Report, encode_with_report, with_metadata
 from pd4dgs_codec.format.metadata import Metadata
-from pd4dgs_codec.interchange.direct import GOLDEN, Packer
+from pd4dgs_codec.interchange.direct import Packer
 from pd4dgs_codec.interchange.sampled import Sampled, sampled
 from pd4dgs_codec.interchange.splats import evenly, picture
-from pd4dgs_codec.interchange.teacher import SOLID, Options, Teacher, cameras_of, read_model
+from pd4dgs_codec.interchange.teacher import GOLDEN, SOLID, Options, Teacher, cameras_of, read_model
 from pd4dgs_codec.kinds.splats import SplatScene
 from pd4dgs_codec.quality.image import mpsnr
 from pd4dgs_codec.scene import Camera, SceneInfo
@@ -80,7 +81,7 @@ def import_model(
     fps: frames per second of a folder. seconds: the duration instead. tell: gets lines about what was read. progress:
     (task, number of steps or None) -> a context whose value is called after each step. Raises DataError, EncodeError.
     """
-    model = read_model(place, fps)
+    model = read_model(place, fps, seconds)
     with progress("reading", None if model.times is None else len(model.times)) as step:
         source = sampled(model, place, fps, step)
     instants, count = source.means.shape[:2]
@@ -119,8 +120,8 @@ def _scene_info(
 ) -> tuple[SceneInfo, list[Camera], list[tuple[Camera, float]]]:
     """Returns (info but the voxel size, cameras that decide, cameras and times that measure)."""
     middle = len(source.times) // 2
-    points = [source.means[i][source.opacities[i] >= SOLID] for i in evenly(range(len(source.times)), BOX_INSTANTS)]
-    everywhere = np.concatenate(points)
+    frames = [source.frame(i, bare=False) for i in evenly(range(len(source.times)), BOX_INSTANTS)]
+    everywhere = np.concatenate([frame.means[frame.opacities >= SOLID] for frame in frames])
     if not len(everywhere):
         everywhere = source.means[middle]
     options = Options(views=CAMERAS, size=(SIZE, SIZE))
@@ -180,11 +181,12 @@ def _quality(
     model: Teacher, scene: SplatScene, judges: list[tuple[Camera, float]], step: Callable[[], None]
 ) -> dict[int, float]:
     """Returns the mean PSNR in dB of each level against the source's own pictures."""
+    players = {level: SplatPlayer(scene.prefix(level)) for level in scene.layers}
     found: dict[int, list[float]] = {level: [] for level in scene.layers}
     for camera, t in judges:
         truth = picture(model.splats(t), camera, scene.info.background, scene.info.near)
-        for level, row in found.items():
-            image = picture(scene.splats(t, level)[0], camera, scene.background(level), scene.info.near)
-            row.append(min(mpsnr(image, truth), BEST))
+        for level, player in players.items():
+            image = picture(player.splats(t)[0], camera, player.background, scene.info.near)
+            found[level].append(min(mpsnr(image, truth), BEST))
         step()
     return {level: float(np.mean(row)) for level, row in found.items()}

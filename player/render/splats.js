@@ -5,7 +5,7 @@
 import { COMPONENTS } from "../kinds/tracks.js";
 import { Arena, GROUP } from "./kernel.js";
 import { blocksOf } from "./layers.js";
-import { MIN_OPACITY, levelOf, texelsFor } from "./level.js";
+import { MIN_OPACITY, deformationUnit, levelOf, texelsFor } from "./level.js";
 /** @import { SplatScene, Tracks } from "../kinds/index.js" */
 /** @import { Packed } from "./kernel.js" */
 /** @import { Texels } from "./level.js" */
@@ -95,7 +95,7 @@ function setShine(values, at, width, x, y, z) {
  * the bases of a time, its outputs Gaussians, its weights their coefficients. x: where the inputs begin, [components,
  * bases]. sums: where the outputs for a batch begin, [components, BATCH].
  *
- * @typedef {{layer: Packed, components: number, x: number, sums: number, parts: ReturnType<typeof basesOf>["parts"]}} Sum
+ * @typedef {{layer: Packed, components: number, x: number, sums: number, parts: Part[]}} Sum
  *
  * The Gaussians of a batch that are seen. first: the batch's. numbers: theirs in it, of which `count` are there. to: where
  * their texels begin in a block.
@@ -207,10 +207,12 @@ export class SplatEvaluator {
     const coefficients = new Float32Array(size * heads.reduce((sum, { inputs }) => sum + blocksOf(inputs), 0));
     let at = 0;
     for (const { inputs, parts } of heads) {
-      for (const { first, width: K, coefficients: own } of parts) {
+      for (const part of parts) {
+        const { first, width: K } = part;
+        const own = this._coefficients(part);
         for (let k = 0; k < K; k++) {
           const to = at + ((first + k) >> 2) * size + ((first + k) & 3);
-          for (let i = 0; i < rows.length; i++) coefficients[to + 4 * i] = own[K * rows[i] + k] ?? 0;
+          for (let i = 0; i < rows.length; i++) coefficients[to + 4 * i] = own[K * i + k];
         }
       }
       at += blocksOf(inputs) * size;
@@ -275,14 +277,40 @@ export class SplatEvaluator {
     const { inputs, parts } = basesOf(this._tracks, head);
     const outputs = inputs ? BATCH * Math.ceil(rows.length / BATCH) : 0;
     const weight = new Float32Array(outputs * inputs);
-    for (const { first, width, coefficients } of parts) {
-      for (let i = 0, to = first; i < rows.length; i++, to += inputs) {
-        // layers have nothing for the rows of later ones
-        for (let k = 0; k < width; k++) weight[to + k] = coefficients[width * rows[i] + k] ?? 0;
+    for (const part of parts) {
+      const { first, width } = part;
+      const own = this._coefficients(part);
+      for (let i = 0; i < rows.length; i++) {
+        for (let k = 0; k < width; k++) weight[inputs * i + first + k] = own[width * i + k];
       }
     }
     const layer = arena.pack({ weight, bias: new Float32Array(outputs), inputs, outputs }, false);
     return { layer, components, x: arena.take(components * inputs), sums: arena.take(components * BATCH), parts };
+  }
+
+  /** The coefficients of a layer's head, with what groups have for them, of the rows that may be seen, [count, width].
+   * @param {Part} part */
+  _coefficients({ width, coefficients, groups, maps }) {
+    const { _rows: rows, _rest: rest } = this;
+    const own = new Float32Array(width * rows.length);
+    for (let i = 0; i < rows.length; i++) {
+      // layers have nothing for the rows of later ones
+      for (let k = 0; k < width; k++) own[width * i + k] = coefficients[width * rows[i] + k] ?? 0;
+    }
+    if (!groups || !maps) return own;
+    const { of, centres } = groups;
+    const count = centres.length / 3;
+    const scale = 1 / (deformationUnit(this.scene) || Infinity);
+    for (let i = 0; i < rows.length; i++) {
+      const group = of[rows[i]];
+      if (!(group >= 0 && group < count)) continue;
+      const [x, y, z] = [0, 1, 2].map((axis) => rest[4 * i + axis] * scale - centres[axis * count + group]);
+      for (let k = 0, from = group, step = width * count; k < width; k++, from += count) {
+        const turned = x * maps[from] + y * maps[from + step] + z * maps[from + 2 * step];
+        own[width * i + k] += turned + maps[from + 3 * step];
+      }
+    }
+    return own;
   }
 
   /** Makes the sums of a batch. @param {(Sum | null)[]} sums @param {number} first Gaussian of the batch */
@@ -406,20 +434,22 @@ export class SplatEvaluator {
   }
 }
 
+/** What one layer has of a head. @typedef {ReturnType<typeof basesOf>["parts"][number]} Part */
+
 /** The bases of a head in all layers, each layer's with the first of its own, and their number. @param {Tracks[]} tracks
  * @param {number} head */
 export function basesOf(tracks, head) {
   let inputs = 0;
-  const parts = tracks.flatMap(({ instants, heads: { [head]: found } }) => {
+  const parts = tracks.flatMap(({ instants, groups, heads: { [head]: found } }) => {
     if (!found) return [];
     const width = found.bases.length / COMPONENTS[head] / instants.length;
     inputs += width;
-    return { first: inputs - width, width, instants, ...found };
+    return { first: inputs - width, width, instants, groups, ...found };
   });
   return { inputs, parts };
 }
 
-/** @param {ReturnType<typeof basesOf>["parts"]} parts @param {number} components @param {number} t 0..1
+/** @param {Part[]} parts @param {number} components @param {number} t 0..1
  * @param {(basis: number, component: number, value: number) => void} put takes each component of each basis at a time */
 export function eachBasis(parts, components, t, put) {
   for (const { first, bases, instants } of parts) {
