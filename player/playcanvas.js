@@ -5,7 +5,7 @@ import { BoundingBox, Color, Mat4, Script, Vec3 } from "playcanvas";
 import { GSPLATDATA_LARGE, GSplatContainer, GSplatFormat, PIXELFORMAT_RGBA32F } from "playcanvas";
 
 import { defaultCamera, fitted } from "./render/camera.js";
-import { Playback, poseOf } from "./render/playback.js";
+import { Playback, poseOf, takeCentres } from "./render/playback.js";
 /** @import { AppBase, Asset, CameraComponent, Entity, Texture } from "playcanvas" */
 /** @import { Camera } from "./decode/tensors.js" */
 /** @import { Gaussians } from "./render/playback.js" */
@@ -184,26 +184,19 @@ export class Pd4 extends Script {
     material.update();
   }
 
-  /** Brings Gaussians onto the screen. @param {Gaussians} gaussians @returns {Promise<void>} when a frame shows them:
-   * the engine sorts them first, and reads their textures only then */
+  /** Brings Gaussians onto the screen. @param {Gaussians & {fill: number[]}} gaussians @returns {Promise<void>} when a
+   * frame shows them: the engine sorts them first, and reads their textures only then */
   _fill(gaussians) {
-    const { count, means } = gaussians;
+    const { count, means, changed } = gaussians;
+    const had = this._container;
     const container = this._containerFor(count);
-    for (const name of STREAMS) {
+    STREAMS.forEach((name, i) => {
+      if (container === had && !changed[i]) return;
       const texture = /** @type {Texture} */ (container.getTexture(name));
       texture.lock().set(gaussians[name]);
       texture.unlock();
-    }
-    const { centers } = container;
-    const low = [Infinity, Infinity, Infinity];
-    const high = [-Infinity, -Infinity, -Infinity];
-    for (let i = 0; i < count; i++) {
-      for (let axis = 0; axis < 3; axis++) {
-        const value = (centers[3 * i + axis] = means[4 * i + axis]);
-        if (value < low[axis]) low[axis] = value;
-        if (value > high[axis]) high[axis] = value;
-      }
-    }
+    });
+    const { low, high } = takeCentres(means, count, container.centers);
     if (count) container.aabb.setMinMax(new Vec3(low), new Vec3(high));
     container.update(count);
     if (this._seenThrough) this._seenThrough.clearColor = new Color(gaussians.fill);

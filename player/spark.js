@@ -2,8 +2,10 @@
 // in.
 
 import { defaultCamera, fitted, unit } from "./render/camera.js";
+import { packed } from "./render/ext-splats.js";
 import { Playback, poseOf } from "./render/playback.js";
 /** @import { Camera } from "./decode/tensors.js" */
+/** @import { Packed } from "./render/ext-splats.js" */
 /** @import { Gaussians, PlaybackOptions } from "./render/playback.js" */
 
 /**
@@ -29,7 +31,8 @@ export const SPARK_SETTINGS = {
   accumExtSplats: true,
 };
 
-/** A scene as a mesh. Add `mesh` to a three.js scene, and call `update` before each frame. */
+/** A scene as a mesh. Add `mesh` to a three.js scene, and call `update` before each frame.
+ * @extends {Playback<Packed | Gaussians>} */
 export class Pd4Splats extends Playback {
   /**
    * Begins to load.
@@ -47,6 +50,8 @@ export class Pd4Splats extends Playback {
     const { THREE, spark } = options;
     this._three = THREE;
     this._splats = new spark.ExtSplats();
+    /** Whether the worker packs Gaussians. */
+    this._packs = storesPacked(spark);
     /** A SplatMesh of Spark. */
     this.mesh = new spark.SplatMesh({ extSplats: this._splats });
     this._background = new THREE.Color();
@@ -107,10 +112,25 @@ export class Pd4Splats extends Playback {
     super.close();
   }
 
-  /** @param {Gaussians} gaussians */
-  _fillMesh({ count, means, scales, quaternions, colors, fill }) {
-    const { Vector3, Quaternion, Color } = this._three;
+  /** @param {import("./render/level.js").State} state */
+  _gaussians(state) {
+    return this._packs ? this._evaluator.pack(state) : super._gaussians(state);
+  }
+
+  /** @param {(Packed | Gaussians) & {fill: number[]}} gaussians */
+  _fillMesh({ fill, ...gaussians }) {
     this._background.setRGB(...fill, this._three.SRGBColorSpace);
+    if ("extArrays" in gaussians) {
+      const { extArrays, count } = gaussians;
+      this._splats.reinitialize({ extArrays, numSplats: count });
+    } else this._setSplats(gaussians);
+    // Gaussians are others than before, so that their old order is of no use: Spark shows them when they are sorted
+    this.mesh.updateMappingVersion();
+  }
+
+  /** Has Spark store Gaussians, which takes the page's time. @param {Gaussians} gaussians */
+  _setSplats({ count, means, scales, quaternions, colors }) {
+    const { Vector3, Quaternion, Color } = this._three;
     const [centre, size, quaternion, color] = [new Vector3(), new Vector3(), new Quaternion(), new Color()];
     const splats = this._splats;
     const [before] = splats.extArrays;
@@ -126,7 +146,22 @@ export class Pd4Splats extends Playback {
     const { extArrays } = splats;
     if (extArrays[0] === before) for (const texture of splats.textures) texture.needsUpdate = true;
     else splats.reinitialize({ extArrays, numSplats: count });
-    // Gaussians are others than before, so that their old order is of no use: Spark shows them when they are sorted
-    this.mesh.updateMappingVersion();
+  }
+}
+
+/** A Gaussian as a texel of each block: mean and opacity, scales, quaternion, colour. */
+const PROBE = [1, -2, 3, 0.5, 0.5, 2, 8, 0, 0.5, 0.1, -0.5, 0.7, 0.25, 0.5, 0.75, 0];
+
+/** Whether this version of Spark stores splats as `packed` does. @param {Spark} spark */
+function storesPacked({ ExtSplats }) {
+  const data = Float32Array.from(PROBE);
+  const { extArrays } = packed({ count: 1, data, width: 1, height: 1, still: 0, changing: [] });
+  try {
+    const { center, scales, quaternion: q, opacity, color } = new ExtSplats({ extArrays, numSplats: 1 }).getSplat(0);
+    const turned = [q.w, q.x, q.y, q.z];
+    const found = [center.x, center.y, center.z, opacity, scales.x, scales.y, scales.z, 0, ...turned, color.r, color.g, color.b];
+    return found.every((value, i) => Math.abs(value - PROBE[i]) < 0.01);
+  } catch {
+    return false;
   }
 }

@@ -5,6 +5,9 @@ from __future__ import annotations
 
 import json
 import math
+import re
+import subprocess
+import tempfile
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
 from pathlib import Path
@@ -19,6 +22,7 @@ from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.info import hashes, info
 from pd4dgs_codec.quality.frames import Frame
 from pd4dgs_codec.quality.levels import Level, load_levels
+from pd4dgs_codec.web.page import player_folder
 
 if TYPE_CHECKING:
     from pd4dgs_codec.model.model import Model
@@ -99,6 +103,32 @@ def codec_panels(points: Sequence[Point]) -> list[Panel]:
             series.setdefault(f"{p['mode']}, effort {p['effort']}", []).append((x, p["error"]))
         panels.append(Panel(label, list(series.items())))
     return panels
+
+
+# -- the player --------------------------------------------------------------------------------------------------------
+
+
+def player_times(data: bytes, pictures: int) -> dict[str, Any]:
+    """Plays a file in Node: `gaussians` of the last picture, and `steps`, milliseconds of CPU by name. Raises DataError
+    where there is no Node, or it cannot play the file."""
+    script = player_folder() / "render" / "timings.js"
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "scene.pd4"
+        path.write_bytes(data)
+        try:
+            run = subprocess.run(["node", script, path, str(pictures)], capture_output=True, text=True, check=False)
+        except OSError as error:
+            raise DataError(f"node: {error.strerror}, expected Node.js 20 or later") from None
+    if run.returncode:
+        faults = re.findall(r"^\w*Error: .*", run.stderr, re.MULTILINE) or [f"exit code {run.returncode}"]
+        raise DataError(f"node: {faults[0]}")
+    found: dict[str, Any] = json.loads(run.stdout)
+    return found
+
+
+def player_table(found: dict[str, Any]) -> str:
+    """Formats a row per step."""
+    return markdown(("step", "CPU ms"), [(step, f"{ms:.2f}") for step, ms in found["steps"].items()])
 
 
 # -- rasterisers -------------------------------------------------------------------------------------------------------

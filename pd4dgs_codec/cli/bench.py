@@ -183,6 +183,32 @@ def _train(args: argparse.Namespace) -> Outcome:
     return Outcome({"runs": runs}, runtime.train_table(runs), runtime.train_panels(runs), "RMSE of the highest level")
 
 
+# -- player ------------------------------------------------------------------------------------------------------------
+
+PLAYER = """\
+Plays a file in Node and reports the CPU time of each step of a picture: medians over times of the highest level, while
+the camera moves. Steps run in workers, except those of the page. The GPU's work is not measured.
+
+examples:
+  pd4dgs-bench player scene.pd4 > player.md
+  pd4dgs-bench player scene.pd4 --pictures 60 --json"""
+
+
+def _player_options(p: options.Parser) -> None:
+    p.add_argument("input", metavar="FILE", help=".pd4 file; - reads stdin")
+    what = "number of pictures (default: 40)"
+    p.add_argument("--pictures", type=options.positive_int, default=40, metavar="N", help=what)
+
+
+def _player(args: argparse.Namespace) -> Outcome:
+    from pd4dgs_codec.bench import report, runtime
+
+    machine = report.machine()
+    found = runtime.player_times(read_bytes(args.input), args.pictures)
+    text = f"{runtime.player_table(found)}\n\n{found['gaussians']:,} Gaussians.\n\n{report.machine_line(machine)}"
+    return Outcome({"input": args.input, "machine": machine, **found}, text)
+
+
 # -- latency -----------------------------------------------------------------------------------------------------------
 
 LATENCY = """\
@@ -251,6 +277,7 @@ REPORTS = {
     "codec": Report("FILE", "Measure the codec's error against bytes and time.", CODEC, _codec_options, _codec),
     "render": Report("FILE", "Measure the rasterisers' error against time.", RENDER, _render_options, _render),
     "train": Report("FILE...", "Measure held-out error against training time.", TRAIN, _train_options, _train),
+    "player": Report("FILE", "Measure the CPU time of the player in Node.", PLAYER, _player_options, _player, False),
     "latency": Report(
         "FILE...", "Measure the time to the image of each level.", LATENCY, _latency_options, _latency, False
     ),

@@ -268,7 +268,7 @@ class Places:
                 end += size
 
     def put(self, coded: np.ndarray, channels: np.ndarray) -> None:
-        """Writes the concatenated `parts` back into channels [m, n]."""
+        """Writes the concatenated `parts` back into channels [m, n], which may be themselves."""
         rows = coded.reshape(len(channels), -1)
         if isinstance(self.order, slice):
             channels[:, self.order] = rows

@@ -30,8 +30,6 @@ _PATTERNS = [np.flatnonzero(_CHILDREN == k) for k in range(9)]  #: bytes with k 
 _INDEX = np.zeros(256, dtype=np.int32)  # of a byte among the bytes with as many children
 for _patterns in _PATTERNS:
     _INDEX[_patterns] = np.arange(len(_patterns))
-#: Child numbers by byte, ascending; entries past the last child are unused.
-_CHILD = np.argsort((np.arange(256)[:, None] >> np.arange(8) & 1) == 0, axis=1, kind="stable")
 _CODED = range(2, 8)  # numbers of children with more than one pattern; nodes with one child have channels of their own
 
 
@@ -154,25 +152,26 @@ def _grow(channels: list[np.ndarray], nodes: list[int], single: list[int], sizes
         if have == count:
             codes = codes << 3 | _within(next(levels), 8)
             continue
-        children = np.empty(have, dtype=np.int64)
+        children = np.empty(have, np.uint8)
         children[only_child] = _within(next(levels), 8)
         children[~only_child] = _within(next(levels), 8)
         children += 1
         after = nodes[level + 1] if level + 1 < len(nodes) else count
-        if np.count_nonzero(children == 1) != alone or int(children.sum()) != after:
+        one = children == 1
+        if np.count_nonzero(one) != alone or int(children.sum()) != after:
             raise Malformed("positions: the numbers of children differ from their stated sums")
-        occupancy = np.full(have, 255, dtype=np.int64)  # eight children have one pattern
-        occupancy[children == 1] = 1 << _within(next(levels), 8)
+        occupancy = np.full(have, 255, np.uint8)  # eight children have one pattern
+        occupancy[one] = 1 << _within(next(levels), 8)
         for k in _CODED:
             here = np.flatnonzero(children == k)
             if len(here) > len(patterns[k]):
                 raise Malformed(f"positions: more nodes with {k} children than stated")
             occupancy[here] = _PATTERNS[k][patterns[k][: len(here)]]
             patterns[k] = patterns[k][len(here) :]
-        parent = np.repeat(np.arange(have), children)
-        turn = np.arange(after) - np.repeat(np.cumsum(children) - children, children)
-        codes = codes[parent] << 3 | _CHILD[occupancy[parent], turn]
-        only_child = (children == 1)[parent]
+        child = np.flatnonzero(np.unpackbits(occupancy, bitorder="little").view(bool))  # and eight times its parent
+        parent = child >> 3
+        codes = codes[parent] << 3 | child & 7
+        only_child = one[parent]
     for k, unused in patterns.items():
         if len(unused):
             raise Malformed(f"positions: {len(unused)} nodes with {k} children fewer than stated")

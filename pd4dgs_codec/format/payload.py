@@ -229,8 +229,9 @@ def _read_rows(reader: ChannelReader, channels: int, n: int, classes: np.ndarray
     """Decodes the symbols int32 [channels, n] of rows of these step classes, int32 [n] or NO_CLASSES."""
     if not classes.size:
         return reader.read([n] * channels, known).reshape(channels, n)
-    places, rows = Places.by(classes, MAX_CLASS + 1), np.empty((channels, n), np.int32)
-    places.put(reader.read(places.sizes * channels, known), rows)
+    places = Places.by(classes, MAX_CLASS + 1)
+    rows = reader.read(places.sizes * channels, known).reshape(channels, n)
+    places.put(rows, rows)
     return rows
 
 

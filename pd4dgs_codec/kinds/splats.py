@@ -147,6 +147,8 @@ def splats_of(tensors: Mapping[str, np.ndarray]) -> Splats:
 def _rotations(p: np.ndarray) -> np.ndarray:
     """Returns quaternions [n, 4] divided by their length, the identity instead of 0."""
     length = np.sqrt(np.einsum("nc,nc->n", p, p))
+    if length.all():
+        return np.asarray(p / length[:, None])
     found = p / np.where(length > 0, length, 1)[:, None]
     found[length == 0, 0] = 1
     return np.asarray(found)

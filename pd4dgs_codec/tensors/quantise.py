@@ -85,7 +85,11 @@ def dequantise(k: np.ndarray, step: float) -> np.ndarray:
 
     Computed in binary32 with the same result, as |k| <= MAX_SYMBOL and the step is a binary32.
     """
-    values: np.ndarray = k.astype(np.float32)
+    return _scaled(k.astype(np.float32), step)
+
+
+def _scaled(values: np.ndarray, step: float) -> np.ndarray:
+    """Multiplies float32 values by the step in place."""
     with np.errstate(over="ignore"):  # the caller refuses infinities, see all_finite
         values *= np.float32(step)
     return values
@@ -197,9 +201,15 @@ class RowTable:
                 own[:, rows] = quantise(channels, tensor.step, name, m, spacing[rows]) * spacing[rows] + m
         return v
 
-    def dequantise(self, v: np.ndarray) -> list[np.ndarray]:
-        """Returns the values float32 [n, C] of each tensor, C-contiguous."""
-        return [np.ascontiguousarray(dequantise(own, tensor.step).T) for tensor, own in self.of_each(v)]
+    def dequantise(self, v: np.ndarray, out: Sequence[np.ndarray] | None = None) -> list[np.ndarray]:
+        """Returns the values float32 [n, C] of each tensor, C-contiguous. out: arrays to write them to."""
+        found = [np.empty((v.shape[1], t.channels), np.float32) for t in self.tensors] if out is None else list(out)
+        for rows in row_blocks(v.shape[1]):
+            for (tensor, own), values in zip(self.of_each(v[:, rows]), found, strict=True):
+                block = values[rows]
+                block[:] = own.T
+                _scaled(block, tensor.step)
+        return found
 
     @property
     def _plain(self) -> bool:
@@ -207,19 +217,25 @@ class RowTable:
         return not self.graded and not any(tensor.predictor for tensor in self.tensors)
 
     def values(self, symbols: np.ndarray, classes: np.ndarray) -> np.ndarray:
-        """Returns v of symbols k int32 [W, n]. Raises Malformed if a magnitude exceeds MAX_SYMBOL."""
-        if magnitude(symbols) > MAX_SYMBOL:
+        """Returns v of symbols k int32 [W, n], in their place. Raises Malformed if a magnitude exceeds MAX_SYMBOL."""
+        if (largest := magnitude(symbols)) > MAX_SYMBOL:
             raise Malformed(f"a symbol of a row over {MAX_SYMBOL} in magnitude")
         if self._plain:
             return symbols
-        v = np.empty_like(symbols)
-        for tensor, k, out, m in self._mapped(symbols, v):
-            used = self._used(tensor, classes)
-            found = _accumulated(k, m, used) if tensor.predictor else (k << (used if used.size else 0)) + m
-            if magnitude(found) > MAX_SYMBOL:
-                raise Malformed(f"a value of a row more than {MAX_SYMBOL} steps from 0")
-            out[:] = found
-        return v
+        spacing = np.int32(1) << classes if self.graded else np.int32(1)
+        reach = largest * int(np.max(spacing, initial=1)) + magnitude(self._centres)
+        for tensor, k, _, m in self._mapped(symbols, symbols):
+            if tensor.predictor:
+                found = _accumulated(k, m, self._used(tensor, classes))
+                _check_reach(found)
+                k[:] = found
+                continue
+            for channel, centre in zip(k, m[:, 0], strict=True):  # which stay in the cache
+                channel *= spacing
+                channel += centre
+            if reach > MAX_SYMBOL:
+                _check_reach(k)
+        return symbols
 
     def symbols(self, v: np.ndarray, classes: np.ndarray) -> np.ndarray:
         """The inverse of `values`. Raises EncodeError if no symbols give v."""
@@ -234,6 +250,11 @@ class RowTable:
             expect(np.array_equal(out << shifts, steps), f"rows {tensor.id}: values between the steps of their class")
             expect(magnitude(out) <= MAX_SYMBOL, f"rows {tensor.id}: a symbol over {MAX_SYMBOL} in magnitude")
         return symbols
+
+
+def _check_reach(v: np.ndarray) -> None:
+    if magnitude(v) > MAX_SYMBOL:
+        raise Malformed(f"a value of a row more than {MAX_SYMBOL} steps from 0")
 
 
 def _runs(classes: np.ndarray, n: int) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:

@@ -11,7 +11,7 @@ import numpy as np
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.morton import MAX_VOXEL, morton_order
 from pd4dgs_codec.scene import Network
-from pd4dgs_codec.tensors.quantise import NO_CLASSES, RowTable, all_finite, dequantise, row_blocks
+from pd4dgs_codec.tensors.quantise import NO_CLASSES, RowTable, all_finite, dequantise
 from pd4dgs_codec.tensors.tables import Fill, Tables, Tensors
 
 NO_LAYER_ROWS = np.zeros((0, 0), np.int32)
@@ -210,10 +210,7 @@ class Growing:
         self._classes.grow(part.classes.size)[:] = part.classes
         tables = ((self._table, self._rows, part.rows), (part.layer_table, self._layer_rows[-1], part.layer_rows))
         for table, columns, v in tables if part.layer_rows.size else tables[:1]:
-            grown = [column.grow(v.shape[1]) for column in columns]
-            for at in row_blocks(v.shape[1]):
-                for own, x in zip(grown, table.dequantise(v[:, at]), strict=True):
-                    own[at] = x
+            table.dequantise(v, [column.grow(v.shape[1]) for column in columns])
 
     def sort(self) -> None:
         """Sorts the rows of the layer in progress by Morton order."""
@@ -296,17 +293,21 @@ class TakenVoxels:
 
     def __init__(self) -> None:
         self._runs = list[np.ndarray]()  # ascending keys, each run more than twice as long as the next
+        self._latest = np.zeros(0, np.uint64)  # keys that no run has yet: of a single slice none are sorted
 
     def take(self, anchor_q: np.ndarray) -> None:
         """Adds distinct voxels int32 [n, 3]. Raises Malformed if one of them is taken already."""
-        keys = np.sort(_voxel_keys(anchor_q))
+        keys, self._latest = self._latest, self._latest[:0]
+        while keys.size and self._runs and self._runs[-1].size <= 2 * keys.size:
+            keys = np.concatenate([self._runs.pop(), keys])
+        self._runs += [np.sort(keys, kind="stable")] if keys.size else []
+        keys = _voxel_keys(anchor_q)
         for run in self._runs:
+            keys.sort(kind="stable")  # in no time if it is
             taken = np.flatnonzero(run[np.minimum(np.searchsorted(run, keys), run.size - 1)] == keys)
             if taken.size:
                 raise Malformed(f"voxel {_voxel_of(keys[taken[0]])} holds more than one anchor, expected one")
-        while keys.size and self._runs and self._runs[-1].size <= 2 * keys.size:
-            keys = np.sort(np.concatenate([self._runs.pop(), keys]), kind="stable")
-        self._runs += [keys] if keys.size else []
+        self._latest = keys
 
 
 def first_duplicate(anchor_q: np.ndarray) -> list[int] | None:

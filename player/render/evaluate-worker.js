@@ -1,40 +1,63 @@
 // The worker of the evaluator without a GPU.
 
-import { evaluate } from "./evaluate.js";
-import { texelsFor } from "./level.js";
+import { texelsOf } from "./evaluate.js";
+import { packed } from "./ext-splats.js";
 import { serve } from "./remote.js";
 import { SplatEvaluator } from "./splats.js";
 /** @import { Scene } from "../kinds/index.js" */
+/** @import { Packed } from "./ext-splats.js" */
 /** @import { Texels } from "./level.js" */
 
-/** What evaluates the newest scene.
- * @type {(level: number, t: number, eye: number[], spare: Float32Array | null) => Texels} */
-let texelsAt;
+/** The newest scene. @type {Scene} */
+let scene;
+/** What evaluates it, if it is one of splats. @type {SplatEvaluator} */
+let splats;
+/** The latest that were packed. @type {Texels | null} */
+let kept = null;
+
+/** @param {Scene | null} next */
+function take(next) {
+  if (!next) return;
+  scene = next;
+  if (scene.kind === "splats") splats = new SplatEvaluator(scene);
+}
 
 serve({
-  /** @param {number} level @param {number} t @param {number[]} eye @param {Scene | null} next a new scene
-   * @param {Float32Array | null} spare data of an earlier result, to overwrite */
-  evaluate(level, t, eye, next, spare) {
-    if (next) texelsAt = evaluatorOf(next);
+  /** @param {Scene | null} next a new scene @param {number} level @param {number} t @param {number[]} eye
+   * @param {Texels | null} spare an earlier result, to overwrite */
+  evaluate(next, level, t, eye, spare) {
+    take(next);
     const result = texelsAt(level, t, eye, spare);
     const means = result.data.slice(0, 4 * result.count);
     return { result: { ...result, means }, transfer: [result.data.buffer, means.buffer] };
   },
+
+  /** @param {Scene | null} next a new scene @param {number} level @param {number} t @param {number[]} eye
+   * @param {Packed | null} spare an earlier result, to overwrite */
+  pack(next, level, t, eye, spare) {
+    take(next);
+    kept = texelsAt(level, t, eye, kept);
+    const result = packed(kept, spare);
+    return { result, transfer: result.extArrays.map(({ buffer }) => buffer) };
+  },
+
+  /** @param {Scene | null} next of splats @param {number} level @param {number} t */
+  means(next, level, t) {
+    take(next);
+    const result = splats.means(level, t);
+    return { result, transfer: [result.buffer] };
+  },
+
+  /** @param {Scene | null} next of splats @param {number} level */
+  parts(next, level) {
+    take(next);
+    const result = splats.parts(level);
+    const { rest, coefficients, windows } = result;
+    return { result, transfer: [rest.buffer, coefficients.buffer, ...(windows ? [windows.buffer] : [])] };
+  },
 });
 
-/** @param {Scene} scene @returns {typeof texelsAt} */
-function evaluatorOf(scene) {
-  if (scene.kind === "splats") {
-    const evaluator = new SplatEvaluator(scene);
-    return (...state) => evaluator.evaluate(...state);
-  }
-  return (level, t, eye, spare) => {
-    const { count, records } = evaluate(scene, level, t, eye);
-    const texels = texelsFor(count, spare);
-    const block = texels.data.length / 4;
-    for (let i = 0; i < count; i++) {
-      for (let k = 0; k < 16; k++) texels.data[(k >> 2) * block + 4 * i + (k & 3)] = records[16 * i + k];
-    }
-    return { ...texels, count };
-  };
+/** The Gaussians of the scene. @param {number} level @param {number} t @param {number[]} eye @param {Texels | null} spare */
+function texelsAt(level, t, eye, spare) {
+  return scene.kind === "splats" ? splats.evaluate(level, t, eye, spare) : texelsOf(scene, level, t, eye, spare);
 }

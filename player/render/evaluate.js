@@ -4,10 +4,11 @@
 import { Column } from "../decode/columns.js";
 import { Arena } from "./kernel.js";
 import { cellsOf, eachAttribute, GAUSSIAN_COLUMNS as COLUMNS, headsIn, levelOf } from "./level.js";
-import { MIN_OPACITY, SPATIAL, sliceAt } from "./level.js";
+import { MIN_OPACITY, SPATIAL, sliceAt, texelsFor } from "./level.js";
 import { anchorColumns } from "./record.js";
 /** @import { Network } from "../decode/tensors.js" */
 /** @import { Deformation, Scale, AnchorScene } from "../kinds/index.js" */
+/** @import { Texels } from "./level.js" */
 
 /**
  * The visible Gaussians in ascending order of their slot, anchor · slots + i. records: [count, GAUSSIAN_COLUMNS], all
@@ -371,4 +372,16 @@ export function evaluate(scene, level, t, eye, arena) {
     current = new Evaluator(scene, room);
   }
   return current.evaluate(level, t, eye);
+}
+
+/** `evaluate` as texels. @param {AnchorScene} scene @param {number} level @param {number} t @param {number[]} eye
+ * @param {Texels | null} spare earlier ones, which may be overwritten @returns {Texels} */
+export function texelsOf(scene, level, t, eye, spare) {
+  const { count, records } = evaluate(scene, level, t, eye);
+  const texels = texelsFor(count, spare);
+  const block = texels.data.length / 4;
+  for (let i = 0; i < count; i++) {
+    for (let k = 0; k < COLUMNS; k++) texels.data[(k >> 2) * block + 4 * i + (k & 3)] = records[COLUMNS * i + k];
+  }
+  return { ...texels, count, still: 0 };
 }

@@ -17,9 +17,9 @@ import { ANCHOR_BITS, NO_ENTRY } from "./sort.js";
 
 /**
  * Visible Gaussians for the renderer: their records in texels of SPLAT_BLOCKS blocks. A texel without a Gaussian has
- * opacity −1. shapes: stands for the time and the list of which they have the opacities and shapes.
+ * opacity −1. shapes: stands for the time and the list of which they have the opacities and shapes. still: as in Texels.
  *
- * @typedef {{field: Field, shapes?: object}} Splats
+ * @typedef {{field: Field, shapes?: object, still?: number}} Splats
  */
 
 /**
@@ -31,7 +31,7 @@ import { ANCHOR_BITS, NO_ENTRY } from "./sort.js";
 /** Block of an anchor's record where its features begin. */
 const FEATURE_BLOCK = 3;
 /** Block of a Gaussian's record that is its colour. */
-export const COLOR_BLOCK = 3;
+const COLOR_BLOCK = 3;
 /** Blocks of a Gaussian's record. */
 export const SPLAT_BLOCKS = GAUSSIAN_COLUMNS / 4;
 /** Limit of the textures of all anchors, bytes: beyond it devices fail in ways that cannot be distinguished. */

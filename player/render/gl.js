@@ -142,14 +142,15 @@ export class Gpu {
     return this.field(width, height, blocks, null, format);
   }
 
-  /** Overwrites the first `rows` rows of the blocks from `first` on. @param {Field} field of floats
-   * @param {Float32Array} data [blocks, height, width, 4] @param {number} [rows] default: all @param {number} [first] */
-  write({ texture, width, height, blocks }, data, rows = height, first = 0) {
+  /** Overwrites the first `rows` rows of `count` blocks from `first` on. @param {Field} field of floats
+   * @param {Float32Array} data [blocks, height, width, 4] @param {number} [rows] default: all @param {number} [first]
+   * @param {number} [count] default: all behind it */
+  write({ texture, width, height, blocks }, data, rows = height, first = 0, count = blocks - first) {
     const from = 4 * width * height * first;
     const { gl } = this;
     gl.bindTexture(gl.TEXTURE_2D_ARRAY, texture);
     gl.pixelStorei(gl.UNPACK_IMAGE_HEIGHT, height);
-    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, first, width, rows, blocks - first, gl.RGBA, gl.FLOAT, data, from);
+    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, first, width, rows, count, gl.RGBA, gl.FLOAT, data, from);
     gl.pixelStorei(gl.UNPACK_IMAGE_HEIGHT, 0);
   }
 
@@ -168,6 +169,19 @@ export class Gpu {
         : [gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT];
     gl.texStorage2D(gl.TEXTURE_2D, 1, internal, width, height);
     gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, height, format, type, data);
+    return texture;
+  }
+
+  /** A texture of half floats, its width the largest. @param {Float32Array} data RGB of texels, row after row
+   * @returns {WebGLTexture} */
+  colors(data) {
+    const { gl, maxSide: width } = this;
+    const count = data.length / 3;
+    const whole = Math.floor(count / width);
+    const texture = this._texture(gl.TEXTURE_2D);
+    gl.texStorage2D(gl.TEXTURE_2D, 1, gl.RGB16F, width, Math.ceil(count / width));
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, whole, gl.RGB, gl.FLOAT, data);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, whole, count - whole * width, 1, gl.RGB, gl.FLOAT, data, 3 * whole * width);
     return texture;
   }
 

@@ -5,6 +5,8 @@
 
 /** Vectors of outputs that are summed up together: with four, no addition waits for the one before it. */
 const VECTORS = 4;
+/** Outputs of a group. */
+export const GROUP = 4 * VECTORS;
 const PAGE_FLOATS = 1 << 14;
 
 /**
@@ -16,13 +18,10 @@ const PAGE_FLOATS = 1 << 14;
 
 /** Floats that both sides see; what was taken lasts until `reset`. */
 export class Arena {
-  /** @param {boolean} [wasm] default: if the machine allows it @param {number} [vectors] of a group of outputs, 1..4: fewer
-   * where all layers have fewer outputs */
-  constructor(wasm = true, vectors = VECTORS) {
+  /** @param {boolean} [wasm] default: if the machine allows it */
+  constructor(wasm = true) {
     this._top = 0;
-    /** Outputs of a group. */
-    this._group = 4 * vectors;
-    this._wasm = wasm ? start(vectors) : null;
+    this._wasm = wasm ? start() : null;
     /** Taking more may replace it. */
     this.floats = this._wasm ? new Float32Array(this._wasm.memory.buffer) : new Float32Array(0);
   }
@@ -55,25 +54,17 @@ export class Arena {
   }
 
   /** Takes a layer in. @param {Network[number]} layer @param {boolean} relu whether ReLU follows @returns {Packed} */
-  pack(layer, relu) {
-    const { inputs, outputs } = layer;
-    const groups = Math.ceil(outputs / this._group);
-    const stride = groups * this._group;
+  pack({ weight, bias, inputs, outputs }, relu) {
+    const groups = Math.ceil(outputs / GROUP);
+    const stride = groups * GROUP;
     const at = this.take(stride * (inputs + 1));
     this.floats.fill(0, at, at + stride * (inputs + 1));
-    this.repack(at, layer);
-    return { at, inputs, groups, stride, relu };
-  }
-
-  /** Puts other weights in the place of a layer's. @param {number} at the layer's @param {Network[number]} layer of the
-   * same size */
-  repack(at, { weight, bias, inputs, outputs }) {
-    const { _group: group } = this;
     for (let o = 0; o < outputs; o++) {
-      let to = at + Math.floor(o / group) * group * (inputs + 1) + (o % group);
+      let to = at + Math.floor(o / GROUP) * GROUP * (inputs + 1) + (o % GROUP);
       this.floats[to] = bias[o];
-      for (let i = 0; i < inputs; i++) this.floats[(to += group)] = weight[o * inputs + i];
+      for (let i = 0; i < inputs; i++) this.floats[(to += GROUP)] = weight[o * inputs + i];
     }
+    return { at, inputs, groups, stride, relu };
   }
 
   /**
@@ -96,18 +87,17 @@ export class Arena {
  * @param {Float32Array} floats @param {Packed} layer @param {number} rows @param {number} x @param {number} stride
  * @param {number} out
  */
-function linear(floats, { at, inputs, groups, stride: outputs, relu }, rows, x, stride, out) {
-  const group = outputs / groups;
-  const sums = new Float64Array(group);
+function linear(floats, { at, inputs, groups, relu }, rows, x, stride, out) {
+  const sums = new Float64Array(GROUP);
   for (let r = 0; r < rows; r++, x += stride) {
     let w = at;
     for (let g = 0; g < groups; g++) {
-      for (let k = 0; k < group; k++) sums[k] = floats[w++];
-      for (let i = 0; i < inputs; i++, w += group) {
+      for (let k = 0; k < GROUP; k++) sums[k] = floats[w++];
+      for (let i = 0; i < inputs; i++, w += GROUP) {
         const value = floats[x + i];
-        for (let k = 0; k < group; k++) sums[k] += floats[w + k] * value;
+        for (let k = 0; k < GROUP; k++) sums[k] += floats[w + k] * value;
       }
-      for (let k = 0; k < group; k++) floats[out++] = relu && sums[k] < 0 ? 0 : sums[k];
+      for (let k = 0; k < GROUP; k++) floats[out++] = relu && sums[k] < 0 ? 0 : sums[k];
     }
   }
 }
@@ -144,14 +134,13 @@ const countdown = (counter, body) => {
   return [0x03, 0x40, ...body.flat(), ...again, 0x0b];
 };
 
-/** linear(rows, x, stride, weights, inputs, groups, out, floor): addresses in bytes; sums below `floor` become it.
- * @param {number} vectors of a group */
-function program(vectors) {
+/** linear(rows, x, stride, weights, inputs, groups, out, floor): addresses in bytes; sums below `floor` become it. */
+function program() {
   const [ROWS, X, STRIDE, WEIGHTS, INPUTS, GROUPS, OUT, FLOOR, GROUP_LEFT, LEFT, AT, W, VALUE] = Array(13).keys();
-  const SUMS = [13, 14, 15, 16].slice(0, vectors);
+  const SUMS = [13, 14, 15, 16];
   const [LOAD, LOAD_SPLAT, STORE, SPLAT, ADD, MUL, MAX] = [0x00, 0x09, 0x0b, 0x13, 0xe4, 0xe6, 0xe9];
   const vectorBytes = 16;
-  const groupBytes = constant(vectors * vectorBytes);
+  const groupBytes = constant(VECTORS * vectorBytes);
 
   const input = [
     [...get(AT), ...simd(LOAD_SPLAT, place(0)), ...set(VALUE)],
@@ -178,7 +167,7 @@ function program(vectors) {
     countdown(GROUP_LEFT, group),
     advance(X, get(STRIDE)),
   ];
-  const locals = [2, 4, I32, 1 + vectors, V128]; // two runs: GROUP_LEFT to W, VALUE and the sums
+  const locals = [2, 4, I32, 1 + VECTORS, V128]; // two runs: GROUP_LEFT to W, VALUE and the sums
   const body = [...locals, ...countdown(ROWS, row), 0x0b];
   return new Uint8Array([
     ...[0x00, 0x61, 0x73, 0x6d, 1, 0, 0, 0],
@@ -194,13 +183,12 @@ function program(vectors) {
  * The program and its memory; null where there is no WebAssembly with vectors, or a content security policy without
  * 'wasm-unsafe-eval'.
  *
- * @param {number} vectors of a group
  * @returns {{memory: WebAssembly.Memory, linear: (...args: number[]) => void} | null}
  */
-function start(vectors) {
+function start() {
   try {
     const memory = new WebAssembly.Memory({ initial: 1 });
-    const { exports } = new WebAssembly.Instance(new WebAssembly.Module(program(vectors)), { e: { m: memory } });
+    const { exports } = new WebAssembly.Instance(new WebAssembly.Module(program()), { e: { m: memory } });
     return { memory, linear: /** @type {(...args: number[]) => void} */ (exports.linear) };
   } catch {
     return null;

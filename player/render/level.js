@@ -16,18 +16,20 @@ export const GAUSSIAN_COLUMNS = 16;
 
 /**
  * Gaussians as texels, [4, height, width, 4], of which the first `count` are filled: columns 4·b to 4·b + 3 of a record
- * in block b.
+ * in block b. changing: the blocks in which those of equal `still` differ; 0 equals none.
  *
- * @typedef {{count: number, data: Float32Array, width: number, height: number}} Texels
+ * @typedef {{count: number, data: Float32Array, width: number, height: number, still: number, changing: number[]}} Texels
  */
 
-/** Room for Gaussians. @param {number} most @param {Float32Array | null} spare data of others, to take if it fits
+/** Room for Gaussians. @param {number} most @param {Texels | null} spare others, whose room is taken if it fits
  * @returns {Texels} */
 export function texelsFor(most, spare) {
   const width = 2 ** Math.max(4, Math.ceil(Math.log2(Math.sqrt(most + 1))));
   const height = Math.max(1, Math.ceil(most / width));
   const length = GAUSSIAN_COLUMNS * width * height;
-  return { count: 0, data: spare?.length === length ? spare : new Float32Array(length), width, height };
+  const own = { count: 0, width, height, changing: [0, 1, 2, 3] };
+  if (spare?.data.length === length) return { ...own, data: spare.data, still: spare.still };
+  return { ...own, data: new Float32Array(length), still: 0 };
 }
 
 /** Lower opacities never reach a pixel: a picture has 255 steps. */

@@ -19,10 +19,10 @@ import { Clip } from "./loader.js";
 
 /**
  * The Gaussians of a state, each array [count, 4]: mean and opacity; scales, scene units; quaternions w x y z; colours,
- * RGB in display space. All are finite and can be seen. fill: the colour behind them, RGB.
+ * RGB in display space. All are finite and can be seen. changed: of each array, whether it differs from that before.
  *
  * @typedef {{count: number, means: Float32Array, scales: Float32Array, quaternions: Float32Array,
- *   colors: Float32Array, fill: number[]}} Gaussians
+ *   colors: Float32Array, changed: boolean[]}} Gaussians
  */
 
 /**
@@ -36,14 +36,34 @@ export function poseOf(view) {
 }
 
 /**
+ * Takes centres, [count, 3], out of means, and returns the box around them.
+ *
+ * @param {Float32Array} means @param {number} count @param {Float32Array} centres
+ */
+export function takeCentres(means, count, centres) {
+  const low = [Infinity, Infinity, Infinity];
+  const high = [-Infinity, -Infinity, -Infinity];
+  for (let i = 0; i < count; i++) {
+    for (let axis = 0; axis < 3; axis++) {
+      const value = (centres[3 * i + axis] = means[4 * i + axis]);
+      if (value < low[axis]) low[axis] = value;
+      if (value > high[axis]) high[axis] = value;
+    }
+  }
+  return { low, high };
+}
+
+/**
  * Loads a scene, keeps its time, and hands Gaussians to a renderer whenever they change.
  *
  * Events: those of `Clip`, of which `error` leaves what was valid; `upgrade` {level, anchors, gaussians} when a higher
  * level, or more anchors of it, is with the renderer.
+ *
+ * @template {{count: number}} [G=Gaussians]
  */
 export class Playback extends Clip {
-  /** @param {PlaybackOptions} options @param {(gaussians: Gaussians) => void | Promise<void>} fill takes Gaussians;
-   * the next ones come when it is done */
+  /** @param {PlaybackOptions} options @param {(gaussians: G & {fill: number[]}) => void | Promise<void>} fill takes
+   * Gaussians, and the colour behind them, RGB; the next ones come when it is done */
   constructor({ time, loop = true }, fill) {
     super({ time, loop });
     this._fill = fill;
@@ -52,6 +72,8 @@ export class Playback extends Clip {
     this._resolve = () => {};
     this._reject = (/** @type {unknown} */ _reason) => {};
     this._evaluator = new CpuEvaluator();
+    /** As in Texels, of the latest Gaussians. */
+    this._still = 0;
     /** @type {State | null} */
     this._wanted = null;
     /** What the renderer has. @type {State | null} */
@@ -141,20 +163,27 @@ export class Playback extends Clip {
     try {
       while (this._wanted && !this.settled) {
         const state = this._wanted;
-        const { count, data } = await this._evaluator.evaluate(state);
+        const gaussians = await this._gaussians(state);
         if (this.closed) return;
-        const at = data.length / 4;
-        const [means, scales, quaternions, colors] = [0, 1, 2, 3].map((b) => data.subarray(b * at, b * at + 4 * count));
-        const { fill } = levelOf(state.scene, state.level);
-        await this._fill({ count, means, scales, quaternions, colors, fill });
+        await this._fill({ ...gaussians, fill: levelOf(state.scene, state.level).fill });
         if (this.closed) return;
-        this._tell(state, count);
+        this._tell(state, gaussians.count);
         this._shown = state;
       }
       this._evaluating = false;
     } catch (error) {
       if (!this.closed) this._fail(error); // and nothing is evaluated any more
     }
+  }
+
+  /** @param {State} state @returns {Promise<G>} */
+  async _gaussians(state) {
+    const { count, data, still, changing } = await this._evaluator.evaluate(state);
+    const changed = [0, 1, 2, 3].map((block) => !still || still !== this._still || changing.includes(block));
+    this._still = still;
+    const at = data.length / 4;
+    const [means, scales, quaternions, colors] = [0, 1, 2, 3].map((b) => data.subarray(b * at, b * at + 4 * count));
+    return /** @type {any} */ ({ count, means, scales, quaternions, colors, changed });
   }
 
   /** @param {State} state which the renderer now has @param {number} gaussians */

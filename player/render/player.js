@@ -2,16 +2,17 @@
 
 import { centreOf, defaultCamera, fitted } from "./camera.js";
 import { CpuEvaluator } from "./cpu.js";
-import { COLOR_BLOCK, GpuEvaluator, SPLAT_BLOCKS } from "./evaluator.js";
+import { GpuEvaluator, SPLAT_BLOCKS } from "./evaluator.js";
 import { Gpu } from "./gl.js";
 import { levelOf, sameState, stateOf } from "./level.js";
 import { Clip } from "./loader.js";
 import { Pace } from "./pace.js";
 import { Painter } from "./painter.js";
 import { Remote } from "./remote.js";
+import { SplatPass } from "./splat-pass.js";
 import { WORKERS } from "./workers.js";
 /** @import { Camera } from "../decode/tensors.js" */
-/** @import { AnchorScene, Scene } from "../kinds/index.js" */
+/** @import { Scene } from "../kinds/index.js" */
 /** @import { Evaluated, Splats } from "./evaluator.js" */
 /** @import { State } from "./level.js" */
 
@@ -90,7 +91,7 @@ export class Player extends Clip {
     this._gpu = null;
     /** @type {Painter | null} */
     this._painter = null;
-    /** @type {GpuEvaluator | null} */
+    /** @type {GpuEvaluator | SplatPass | null} */
     this._evaluator = null;
     /** @type {CpuEvaluator | null} */
     this._cpu = null;
@@ -500,8 +501,8 @@ export class Player extends Clip {
   /** @param {Gpu} gpu @param {Scene} scene */
   _onCpu(gpu, scene) {
     const { evaluator } = this._options;
-    const few = gpu.software && scene.anchor.length <= 3 * SOFTWARE_ANCHORS;
-    return scene.kind === "splats" || evaluator === "cpu" || this._unfit || !gpu.floats || (few && evaluator !== "gpu");
+    const few = gpu.software && (scene.kind === "splats" || scene.anchor.length <= 3 * SOFTWARE_ANCHORS);
+    return evaluator === "cpu" || this._unfit || !gpu.floats || (few && evaluator !== "gpu");
   }
 
   /** @param {Gpu} gpu @param {State} state @param {Splats | null} into what may be overwritten
@@ -514,18 +515,17 @@ export class Player extends Clip {
       this._evaluator = null;
     }
     if (onCpu) {
-      this._cpu ??= new CpuEvaluator();
-      const { count, data, means, width, height } = await this._cpu.evaluate(state);
+      const cpu = (this._cpu ??= new CpuEvaluator());
+      const { count, data, means, width, height, still, changing } = await cpu.evaluate(state);
       const field = gpu.renewed(into?.field, width, height, SPLAT_BLOCKS);
-      // another eye changes colours alone where Gaussians need no anchors
-      const { state: had, splats } = this._front ?? {};
-      const blind = scene.kind === "splats" && had?.scene === scene && had.level === level && had.t === t;
-      const shapes = blind ? splats?.shapes : {};
-      const kept = into?.field === field && into.shapes === shapes;
-      gpu.write(field, data, Math.ceil(count / width), kept ? COLOR_BLOCK : 0);
-      return { splats: { field, shapes }, means: blind ? null : means };
+      const blocks = into?.field === field && still && into.still === still ? changing : [0, 1, 2, 3];
+      for (const block of blocks) gpu.write(field, data, Math.ceil(count / width), block, 1);
+      return { splats: { field, still }, means };
     }
-    this._evaluator ??= new GpuEvaluator(gpu, /** @type {AnchorScene} */ (scene));
+    this._evaluator ??=
+      scene.kind === "splats"
+        ? new SplatPass(gpu, scene, (this._cpu ??= new CpuEvaluator()))
+        : new GpuEvaluator(gpu, scene);
     return this._evaluator.evaluate(level, t, eye, into, (opacities, ...rest) =>
       this._sorter.call("list", [opacities, ...rest], [opacities.buffer]),
     );

@@ -45,14 +45,15 @@ class Matrix4 {
 
 const THREE = { Vector3: Vector, Quaternion: Vector, Color: Vector, Matrix4, SRGBColorSpace: "srgb" };
 
-/** Spark's: arrays of whole rows of 2,048, which grow at least twofold; textures that are made anew with them. */
-class ExtSplats {
+/** A version of Spark's that stores splats in some other way: arrays of whole rows of 2,048, which grow at least twofold;
+ * textures that are made anew with them. */
+class OtherSplats {
   constructor() {
     this.maxSplats = this.numSplats = 0;
     this.extArrays = [new Uint32Array(0), new Uint32Array(0)];
     this.textures = [{ needsUpdate: false }, { needsUpdate: false }];
     /** @type {any[]} */
-    this.content = [];
+    this.stored = [];
     this.made = 0;
   }
 
@@ -67,7 +68,7 @@ class ExtSplats {
   setSplat(index, ...[c, s, q, opacity, { r, g, b }]) {
     assert.ok(index < this.maxSplats);
     this.numSplats = Math.max(this.numSplats, index + 1);
-    this.content[index] = [c.x, c.y, c.z, s.x, s.y, s.z, q.w, q.x, q.y, q.z, opacity, r, g, b];
+    this.stored[index] = [c.x, c.y, c.z, s.x, s.y, s.z, q.w, q.x, q.y, q.z, opacity, r, g, b];
   }
 
   /** @param {{extArrays: Uint32Array[], numSplats: number}} options */
@@ -76,6 +77,57 @@ class ExtSplats {
     assert.equal(extArrays[0].length, 4 * this.maxSplats);
     this.numSplats = numSplats;
     this.textures = [{ needsUpdate: false }, { needsUpdate: false }];
+  }
+
+  get content() {
+    return this.stored.slice(0, this.numSplats);
+  }
+}
+
+/** @param {number} bits of a 16-bit float */
+function ofHalf(bits) {
+  const [sign, exponent, rest] = [bits >> 15, (bits >> 10) & 31, bits & 1023];
+  return (sign ? -1 : 1) * (exponent ? (1 + rest / 1024) * 2 ** (exponent - 15) : rest * 2 ** -24);
+}
+
+/** Spark's 2.2. */
+class ExtSplats extends OtherSplats {
+  /** @param {{extArrays: Uint32Array[], numSplats: number}} [options] */
+  constructor(options) {
+    super();
+    if (options) this.reinitialize(options);
+  }
+
+  /** @param {{extArrays: Uint32Array[], numSplats: number}} options */
+  reinitialize({ extArrays, numSplats }) {
+    assert.ok(extArrays.every(({ length }) => length % 8192 === 0 && length >= 4 * numSplats));
+    Object.assign(this, { extArrays, numSplats });
+  }
+
+  /** @param {number} index */
+  getSplat(index) {
+    const [[...first], [...second]] = this.extArrays.map((array) => array.subarray(4 * index, 4 * index + 4));
+    const [x, y, z] = new Float32Array(Uint32Array.from(first).buffer);
+    const [r, g, b, sx, sy, sz] = second.slice(0, 3).flatMap((two) => [ofHalf(two & 0xffff), ofHalf(two >>> 16)]);
+    const [u, v] = [second[3] & 1023, (second[3] >>> 10) & 1023].map((k) => (2 * k) / 1023 - 1);
+    const w = 1 - Math.abs(u) - Math.abs(v);
+    const axis = w < 0 ? [(1 - Math.abs(v)) * Math.sign(u), (1 - Math.abs(u)) * Math.sign(v), w] : [u, v, w];
+    const angle = ((second[3] >>> 20) / 4095) * Math.PI;
+    const [qx, qy, qz] = axis.map((k) => (k / Math.hypot(...axis)) * Math.sin(angle / 2));
+    return {
+      center: { x, y, z },
+      opacity: ofHalf(first[3]),
+      color: { r, g, b },
+      scales: { x: Math.exp(sx), y: Math.exp(sy), z: Math.exp(sz) },
+      quaternion: { w: Math.cos(angle / 2), x: qx, y: qy, z: qz },
+    };
+  }
+
+  get content() {
+    return Array.from({ length: this.numSplats }, (_, i) => {
+      const { center: c, scales: s, quaternion: q, opacity, color: { r, g, b } } = this.getSplat(i);
+      return [c.x, c.y, c.z, s.x, s.y, s.z, q.w, q.x, q.y, q.z, opacity, r, g, b];
+    });
   }
 }
 
@@ -122,41 +174,54 @@ function expected(level, t, eye) {
   });
 }
 
-test("the mesh holds the Gaussians of a level, a time and a camera", async () => {
-  const splats = await Pd4Splats.open(ADDRESS, modules);
-  /** @type {any[]} */
-  const upgrades = [];
-  splats.addEventListener("upgrade", (event) => upgrades.push(/** @type {any} */ (event).detail));
-  const { bytes, complete } = await detailOf(splats, "loaded");
-  assert.ok(complete && bytes === BYTES.length);
-  const { info, levels, mesh } = splats;
-  assert.deepEqual(levels, [0, 1, 2]);
-  assert.deepEqual(splats.background.values, [...info.background, "srgb"]);
-  const [start, end] = info.timeRange;
-  let seen = 0;
-  for (const [level, share, eye] of /** @type {[number, number, number[]][]} */ ([
-    [0, 0, [0, 0, -4]],
-    [1, 0.5, [0, 0, -4]],
-    [2, 1, [1, 2, -3]],
-  ])) {
-    splats.level = level;
-    splats.time = start + share * (end - start);
-    await settle(splats, cameraAt(eye));
-    const wanted = expected(level, level ? share : 0, eye);
-    assert.ok(wanted.length > 0);
-    assert.equal(mesh.extSplats.numSplats, wanted.length);
-    assert.deepEqual(mesh.extSplats.content.slice(0, wanted.length), wanted);
-    assert.equal(mesh.mappings, ++seen);
-    await settle(splats, cameraAt(eye));
-    assert.equal(mesh.mappings, seen, "nothing is evaluated in vain");
-  }
-  assert.equal(mesh.extSplats.made, 1);
-  assert.ok(mesh.extSplats.textures.every((/** @type {any} */ texture) => texture.needsUpdate));
-  assert.deepEqual(upgrades.map(({ level }) => level), [0, 1, 2]);
-  splats.close();
-  assert.ok(mesh.disposed);
-  assert.throws(() => splats.update(cameraAt([0, 0, 0])), /closed/);
-});
+for (const Stored of [ExtSplats, OtherSplats]) {
+  test(`the mesh holds the Gaussians of a level, a time and a camera: ${Stored.name}`, async () => {
+    const splats = await Pd4Splats.open(ADDRESS, { ...modules, spark: { SplatMesh, ExtSplats: Stored } });
+    /** @type {any[]} */
+    const upgrades = [];
+    splats.addEventListener("upgrade", (event) => upgrades.push(/** @type {any} */ (event).detail));
+    const { bytes, complete } = await detailOf(splats, "loaded");
+    assert.ok(complete && bytes === BYTES.length);
+    const { info, levels, mesh } = splats;
+    assert.deepEqual(levels, [0, 1, 2]);
+    assert.deepEqual(splats.background.values, [...info.background, "srgb"]);
+    const [start, end] = info.timeRange;
+    let seen = 0;
+    for (const [level, share, eye] of /** @type {[number, number, number[]][]} */ ([
+      [0, 0, [0, 0, -4]],
+      [1, 0.5, [0, 0, -4]],
+      [2, 1, [1, 2, -3]],
+    ])) {
+      splats.level = level;
+      splats.time = start + share * (end - start);
+      await settle(splats, cameraAt(eye));
+      const wanted = expected(level, level ? share : 0, eye);
+      assert.ok(wanted.length > 0);
+      const { content } = mesh.extSplats;
+      assert.equal(content.length, wanted.length);
+      const most = Stored === ExtSplats ? 4e-3 : 0; // of 16-bit floats, and of 10 bits for an axis
+      wanted.forEach((row, i) => {
+        const [q, p] = [row, content[i]].map((values) => values.slice(6, 10));
+        const turned = Math.sign(q.reduce((/** @type {number} */ sum, /** @type {number} */ value, /** @type {number} */ k) => sum + value * p[k], 0)); // q and -q are one rotation
+        row.forEach((value, k) => {
+          const found = k >= 6 && k < 10 ? turned * content[i][k] : content[i][k];
+          assert.ok(Math.abs(found - value) <= most * Math.max(1, Math.abs(value)), `${i} ${k}: ${found}, not ${value}`);
+        });
+      });
+      assert.equal(mesh.mappings, ++seen);
+      await settle(splats, cameraAt(eye));
+      assert.equal(mesh.mappings, seen, "nothing is evaluated in vain");
+    }
+    if (Stored === OtherSplats) {
+      assert.equal(mesh.extSplats.made, 1);
+      assert.ok(mesh.extSplats.textures.every((/** @type {any} */ texture) => texture.needsUpdate));
+    }
+    assert.deepEqual(upgrades.map(({ level }) => level), [0, 1, 2]);
+    splats.close();
+    assert.ok(mesh.disposed);
+    assert.throws(() => splats.update(cameraAt([0, 0, 0])), /closed/);
+  });
+}
 
 test("time advances while the mesh plays, and loops or stops at the end", async () => {
   const splats = await Pd4Splats.open(ADDRESS, { ...modules, time: 1e9, level: 0 });

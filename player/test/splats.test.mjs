@@ -218,9 +218,9 @@ test("absurd values are bounded, and a quaternion of zeros is the identity", () 
 test("an evaluation writes to the arrays of an earlier one of the same size", () => {
   const evaluator = new SplatEvaluator(sceneOf({ window: true }));
   const first = evaluator.evaluate(2, 0.2, [0, 0, 0]);
-  const second = evaluator.evaluate(2, 0.7, [0, 0, 0], first.data);
+  const second = evaluator.evaluate(2, 0.7, [0, 0, 0], first);
   assert.equal(second.data, first.data);
-  assert.notEqual(evaluator.evaluate(0, 0.7, [0, 0, 0], first.data).data, first.data);
+  assert.notEqual(evaluator.evaluate(0, 0.7, [0, 0, 0], first).data, first.data);
 });
 
 test("a state has a time where something changes, and an eye where there are harmonics", () => {

@@ -201,6 +201,20 @@ def test_a_file_without_a_camera_cannot_be_rendered(scene, tmp_path):
     assert bench.main(["latency", str(tmp_path / "scene.pd4")]) == 1
 
 
+# -- the player --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="needs Node.js")
+def test_the_player_is_measured_in_node(scene_pd4, tmp_path, capsys):
+    assert bench.main(["player", str(scene_pd4), "--pictures", "3", "--json"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["gaussians"] > 0 and {"decode", "evaluate", "sort"} < found["steps"].keys()
+    assert all(ms > 0 for ms in found["steps"].values())
+    (tmp_path / "junk.pd4").write_bytes(b"junk")
+    assert bench.main(["player", str(tmp_path / "junk.pd4")]) == 1
+    assert "DecodeError: not a .pd4 file" in capsys.readouterr().err
+
+
 # -- the command -------------------------------------------------------------------------------------------------------
 
 

@@ -69,7 +69,7 @@ def test_symbols_of_any_class_survive_their_float32_values(indices, step, seed):
     at = centre[:, None] + k * (1 << classes.astype(np.int64))
     k = np.where((np.abs(at) <= MAX_SYMBOL) & (np.abs(k) <= MAX_SYMBOL), k, 0).astype(np.int32)
     rows = table(10, step=step, centre=centre)
-    values = rows.dequantise(rows.values(k, classes))
+    values = rows.dequantise(rows.values(k.copy(), classes))
     np.testing.assert_array_equal(rows.symbols(rows.quantise(values, classes, ["rows"]), classes), k)
     at = centre[0] + k[0].astype(np.int64) * 2 ** classes.astype(np.int64)
     expected = (at * np.float64(step)).astype(np.float32)
@@ -100,7 +100,7 @@ def test_a_row_is_predicted_by_the_last_one_of_its_class_or_a_finer_one(pairs, m
     k, classes = np.array(pairs, np.int32).reshape(-1, 2).T
     rows = RowTable((Rows(0, 2, 1.0, 1), Rows(1, 1, 1.0)), np.array([m, 0, m], np.int32))
     symbols = np.stack([k, -k, k])
-    v = rows.values(symbols, classes)
+    v = rows.values(symbols.copy(), classes)
     assert v[0].tolist() == predicted(k.tolist(), classes.tolist(), m)
     assert v[1].tolist() == predicted((-k).tolist(), classes.tolist(), 0)
     assert v[2].tolist() == [m + (symbol << c) for symbol, c in zip(k.tolist(), classes.tolist(), strict=True)]
@@ -126,6 +126,6 @@ def test_values_between_the_steps_of_their_class_have_no_symbols():
 def test_classes_do_not_concern_labels(pairs):
     k, classes = np.array(pairs, np.int32).reshape(-1, 2).T
     table = RowTable((Rows(5, 1, 1.0, WHOLE),), np.zeros(1, np.int32))
-    v = table.values(k[None], classes)
+    v = table.values(k[None].copy(), classes)
     np.testing.assert_array_equal(v[0], np.cumsum(k))
     np.testing.assert_array_equal(table.symbols(v, classes), k[None])

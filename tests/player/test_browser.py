@@ -311,7 +311,9 @@ def narrow() -> bytes:
     return encode(lively_scene(700, widths=Widths(16, 4), keys=(20_000, 20_000)), layers=2, effort=1)
 
 
-@pytest.mark.parametrize("kind, evaluator", [("lively", "gpu"), ("narrow", "gpu"), ("narrow", "cpu"), ("splats", None)])
+@pytest.mark.parametrize(
+    "kind, evaluator", [("lively", "gpu"), ("narrow", "gpu"), ("narrow", "cpu"), ("splats", "cpu"), ("splats", "gpu")]
+)
 def test_pictures_are_those_of_the_rasteriser(harness, server, folder, kind, evaluator, request):
     pytest.importorskip("numba")
     data = request.getfixturevalue(kind)
@@ -330,12 +332,13 @@ def test_pictures_are_those_of_the_rasteriser(harness, server, folder, kind, eva
     assert decibels(seen[1], seen[2]) < 60 and decibels(seen[2], seen[5]) < 60  # levels and times differ
 
 
-def test_another_eye_changes_the_colours_of_splats(harness, server, folder, splats):
+@pytest.mark.parametrize("evaluator", [None, "gpu"])
+def test_another_eye_changes_the_colours_of_splats(harness, server, folder, splats, evaluator):
     pytest.importorskip("numba")
     (folder / "splats.pd4").write_bytes(splats)
-    turns = ((0.4, 0), (0.8, 0.1), (-0.5, 0), (0, 0.3))  # from the third on, colours alone go to the GPU
+    turns = ((0.4, 0), (0.8, 0.1), (-0.5, 0), (0, 0.3))
     views = [(resized(camera, WIDTH, HEIGHT), (0.37,)) for camera in cameras(decode(splats), turns)]
-    opened(harness, server.url_of("splats.pd4"))
+    opened(harness, server.url_of("splats.pd4"), evaluator=evaluator)
     for shot in shots(harness, splats, views, [2]):
         assert decibels(shot.player, shot.expected) > LEAST_DB, shot.camera
 
