@@ -160,6 +160,27 @@ def once(tmp_path_factory) -> Callable[[str, Callable[[Path], object]], Path]:
     return call
 
 
+@pytest.fixture(scope="session")
+def missing() -> Callable[[object], Any]:
+    """missing(reason) skips a test of a browser, and fails it where PD4DGS_REQUIRE_BROWSER is 1."""
+    end = pytest.fail if os.environ.get("PD4DGS_REQUIRE_BROWSER") == "1" else pytest.skip
+    return lambda reason: end(str(reason))
+
+
+@pytest.fixture(scope="module")
+def browser(missing) -> Iterator[Any]:
+    """Chromium as Playwright sees it."""
+    from browser import launched
+
+    from pd4dgs_codec.errors import DataError
+
+    try:
+        with launched() as found:
+            yield found
+    except DataError as error:
+        missing(error)
+
+
 @dataclass(frozen=True)
 class Result:
     """What a command did."""

@@ -1,4 +1,4 @@
-"""Scenes of splats and tracks: a Hypothesis generator, and one to look at."""
+"""Scenes of splats and tracks: a Hypothesis generator, one to look at, and what they are compared by."""
 
 from dataclasses import replace
 
@@ -6,6 +6,7 @@ import numpy as np
 from hypothesis import strategies as st
 from strategies import LAYER_SETS, RANGES, info, symbols
 
+from pd4dgs_codec.data.view import rotation_matrix
 from pd4dgs_codec.kinds import splats
 from pd4dgs_codec.kinds.splats import TENSORS, SplatScene
 from pd4dgs_codec.kinds.tracks import HEADS, NONE, Groups, Head, Tracks
@@ -132,6 +133,12 @@ def visible_splats(seed: int = 0, *, count: int = 300, degree: int = 1, moving: 
     camera = replace(camera, viewmat=viewmat, K=K, width=48, height=40)
     about = SceneInfo(size, box, (0.0, 2.0), (1.0, 1.0, 1.0), 0.1, 100.0, (0.3, -0.8, 0.5), 1.0, camera)
     return splats.scene(about, cells, tensors, STEPS, tracks=tracks)
+
+
+def covariances(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
+    """float64 [N, 3, 3] of unit quaternions wxyz [N, 4] and standard deviations [N, 3]."""
+    factor = rotation_matrix(quats) * scales.astype(np.float64)[:, None]
+    return np.asarray(factor @ factor.transpose(0, 2, 1))
 
 
 def assert_same_splats(a: SplatScene, b: SplatScene) -> None:

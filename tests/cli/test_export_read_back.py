@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from explicit import covariances
 from tiny import sighted, trained_like_scene
 
-from pd4dgs_codec.data.view import rotation_matrix
 from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
@@ -53,12 +53,6 @@ class Read:
         """[N, 3] seen from `eye`, by the harmonics up to a degree."""
         basis = harmonics(unit(self.means.astype(float) - eye), degree)
         return np.maximum(np.einsum("nj,njc->nc", basis, self.sh[:, : basis.shape[1]]) + 0.5, 0)
-
-
-def covariances(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
-    """[N, 3, 3] of quaternions wxyz and standard deviations."""
-    factor = rotation_matrix(quats.astype(float)) * scales.astype(float)[:, None]
-    return factor @ factor.transpose(0, 2, 1)
 
 
 def ply(raw: bytes) -> Read:

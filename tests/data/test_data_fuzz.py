@@ -127,7 +127,7 @@ class Folder:
         return "read"
 
 
-@pytest.mark.parametrize("seeds", [range(120), *(pytest.param(many, marks=pytest.mark.slow) for many in MANY)])
+@pytest.mark.parametrize("seeds", [range(40), *(pytest.param(many, marks=pytest.mark.slow) for many in MANY)])
 @pytest.mark.parametrize("kind", KINDS)
 def test_damaged_datasets(scene, tmp_path, kind, seeds):
     folder, counts = Folder(LAYOUTS[kind](scene, tmp_path / "set")), {"read": 0, "refused": 0}
@@ -137,4 +137,4 @@ def test_damaged_datasets(scene, tmp_path, kind, seeds):
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
         for seed in seeds:
             counts[folder.try_damage(seed)] += 1
-    assert min(counts.values()) > 5, counts  # the damage is neither harmless nor fatal throughout
+    assert min(counts.values()) > 2, counts  # the damage is neither harmless nor fatal throughout

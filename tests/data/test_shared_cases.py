@@ -1,6 +1,5 @@
 """Inputs as users have them, made by the scripts of a folder `cases` beside the shared data, are read well."""
 
-import os
 import re
 import subprocess
 import sys
@@ -14,7 +13,7 @@ from urllib.parse import quote
 
 import numpy as np
 import pytest
-from browser import ELEMENT, TIMEOUT_MS, launched, until
+from browser import ELEMENT, TIMEOUT_MS, until
 from common import ROOT, SHARED
 from PIL import Image
 from strategies import assert_same_scene, make_scene
@@ -122,7 +121,7 @@ REFUSED = {
     "list_in_vertex.ply": "unknown vertex property 'list uchar int neighbours', expected a scalar",
     "empty.ply": "none of 0 Gaussians is finite",
     "cut.ply": "40600 bytes of vertices, expected 41600",
-    "packed.ksplat": "is a .ksplat file, expected a PLY, SPZ, .splat or .4dgs file or a checkpoint of gsplat",
+    "packed.ksplat": "is a .ksplat file, expected a PLY, SPZ, SOG, .splat, .splatv or .4dgs file or a checkpoint",
 }
 DEGREE_0 = {"degree0.ply", "rgb.ply", "packed.splat"}
 
@@ -235,18 +234,15 @@ def test_what_is_no_file_is_one_line(server, path, says):
 
 
 @pytest.fixture(scope="module")
-def player(tmp_path_factory) -> Iterator[tuple[Any, str, str]]:
+def player(browser, tmp_path_factory) -> Iterator[tuple[Any, str, str]]:
     """A browser, the URL of the player's page, and that of the server of cases, which serves a scene of 18 kB."""
     folder = tmp_path_factory.mktemp("player")
     (folder / "index.html").write_text(page())
     (folder / "a.pd4").write_bytes(encode(make_scene(7, anchors=250, kind="gaussian", extent=20), layers=2, effort=1))
-    try:
-        with launched() as browser, Server(folder) as own, own.running(), serving(folder / "a.pd4") as url:
-            context = browser.new_context(viewport={"width": 160, "height": 120})
-            context.set_default_timeout(TIMEOUT_MS)
-            yield context, own.url, url
-    except DataError as error:
-        (pytest.fail if os.environ.get("PD4DGS_REQUIRE_BROWSER") == "1" else pytest.skip)(str(error))
+    with Server(folder) as own, own.running(), serving(folder / "a.pd4") as url:
+        context = browser.new_context(viewport={"width": 160, "height": 120})
+        context.set_default_timeout(TIMEOUT_MS)
+        yield context, own.url, url
 
 
 #: What the player says in Chromium, which unpacks gzip by itself. Of an answer that is cut at once, a browser may lose

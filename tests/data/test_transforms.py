@@ -380,6 +380,7 @@ def test_shelf_hand(shared):
     assert error < 0.6 * mirrored  # the points' colours are found where they project
 
 
+@pytest.mark.slow
 def test_bouncing_balls(shared):
     d = load(shared("bouncing-balls"), downscale=8)
     assert (len(d.train), len(d.test)) == (140, 20) and d.background == (1, 1, 1)

@@ -31,7 +31,7 @@ print(WIDE, hashlib.sha256(values.tobytes() + picture.tobytes()).hexdigest())
 def test_bits_do_not_depend_on_the_width_of_vectors(python):
     """One cache serves both CPUs, as a folder that two machines share does."""
     found = []
-    for features in ({}, {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": "+avx,+avx2,+fma"}) * 2:
+    for features in ({}, {"NUMBA_CPU_NAME": "haswell", "NUMBA_CPU_FEATURES": "+avx,+avx2,+fma"}, {}):
         found.append(python(PICTURE, **features).split())
-    assert [int(width) for width, _ in found] == [WIDE, simd.LANES] * 2
+    assert [int(width) for width, _ in found] == [WIDE, simd.LANES, WIDE]
     assert len({digest for _, digest in found}) == 1

@@ -48,10 +48,10 @@ def kinds(figures):
 def test_a_short_run_finds_nothing():
     names = [name for name in fuzz.DECODERS if name == "refdec" or NODE]
     decoders = fuzz.make_decoders(names)
-    figures = run_inputs(20, range(300), decoders)
+    figures = run_inputs(20, range(150), decoders)
     assert figures.findings == []
-    assert figures.inputs == 300 == figures.outcomes.total() and figures.sealed > 120 and figures.legal > 40
-    assert set(figures.compared) == set(names) and figures.compared["refdec"] > 60
+    assert figures.inputs == 150 == figures.outcomes.total() and figures.sealed > 60 and figures.legal > 20
+    assert set(figures.compared) == set(names) and figures.compared["refdec"] > 30
     assert figures.differences.total() < 20
     assert {
         "decoded",
@@ -68,7 +68,7 @@ def test_no_flipped_bit_of_a_file_decodes():
     data = small_file()
     ends = (0, read_preamble(data).size, *slice_ends(data))
     near = [at for end in ends for at in range(end - 4, end + 20) if 0 <= at < len(data)]
-    for bit in [*(8 * at + rest for at in near for rest in (0, 5)), *range(0, 8 * len(data), 97)]:
+    for bit in [*(8 * at + rest for at in near for rest in (0, 5)), *range(0, 8 * len(data), 397)]:
         with pytest.raises(DecodeError):
             hashes(flipped(data, bit // 8, 1 << bit % 8))
 
@@ -79,8 +79,8 @@ def anchors(mode):
 
 
 def planes(predictor):
-    """3.6 million cells, all of one symbol."""
-    sides = [(4096, 40 - i, 40 - i, 40 - i) for i in range(8)]
+    """1.4 million cells, all of one symbol."""
+    sides = [(4096, 40 - i, 40 - i, 40 - i) for i in range(3)]
     return cases.deformed(*[Grid(1, own, (predictor,) * 6, constant(1), i) for i, own in enumerate(sides)]).data()
 
 
@@ -92,8 +92,8 @@ def exceptions():
 
 
 def predicted_rows():
-    """4 million coefficients of tracks, each predicted by the row before."""
-    rows, widths, heads = 8000, (3, 3, 1, 3, 3), {0: 85, 1: 64, 2: 85, 3: 200, 4: 64}
+    """1.5 million coefficients of tracks, each predicted by the row before."""
+    rows, widths, heads = 3000, (3, 3, 1, 3, 3), {0: 85, 1: 64, 2: 85, 3: 200, 4: 64}
     grids = [Grid(1, (2,), fill=lambda i, s: np.arange(2).reshape(s)), *(
         Grid(m * (3, 4, 3, 1, 3)[h], (2,), fill=constant(1), id=h + 1) for h, m in heads.items())]  # fmt: skip
     layer_rows = {h: np.ones((m, rows), np.int32) for h, m in heads.items()}
@@ -108,7 +108,7 @@ def predicted_rows():
 BIG = {
     "planes by the median": lambda: planes(1),
     "planes by sums": lambda: planes(0),
-    "planes in stages": lambda: cases.deformed(Grid(3, (1000, 1000, 80, 80), fill=constant(1))).data(),
+    "planes in stages": lambda: cases.deformed(Grid(3, (600, 600, 80, 80), fill=constant(1))).data(),
     "exceptions": exceptions,
     "rows": predicted_rows,
     "tables": lambda: cases.entries_at_limit().data(),
@@ -164,9 +164,10 @@ def test_inputs_are_named_by_their_numbers():
 
 def test_random_files_are_legal_and_of_every_sort():
     parts = []
-    for i in range(150):
-        data = legal.numbered(i).data()
-        assert hashes(data) == legal.numbered(i).hashes()
+    for i in range(80):
+        file = legal.numbered(i)
+        data = file.data()
+        assert hashes(data) == file.hashes()
         parts.append(mutate.take_apart(data))
     slices = [chunk for file in parts for chunk in file.chunks if chunk.meta is not None]
     assert {len(file.header[4]) for file in parts} >= {1, 2, 3, 5, 7} and {5 in file.header for file in parts} == {
@@ -259,7 +260,7 @@ def test_a_process_that_ends_or_gets_stuck_while_the_run_goes_on(monkeypatch, tm
     monkeypatch.setattr(fuzz, "check_package", examine)
     monkeypatch.setattr(fuzz, "check_memory", lambda data: 0.0)
     monkeypatch.setattr(fuzz, "seeds", lambda paths: seeds())
-    monkeypatch.setattr(fuzz, "STUCK_SECONDS", 3.0 if kind == "stuck" else 300.0)
+    monkeypatch.setattr(fuzz, "STUCK_SECONDS", 8.0 if kind == "stuck" else 300.0)
     command = ["--inputs", "30", "--seed", "5", "--decoders", "python", "--out", str(tmp_path)]
     assert fuzz.main(command) == 1
     assert (tmp_path / "5-13-crash.pd4").read_bytes() == bad.data

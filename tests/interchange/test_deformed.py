@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from explicit import covariances
 from teachers import Deformable, FourD, Nodes, ball, fit
 from test_splats import make_splats
 from tiny import TINY
 from torch import nn
 
-from pd4dgs_codec.data.view import rotation_matrix
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange import runs
 from pd4dgs_codec.interchange.teacher import load_source, read_model
@@ -20,11 +20,6 @@ from pd4dgs_codec.model.config import PRESETS
 
 DEFORMATION, PLY = "point_cloud/iteration_7/deformation.pth", "point_cloud/iteration_7/point_cloud.ply"
 TIMES = (0.0, 0.37, 1.0)
-
-
-def _covariances(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
-    factor = rotation_matrix(quats) * scales[:, None].astype(np.float64)
-    return factor @ factor.transpose(0, 2, 1)
 
 
 def _same(place: Path, model: FourD | Deformable | Nodes) -> None:
@@ -37,8 +32,8 @@ def _same(place: Path, model: FourD | Deformable | Nodes) -> None:
         found = teacher.splats(t)
         for name in ("means", "opacities", "sh"):
             np.testing.assert_allclose(getattr(found, name), expected[name], atol=1e-4, err_msg=name)
-        theirs = _covariances(expected["quats"], expected["scales"])
-        np.testing.assert_allclose(_covariances(found.quats, found.scales), theirs, atol=1e-4)
+        theirs = covariances(expected["quats"], expected["scales"])
+        np.testing.assert_allclose(covariances(found.quats, found.scales), theirs, atol=1e-4)
         moved.append(found)
     assert max(np.ptp([getattr(splats, name) for splats in moved], axis=0).max() for name in vars(found)) > 0.01
 

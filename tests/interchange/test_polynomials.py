@@ -7,14 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from explicit import covariances
 from test_import import _refused, small_views  # noqa: F401 (a fixture)
 
 from pd4dgs_codec import decode
 from pd4dgs_codec.errors import DamageWarning, DataError
 from pd4dgs_codec.interchange.sampled import sampled
 from pd4dgs_codec.interchange.teacher import Teacher, read_model
-from pd4dgs_codec.kinds.splats import Splats, visible
+from pd4dgs_codec.kinds.splats import unit, visible
 
+pytestmark = pytest.mark.usefixtures("small_views")
 TIMES = (0.0, 0.3, 0.5, 1.0)
 
 
@@ -40,10 +42,6 @@ def splatv(count: int = 60, seed: int = 0, **changed: np.ndarray) -> tuple[bytes
     return head + text + rows.tobytes(), {name: used[name].astype(np.float64) for name in rows.dtype.names or ()}
 
 
-def turned(quats: np.ndarray) -> np.ndarray:
-    return quats / np.linalg.norm(quats, axis=1, keepdims=True)
-
-
 def test_splatv(tmp_path, cli):
     data, rows = splatv()
     path = tmp_path / "a"
@@ -55,7 +53,7 @@ def test_splatv(tmp_path, cli):
         near = factor >= 0.02
         m = rows["motion"]
         means = rows["xyz"] + m[:, :3] * d + m[:, 3:6] * d**2 + m[:, 6:9] * d**3
-        quats = turned(np.concatenate([rows["rot01"], rows["rot23"]], axis=1) + rows["omega"] * d)
+        quats = unit(np.concatenate([rows["rot01"], rows["rot23"]], axis=1) + rows["omega"] * d)
         found = model.splats(t)
         np.testing.assert_allclose(found.means[near], means[near], atol=1e-5)
         np.testing.assert_allclose(np.abs((found.quats * quats).sum(axis=1))[near], 1, atol=1e-5)
@@ -140,13 +138,6 @@ def plain_4d(
     return {name: values.numpy() for name, values in parts.items()}
 
 
-def covariances(splats: Splats) -> np.ndarray:
-    from pd4dgs_codec.data.view import rotation_matrix
-
-    factor = rotation_matrix(splats.quats.astype(np.float64)) * splats.scales[:, None]
-    return np.asarray(factor @ factor.transpose(0, 2, 1))
-
-
 @pytest.mark.parametrize(
     "span, turns, cosines",
     [((0.0, 1.0), True, 2), ((0.0, 10.0), True, 1), ((-0.5, 0.5), True, 0), ((0.0, 50.0), False, 2)],
@@ -163,7 +154,7 @@ def test_4dgs_checkpoints(tmp_path, span, turns, cosines, cli):
         np.testing.assert_allclose(found.opacities, expected["opacities"], atol=1e-5)
         np.testing.assert_allclose(found.means[shown], expected["means"][shown], atol=1e-4)
         np.testing.assert_allclose(found.sh[shown], expected["sh"][shown], atol=1e-4)
-        np.testing.assert_allclose(covariances(found)[shown], expected["space"][shown], atol=1e-5)
+        np.testing.assert_allclose(covariances(found.quats, found.scales)[shown], expected["space"][shown], atol=1e-5)
     if cosines == 0:
         packed(model, path, tmp_path / "a.pd4", cli)
 
@@ -210,7 +201,7 @@ def test_lines_and_windows_of_4dgs_files_are_exact(tmp_path, cli):
     low = np.where(bells, 0, np.where(np.arange(n) % 3 == 0, 0, 0.6))
     part = dict(
         positions=rng.normal(0, 0.5, (n, 3)), scales=np.exp(rng.normal(-2, 0.2, (n, 3))),
-        rotations=turned(rng.normal(size=(n, 4))), colors=rng.uniform(0.3, 1, (n, 4)),
+        rotations=unit(rng.normal(size=(n, 4))), colors=rng.uniform(0.3, 1, (n, 4)),
         motions=rng.normal(0, 0.2, (n, 3)), mu_t=rng.uniform(0, seconds, n), sigma_t=np.where(bells, 0.4, np.inf),
     )  # fmt: skip
     part = {name: values.astype(np.float32) for name, values in part.items()}

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from explicit import covariances
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -24,11 +25,6 @@ def cloud(count, seed=0):
     return Splats(
         *(x.astype(np.float32) for x in (*parts, rng.uniform(0.2, 0.9, count), rng.normal(size=(count, 1, 3))))
     )
-
-
-def covariances(quats, scales):
-    axes = np.stack([rotation_matrix(q) for q in quats.astype(np.float64)]) * scales[:, None]
-    return axes @ axes.transpose(0, 2, 1)
 
 
 # -- still -------------------------------------------------------------------------------------------------------------

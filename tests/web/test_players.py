@@ -1,15 +1,14 @@
 """Packages in the DASH and HLS players that people use: dash.js, Shaka Player and hls.js, in Chromium.
 
-They come with `cd player && npm install --no-package-lock`. PD4DGS_REQUIRE_BROWSER=1: their absence is a failure.
+They come with `cd player && npm install --no-package-lock`.
 """
 
-import os
 import shutil
 from typing import Any
 
 import numpy as np
 import pytest
-from browser import PLAYER, TIMEOUT_MS, launched
+from browser import PLAYER, TIMEOUT_MS
 
 from pd4dgs_codec.errors import DataError, RenderError
 from pd4dgs_codec.quality.frames import check_mp4, write_mp4
@@ -35,18 +34,14 @@ PLAYERS = {
 }
 
 
-def _missing(reason: str) -> Any:
-    (pytest.fail if os.environ.get("PD4DGS_REQUIRE_BROWSER") == "1" else pytest.skip)(reason)
-
-
 @pytest.fixture(scope="module")
-def packaged(scene_bytes, tmp_path_factory) -> Server:
+def packaged(scene_bytes, missing, tmp_path_factory) -> Server:
     """A package with a video, in which the picture gets brighter."""
     folder = tmp_path_factory.mktemp("package")
     try:
         check_mp4()
     except (RenderError, DataError) as error:
-        _missing(str(error))
+        missing(error)
     pictures = (np.full((SIZE, SIZE, 3), 50 + 5 * i, np.uint8) for i in range(30))
     write_mp4(pictures, folder / "video.mp4", FPS, fragment=10)
     video = Video((folder / "video.mp4").read_bytes(), SIZE, SIZE, FPS)
@@ -57,14 +52,10 @@ def packaged(scene_bytes, tmp_path_factory) -> Server:
 
 
 @pytest.fixture(scope="module")
-def context() -> Any:
-    try:
-        with launched() as browser:
-            opened = browser.new_context()
-            opened.set_default_timeout(TIMEOUT_MS)
-            yield opened
-    except DataError as error:
-        _missing(str(error))
+def context(browser: Any) -> Any:
+    opened = browser.new_context()
+    opened.set_default_timeout(TIMEOUT_MS)
+    return opened
 
 
 @pytest.mark.parametrize("name", PLAYERS)

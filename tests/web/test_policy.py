@@ -1,18 +1,13 @@
-"""The pages that the package writes state a policy (CSP), under which they work in Chromium.
+"""The pages that the package writes state a policy (CSP), under which they work in Chromium."""
 
-PD4DGS_REQUIRE_BROWSER=1: its absence is a failure.
-"""
-
-import os
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from browser import ELEMENT, TIMEOUT_MS, launched, until, wait_for_level
+from browser import ELEMENT, TIMEOUT_MS, until, wait_for_level
 
 from pd4dgs_codec import show
-from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.web.package import choice_page, library, package
 from pd4dgs_codec.web.page import Still, page, with_policy
 from pd4dgs_codec.web.server import Server
@@ -43,15 +38,6 @@ def served(scene_bytes, tmp_path_factory) -> Iterator[Server]:
     (root / "held.html").write_text(show(scene_bytes).page)
     with Server(root) as server, server.running():
         yield server
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    try:
-        with launched() as found:
-            yield found
-    except DataError as error:
-        (pytest.fail if os.environ.get("PD4DGS_REQUIRE_BROWSER") == "1" else pytest.skip)(str(error))
 
 
 @pytest.fixture
