@@ -196,7 +196,7 @@ def _in_order(frames: Sequence[Splats]) -> bool:
     """Whether frames of as many rows keep their rows: of most Gaussians, the one in the same row of the next frame is
     among the RANK that most resemble it where its last movement takes it."""
     n, rng = len(frames[0].means), np.random.default_rng(0)
-    for i in evenly(range(len(frames) - 1), TRIPLES):
+    for i in evenly(range(min(1, len(frames) - 2), len(frames) - 1), TRIPLES):  # before the first there is no movement
         before, now, later = frames[max(i - 1, 0)], frames[i], frames[i + 1]
         rows, reach = rng.permutation(n)[:ROWS], _reach(now)
         guesses = (now.means, 2 * now.means - before.means)
