@@ -81,7 +81,7 @@ def import_model(
     fps: frames per second of a folder. seconds: the duration instead. tell: gets lines about what was read. progress:
     (task, number of steps or None) -> a context whose value is called after each step. Raises DataError, EncodeError.
     """
-    model = read_model(place, fps)
+    model = read_model(place, fps, seconds)
     with progress("reading", None if model.times is None else len(model.times)) as step:
         source = sampled(model, place, fps, step)
     instants, count = source.means.shape[:2]
@@ -120,8 +120,8 @@ def _scene_info(
 ) -> tuple[SceneInfo, list[Camera], list[tuple[Camera, float]]]:
     """Returns (info but the voxel size, cameras that decide, cameras and times that measure)."""
     middle = len(source.times) // 2
-    points = [source.means[i][source.opacities[i] >= SOLID] for i in evenly(range(len(source.times)), BOX_INSTANTS)]
-    everywhere = np.concatenate(points)
+    frames = [source.frame(i, bare=False) for i in evenly(range(len(source.times)), BOX_INSTANTS)]
+    everywhere = np.concatenate([frame.means[frame.opacities >= SOLID] for frame in frames])
     if not len(everywhere):
         everywhere = source.means[middle]
     options = Options(views=CAMERAS, size=(SIZE, SIZE))
