@@ -30,7 +30,7 @@ from pd4dgs_codec.interchange.pack import (
 from pd4dgs_codec.interchange.sampled import Sampled
 from pd4dgs_codec.interchange.splats import evenly, picture
 from pd4dgs_codec.interchange.teacher import GOLDEN
-from pd4dgs_codec.interchange.tracks import STRAIGHT, Change, Grouping, layer
+from pd4dgs_codec.interchange.tracks import STRAIGHT, Change, Grouping, Motion, layer
 from pd4dgs_codec.kinds import splats
 from pd4dgs_codec.kinds.splats import YCOCG, product
 from pd4dgs_codec.kinds.tracks import Tracks, place
@@ -165,17 +165,15 @@ class Packer:
         allowed = STRAIGHT * grid.theta * len(self.ordered.rows) * sum(self.ordered.channels.values())
         at = (packed.cells + packed.tensors["offset"].astype(np.float64)) * packed.voxel_size
         grouping = self.grouping and replace(self.grouping, places=place(at, self.info.box))
-        changes, layers = self.changes, {1: first or kept, 2: kept[len(first) :] if first else []}
-        found = dict[int, Tracks]()
+        layers = {1: first or kept, 2: kept[len(first) :] if first else []}
+        found, done = dict[int, Tracks](), dict[str, Motion]()
         for number, own in layers.items():
             if not own:
                 continue
-            chosen = {name: np.array([k for _, other, k in own if other == name]) for name in changes}
+            chosen = {name: np.array([k for _, other, k in own if other == name]) for name in self.changes}
             chosen = {name: ks for name, ks in chosen.items() if len(ks)}
             groups = grouping if number == 1 else None
-            found[number], done = layer(changes, chosen, grid, self.source.times, self.key, allowed, groups)
-            for name, values in done.items():
-                changes = changes | {name: replace(changes[name], values=changes[name].values - values)}
+            found[number], done = layer(self.changes, chosen, grid, self.source.times, self.key, allowed, groups, done)
         return found
 
 

@@ -186,10 +186,10 @@ def _features(splats: Splats, means: np.ndarray, reach: float) -> np.ndarray:
 def _reach(splats: Splats) -> float:
     """Returns the distance of matches: REACH median distances between neighbours."""
     some = np.random.default_rng(0).permutation(len(splats.means))[:ROWS]
-    apart = np.linalg.norm(splats.means[some][:, None] - splats.means[None], axis=2)
-    apart[np.arange(len(some)), some] = np.inf
-    nearest = apart.min(axis=1)
-    return max(REACH * float(np.median(nearest[np.isfinite(nearest)], axis=0)) if len(nearest) > 1 else 1.0, 1e-9)
+    if len(some) < 2:
+        return 1.0
+    _, nearest = _others(splats.means[some], splats.means, some)
+    return max(REACH * float(np.sqrt(np.median(nearest))), 1e-9)
 
 
 def _in_order(frames: Sequence[Splats]) -> bool:
@@ -203,11 +203,31 @@ def _in_order(frames: Sequence[Splats]) -> bool:
         ranks = []
         for guess in guesses:
             here, there = _features(now, guess, reach)[rows], _features(later, later.means, reach)
-            apart = np.square(here[:, None] - there[None]).sum(axis=2)
-            ranks.append((apart < apart[np.arange(len(rows)), rows][:, None]).sum(axis=1))
+            ranks.append(_others(here, there, rows)[0])
         if np.median(np.minimum(*ranks)) > RANK:
             return False
     return True
+
+
+@kernel()
+def _others(here: np.ndarray, there: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns (int64 [m]: how many rows of `there` [n, d] are nearer to each row of `here` [m, d] than there[own],
+    float32 [m]: the least squared distance to a row but that one)."""
+    ranks, nearest = np.zeros(len(here), np.int64), np.full(len(here), np.inf, np.float32)
+    for i in range(len(here)):
+        most = np.float32(0)
+        for k in range(here.shape[1]):
+            most += (here[i, k] - there[own[i], k]) ** 2
+        for j in range(len(there)):
+            apart, limit = np.float32(0), max(most, nearest[i])
+            for k in range(here.shape[1]):
+                apart += (here[i, k] - there[j, k]) ** 2
+                if apart >= limit:
+                    break
+            if j != own[i]:
+                ranks[i] += apart < most
+                nearest[i] = min(nearest[i], apart)
+    return ranks, nearest
 
 
 @kernel()
