@@ -29,7 +29,7 @@ from pd4dgs_codec.interchange.pack import (
     turned,
 )
 from pd4dgs_codec.interchange.sampled import Sampled
-from pd4dgs_codec.interchange.splats import picture
+from pd4dgs_codec.interchange.splats import evenly, picture
 from pd4dgs_codec.interchange.teacher import GOLDEN, Teacher
 from pd4dgs_codec.interchange.tracks import STRAIGHT, Change, Grouping, Motion, layer
 from pd4dgs_codec.kinds import splats
@@ -37,8 +37,9 @@ from pd4dgs_codec.kinds.splats import YCOCG, Splats, product
 from pd4dgs_codec.kinds.tracks import Tracks, place
 from pd4dgs_codec.scene import Camera, SceneInfo
 
-#: One of so many cameras measures the error, and does not decide about steps: those that do look better than others.
-HOLDOUT = 5
+#: One of so many cameras measures the error and does not decide about steps: those that do look better than others. Of
+#: fewer than FEW all decide, and CHECKED of them measure.
+HOLDOUT, FEW, CHECKED = 5, 30, 12
 #: Windows are precise to PRECISE of the width that all but the share SHORT of them have.
 PRECISE, SHORT = 0.1, 0.01
 
@@ -64,13 +65,13 @@ class Packer:
     ):
         self.info, self.key = info, len(source.times) // 2
         self.source = source = _canonical(source, self.key)
-        deciding, others = held_out(cameras, HOLDOUT)
+        deciding, others = held_out(cameras, HOLDOUT if len(cameras) >= FEW else 0)
         last = len(source.times) - 1
         instants = [round(i * GOLDEN % 1.0 * last) for i in range(len(deciding))]
         views = Views(lambda i: source.frame(i, bare=False), deciding, instants)
         weights = sensitivity(Pictures(views, info.background, info.near))
         step()
-        self.cameras = others or deciding
+        self.cameras = others or evenly(deciding, CHECKED)
         self.times = [model.nearest(i * GOLDEN % 1.0) for i in range(len(self.cameras))]  # also between samples
         checked = Views(model.splats, self.cameras, self.times)
         self.images = Pictures(checked, info.background, info.near).images
