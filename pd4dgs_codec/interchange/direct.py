@@ -141,16 +141,19 @@ class Packer:
     def _changes(self) -> dict[str, Change]:
         """Returns the principal components of what changes, by head, without heads in which nothing does."""
         s, rows, key = self.source, self.ordered.rows, self.key
-        made: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-            "position": lambda r: s.means[:, r] - s.means[key, r],
-            "rotation": lambda r: _turns(s.quats[:, r], s.quats[key, r]),
-            "scale": lambda r: _logs(s.scales[:, r]) - _logs(s.scales[key, r])[None],
-            "opacity": lambda r: (logits(s.opacities[:, r]) - logits(s.opacities[key, r]))[..., None],
-            "color": lambda r: (s.colors[:, r] - s.colors[key, r]) @ YCOCG.T,
+        made: dict[str, tuple[np.ndarray, Callable[[np.ndarray, np.ndarray], np.ndarray]]] = {
+            "position": (s.means, lambda x, at: x - at),
+            "rotation": (s.quats, _turns),
+            "scale": (s.scales, lambda x, at: _logs(x) - _logs(at)),
+            "opacity": (s.opacities, lambda x, at: (logits(x) - logits(at))[..., None]),
+            "color": (s.colors, lambda x, at: (x - at) @ YCOCG.T),
         }
         found = {}
-        for name, make in made.items():
-            values = np.ascontiguousarray(make(rows).transpose(1, 2, 0), np.float32)  # [n, c, T]
+        for name, (given, differences) in made.items():
+            if (given == given[key]).all():
+                continue
+            values = differences(given[:, rows], given[key, rows]).transpose(1, 2, 0)  # [n, c, T]
+            values = np.ascontiguousarray(values, np.float32)
             if change := Change.of(values, self.ordered.weights[name]):
                 found[name] = change
         return found
