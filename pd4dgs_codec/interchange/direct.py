@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from pd4dgs_codec.data.view import held_out
 from pd4dgs_codec.draw.player import SplatPlayer
 from pd4dgs_codec.interchange.pack import (
     Grid,
@@ -29,49 +30,51 @@ from pd4dgs_codec.interchange.pack import (
 )
 from pd4dgs_codec.interchange.sampled import Sampled
 from pd4dgs_codec.interchange.splats import evenly, picture
-from pd4dgs_codec.interchange.teacher import GOLDEN
-from pd4dgs_codec.interchange.tracks import STRAIGHT, Change, Grouping, layer
+from pd4dgs_codec.interchange.teacher import GOLDEN, Teacher
+from pd4dgs_codec.interchange.tracks import STRAIGHT, Change, Grouping, Motion, layer
 from pd4dgs_codec.kinds import splats
-from pd4dgs_codec.kinds.splats import YCOCG, product
+from pd4dgs_codec.kinds.splats import YCOCG, Splats, product
 from pd4dgs_codec.kinds.tracks import Tracks, place
 from pd4dgs_codec.scene import Camera, SceneInfo
 
-CHECKED = 12  #: pictures that measure the error
+#: One of so many cameras measures the error and does not decide about steps: those that do look better than others. Of
+#: fewer than FEW all decide, and CHECKED of them measure.
+HOLDOUT, FEW, CHECKED = 5, 30, 12
 #: Windows are precise to PRECISE of the width that all but the share SHORT of them have.
 PRECISE, SHORT = 0.1, 0.01
 
 
 class Views(Sequence[Any]):
-    """Views of samples at cameras, spread over time, whose Gaussians are made when they are asked for."""
+    """Cameras with the Gaussians at times, or instants, that are made when they are asked for."""
 
-    def __init__(self, source: Sampled, cameras: Sequence[Camera], chosen: Sequence[int]):
-        self.source, self.cameras, self.chosen = source, cameras, list(chosen)
-
-    @classmethod
-    def over_time(cls, source: Sampled, cameras: Sequence[Camera]) -> Views:
-        """Spreads the cameras over the instants."""
-        last = len(source.times) - 1
-        return cls(source, cameras, [round(i * GOLDEN % 1.0 * last) for i in range(len(cameras))])
+    def __init__(self, at: Callable[[Any], Splats], cameras: Sequence[Camera], times: Sequence[Any]):
+        self.at, self.cameras, self.times = at, cameras, times
 
     def __len__(self) -> int:
         return len(self.cameras)
 
     def __getitem__(self, i: Any) -> Any:
-        return self.cameras[i], self.source.frame(self.chosen[i], bare=False)
+        return self.cameras[i], self.at(self.times[i])
 
 
 class Packer:
     """Packs samples for any quality; what does not depend on it is computed once."""
 
-    def __init__(self, source: Sampled, cameras: Sequence[Camera], info: SceneInfo, step: Callable[[], None]):
+    def __init__(
+        self, model: Teacher, source: Sampled, cameras: Sequence[Camera], info: SceneInfo, step: Callable[[], None]
+    ):
         self.info, self.key = info, len(source.times) // 2
         self.source = source = _canonical(source, self.key)
-        views = Views.over_time(source, cameras)
-        pictures = Pictures(views, info.background, info.near)
-        weights = sensitivity(pictures)
+        deciding, others = held_out(cameras, HOLDOUT if len(cameras) >= FEW else 0)
+        last = len(source.times) - 1
+        instants = [round(i * GOLDEN % 1.0 * last) for i in range(len(deciding))]
+        views = Views(lambda i: source.frame(i, bare=False), deciding, instants)
+        weights = sensitivity(Pictures(views, info.background, info.near))
         step()
-        some = Views(source, evenly(views.cameras, CHECKED), evenly(views.chosen, CHECKED))
-        self.pictures, self.times = Pictures(some, info.background, info.near), source.times[some.chosen]
+        self.cameras = others or evenly(deciding, CHECKED)
+        self.times = [model.nearest(i * GOLDEN % 1.0) for i in range(len(self.cameras))]  # also between samples
+        checked = Views(model.splats, self.cameras, self.times)
+        self.images = Pictures(checked, info.background, info.near).images
         self.ordered = Ordered.of(source.frame(self.key), weights)
         self.grouping: Grouping | None = None
         self.changes = self._changes() if len(source.times) > 1 else {}
@@ -98,8 +101,8 @@ class Packer:
     def _error(self, scene: splats.SplatScene) -> float:
         """Returns the squared error of the pictures that stands for their mean PSNR."""
         errors, info, player = [], self.info, SplatPlayer(scene)
-        for (camera, _), t, truth in zip(self.pictures.views, self.times, self.pictures.images, strict=True):
-            image = picture(player.splats(float(t))[0], camera, info.background, info.near)
+        for camera, t, truth in zip(self.cameras, self.times, self.images, strict=True):
+            image = picture(player.splats(t)[0], camera, info.background, info.near)
             errors.append(np.square(image - truth, dtype=np.float64).mean())
         return float(np.exp(np.mean(np.log(np.maximum(errors, 1e-12)))))
 
@@ -138,16 +141,19 @@ class Packer:
     def _changes(self) -> dict[str, Change]:
         """Returns the principal components of what changes, by head, without heads in which nothing does."""
         s, rows, key = self.source, self.ordered.rows, self.key
-        made: dict[str, Callable[[np.ndarray], np.ndarray]] = {
-            "position": lambda r: s.means[:, r] - s.means[key, r],
-            "rotation": lambda r: _turns(s.quats[:, r], s.quats[key, r]),
-            "scale": lambda r: _logs(s.scales[:, r]) - _logs(s.scales[key, r])[None],
-            "opacity": lambda r: (logits(s.opacities[:, r]) - logits(s.opacities[key, r]))[..., None],
-            "color": lambda r: (s.colors[:, r] - s.colors[key, r]) @ YCOCG.T,
+        made: dict[str, tuple[np.ndarray, Callable[[np.ndarray, np.ndarray], np.ndarray]]] = {
+            "position": (s.means, lambda x, at: x - at),
+            "rotation": (s.quats, _turns),
+            "scale": (s.scales, lambda x, at: _logs(x) - _logs(at)),
+            "opacity": (s.opacities, lambda x, at: (logits(x) - logits(at))[..., None]),
+            "color": (s.colors, lambda x, at: (x - at) @ YCOCG.T),
         }
         found = {}
-        for name, make in made.items():
-            values = np.ascontiguousarray(make(rows).transpose(1, 2, 0), np.float32)  # [n, c, T]
+        for name, (given, differences) in made.items():
+            if (given == given[key]).all():
+                continue
+            values = differences(given[:, rows], given[key, rows]).transpose(1, 2, 0)  # [n, c, T]
+            values = np.ascontiguousarray(values, np.float32)
             if change := Change.of(values, self.ordered.weights[name]):
                 found[name] = change
         return found
@@ -165,17 +171,15 @@ class Packer:
         allowed = STRAIGHT * grid.theta * len(self.ordered.rows) * sum(self.ordered.channels.values())
         at = (packed.cells + packed.tensors["offset"].astype(np.float64)) * packed.voxel_size
         grouping = self.grouping and replace(self.grouping, places=place(at, self.info.box))
-        changes, layers = self.changes, {1: first or kept, 2: kept[len(first) :] if first else []}
-        found = dict[int, Tracks]()
+        layers = {1: first or kept, 2: kept[len(first) :] if first else []}
+        found, done = dict[int, Tracks](), dict[str, Motion]()
         for number, own in layers.items():
             if not own:
                 continue
-            chosen = {name: np.array([k for _, other, k in own if other == name]) for name in changes}
+            chosen = {name: np.array([k for _, other, k in own if other == name]) for name in self.changes}
             chosen = {name: ks for name, ks in chosen.items() if len(ks)}
             groups = grouping if number == 1 else None
-            found[number], done = layer(changes, chosen, grid, self.source.times, self.key, allowed, groups)
-            for name, values in done.items():
-                changes = changes | {name: replace(changes[name], values=changes[name].values - values)}
+            found[number], done = layer(self.changes, chosen, grid, self.source.times, self.key, allowed, groups, done)
         return found
 
 

@@ -90,7 +90,7 @@ def import_model(
     tell(f"{place}: {_about(source, seconds, static)}")
     info, cameras, judges = _scene_info(place, model, source, seconds, background, up)
     with progress("packing", None) as step:
-        packer = Packer(source, cameras, info, step)
+        packer = Packer(model, source, cameras, info, step)
         write = _writer(packer, slices, step)
         room = most_bytes and most_bytes - METADATA_ROOM - sum(len(str(text)) for text in vars(about).values())
         data, report = write(psnr) if room is None else _of_size(write, psnr, room)

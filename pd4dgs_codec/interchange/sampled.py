@@ -186,28 +186,48 @@ def _features(splats: Splats, means: np.ndarray, reach: float) -> np.ndarray:
 def _reach(splats: Splats) -> float:
     """Returns the distance of matches: REACH median distances between neighbours."""
     some = np.random.default_rng(0).permutation(len(splats.means))[:ROWS]
-    apart = np.linalg.norm(splats.means[some][:, None] - splats.means[None], axis=2)
-    apart[np.arange(len(some)), some] = np.inf
-    nearest = apart.min(axis=1)
-    return max(REACH * float(np.median(nearest[np.isfinite(nearest)], axis=0)) if len(nearest) > 1 else 1.0, 1e-9)
+    if len(some) < 2:
+        return 1.0
+    _, nearest = _others(splats.means[some], splats.means, some)
+    return max(REACH * float(np.sqrt(np.median(nearest))), 1e-9)
 
 
 def _in_order(frames: Sequence[Splats]) -> bool:
     """Whether frames of as many rows keep their rows: of most Gaussians, the one in the same row of the next frame is
     among the RANK that most resemble it where its last movement takes it."""
     n, rng = len(frames[0].means), np.random.default_rng(0)
-    for i in evenly(range(len(frames) - 1), TRIPLES):
+    for i in evenly(range(min(1, len(frames) - 2), len(frames) - 1), TRIPLES):  # before the first there is no movement
         before, now, later = frames[max(i - 1, 0)], frames[i], frames[i + 1]
         rows, reach = rng.permutation(n)[:ROWS], _reach(now)
         guesses = (now.means, 2 * now.means - before.means)
         ranks = []
         for guess in guesses:
             here, there = _features(now, guess, reach)[rows], _features(later, later.means, reach)
-            apart = np.square(here[:, None] - there[None]).sum(axis=2)
-            ranks.append((apart < apart[np.arange(len(rows)), rows][:, None]).sum(axis=1))
+            ranks.append(_others(here, there, rows)[0])
         if np.median(np.minimum(*ranks)) > RANK:
             return False
     return True
+
+
+@kernel()
+def _others(here: np.ndarray, there: np.ndarray, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns (int64 [m]: how many rows of `there` [n, d] are nearer to each row of `here` [m, d] than there[own],
+    float32 [m]: the least squared distance to a row but that one)."""
+    ranks, nearest = np.zeros(len(here), np.int64), np.full(len(here), np.inf, np.float32)
+    for i in range(len(here)):
+        most = np.float32(0)
+        for k in range(here.shape[1]):
+            most += (here[i, k] - there[own[i], k]) ** 2
+        for j in range(len(there)):
+            apart, limit = np.float32(0), max(most, nearest[i])
+            for k in range(here.shape[1]):
+                apart += (here[i, k] - there[j, k]) ** 2
+                if apart >= limit:
+                    break
+            if j != own[i]:
+                ranks[i] += apart < most
+                nearest[i] = min(nearest[i], apart)
+    return ranks, nearest
 
 
 @kernel()

@@ -26,24 +26,30 @@ BIT = 2 * np.log(2)  #: what a bit is worth, in units of the error that a scalar
 MOST_BASES = MAX_CHANNELS // 4  #: of a head: its map has four channels for each, as rotations have
 STRAIGHT = 0.05  #: the share of the allowed error that left-out instants may add
 STATIC = 1e-12  #: the least share of a picture's squared error for which anything changes
-#: Groups at first, Gaussians among which they start, rounds of finding them, and of finding runs of them.
-GROUPS, STARTS, ROUNDS, RUNS = 64, 4096, 10, 2
+#: Groups at first, Gaussians among which they start, rounds of finding them by SAMPLE of the Gaussians, and of finding
+#: runs of all of them; by so many coefficients.
+GROUPS, STARTS, ROUNDS, SAMPLE, RUNS, LEADING = 64, 4096, 10, 16384, 2, 16
 #: Bits of another group than the row before, and of a number of a map. Without groups a row's coefficients are coded as
 #: differences from the row before, which leaves them this share of their bits.
 SWITCH, MAP_BITS, PREDICTED = 7.0, 12.0, 0.75
 FINE = 20.0  #: a map is so many times as precise as coefficients of class 0, since all of its group depend on it
 
 
+#: Coefficients [n, K] of a head, and its trajectories float64 [K, c T] at all instants.
+Motion = tuple[np.ndarray, np.ndarray]
+
+
 @dataclass(frozen=True, eq=False)
 class Change:
     """How a head changes. values: float32 [n, c T], n Gaussians at T instants, c components. weights: float64 [n],
     `pack.sensitivity`. vectors: float64 [c T, K], its principal components, with mean squares over time of 1.
-    energies: float64 [K], squared errors of pictures without each, falling."""
+    coefficients: float32 [n, K] of these. energies: float64 [K], squared errors of pictures without each, falling."""
 
     values: np.ndarray
     weights: np.ndarray
     components: int
     vectors: np.ndarray
+    coefficients: np.ndarray
     energies: np.ndarray
 
     @staticmethod
@@ -56,17 +62,16 @@ class Change:
         order = np.argsort(-energies)[:MOST_BASES]
         order = order[energies[order] > max(STATIC, 1e-7 * energies.max())]
         found = vectors[:, order] * np.sqrt(instants)
-        return Change(values, weights, components, found, energies[order]) if len(order) else None
-
-    @property
-    def instants(self) -> int:
-        return len(self.vectors) // self.components
+        if not len(order):
+            return None
+        coefficients = values @ (found / instants).astype(np.float32)
+        return Change(values, weights, components, found, coefficients, energies[order])
 
     def gains(self, theta: float) -> np.ndarray:
         """Returns by how much each component lowers the error, less what its bits are worth, float64 [K]."""
-        added = self.weights[:, None] * np.square(self.values @ (self.vectors / self.instants))
-        bits = bits_of(added, theta).sum(axis=0) + BITS * len(self.vectors)
-        return np.asarray(np.maximum(added - theta, 0).sum(axis=0) - BIT * theta * bits)
+        added = self.weights[:, None].astype(np.float32) * np.square(self.coefficients)
+        bits = bits_of(added, theta).sum(axis=0, dtype=np.float64) + BITS * len(self.vectors)
+        return np.asarray(np.maximum(added - theta, 0).sum(axis=0, dtype=np.float64) - BIT * theta * bits)
 
 
 def bits_of(added: np.ndarray, theta: float) -> np.ndarray:
@@ -102,11 +107,12 @@ def layer(
     key: int,
     allowed: float,
     grouping: Grouping | None = None,
-) -> tuple[Tracks, dict[str, np.ndarray]]:
-    """Returns (the tracks of a layer, their residuals float32 [n, c T] at all instants by head).
+    below: Mapping[str, Motion] | None = None,
+) -> tuple[Tracks, dict[str, Motion]]:
+    """Returns (the tracks of a layer, the motion that they are, by head).
 
     chosen: components by head. times: float64 [T], normalised; key: the key instant. allowed: the squared error that
-    leaving out instants may add. grouping: None for tracks without groups.
+    leaving out instants may add. grouping: None for tracks without groups. below: the motion of a layer below.
     """
     paths = [changes[name].vectors[:, own] * np.sqrt(changes[name].energies[own]) for name, own in chosen.items()]
     kept = knots(np.concatenate([path.T.reshape(-1, len(times)) for path in paths]), times, key, allowed)
@@ -123,16 +129,19 @@ def layer(
         exact = change.vectors[:, own].T.reshape(len(own), change.components, -1)[:, :, kept]
         bases[name] = (np.rint(exact / fine[name]) * step).astype(np.float32)
         wholes[name] = between(times[kept], bases[name].astype(np.float64), times).reshape(len(own), -1)
-        values[name] = (change.values @ np.linalg.pinv(wholes[name])).astype(np.float64)
+        inverse = np.linalg.pinv(wholes[name])
+        values[name] = (change.values @ inverse.astype(np.float32)).astype(np.float64)
+        if below and name in below:
+            values[name] -= below[name][0] @ (below[name][1] @ inverse)
     groups = grouping.fitted(values, weights, grid.theta, step) if grouping else None
-    heads, residuals = {}, {}
+    heads, motion = {}, {}
     for name, x in values.items():
         shared = groups.added(name, grouping.places) if grouping and groups and name in groups.maps else np.zeros(1)
         own_step = float(np.float32(grid.steps[name] / scales[name]))
         rest = grid.rounded(x - shared, own_step, weights[name])
         heads[name] = Head(bases[name], rest, own_step)
-        residuals[name] = ((rest + shared) @ wholes[name]).astype(np.float32)
-    return Tracks.of(times[kept], step, heads, groups), residuals
+        motion[name] = rest + shared, wholes[name]
+    return Tracks.of(times[kept], step, heads, groups), motion
 
 
 # -- groups ------------------------------------------------------------------------------------------------------------
@@ -151,8 +160,7 @@ class Grouping:
         """Groups the Gaussians by the head whose coefficients take most bits at this theta."""
         most, found = 0.0, np.zeros(len(places), np.int64)
         for change in changes.values():
-            own = change.vectors[:, change.gains(theta) > 0] / change.instants
-            coefficients = (change.values @ own).astype(np.float64)
+            coefficients = change.coefficients[:, change.gains(theta) > 0]
             bits = bits_of(change.weights[:, None] * np.square(coefficients), theta).sum()
             if bits > most:
                 most, found = bits, _labels(coefficients, change.weights, places, theta)
@@ -206,22 +214,27 @@ def _maps(
 def _labels(x: np.ndarray, weights: np.ndarray, places: np.ndarray, theta: float) -> np.ndarray:
     """Finds groups within which coefficients [n, K] are nearly linear in the position, in long runs of rows: int64 [n],
     from 0 without gaps."""
-    n, rng = len(x), np.random.default_rng(0)
+    x = x[:, :LEADING].astype(np.float32)
     motion = x / max(float(np.sqrt(np.average(np.square(x).sum(axis=1), weights=weights))), 1e-30)
-    near = np.concatenate([places / max(float(places.std()), 1e-30), motion], axis=1)
-    some = rng.permutation(n)[:STARTS]
-    starts, far = [near[some[0]]], np.full(len(some), np.inf)
+    near = np.concatenate([places / max(float(places.std()), 1e-30), motion], axis=1).astype(np.float32)
+    rows = np.random.default_rng(0).permutation(len(x))[:SAMPLE]
+    some, starts, far = near[rows[:STARTS]], [near[rows[0]]], np.full(min(STARTS, len(rows)), np.inf)
     for _ in range(min(GROUPS, len(some)) - 1):
-        far = np.minimum(far, np.square(near[some] - starts[-1]).sum(axis=1))
-        starts.append(near[some[far.argmax()]])
-    labels = np.argmin([np.square(near - start).sum(axis=1) for start in starts], axis=0)
+        far = np.minimum(far, np.square(some - starts[-1]).sum(axis=1))
+        starts.append(some[far.argmax()])
+    labels = np.argmin([np.square(near[rows] - start).sum(axis=1) for start in starts], axis=0)
     for turn in range(ROUNDS + RUNS):
         _, labels = np.unique(labels, return_inverse=True)
-        centres = np.stack([places[labels == m].mean(axis=0) for m in range(labels.max() + 1)])
-        maps, costs = _maps(x, weights, places, labels, centres), np.empty((n, len(centres)), np.float32)
-        for m, (own, centre) in enumerate(zip(maps, centres, strict=True)):
-            left = np.square(x - (places - centre) @ own[:3] - own[3])
-            costs[:, m] = left.sum(axis=1) if turn < ROUNDS else bits_of(weights[:, None] * left, theta).sum(axis=1)
+        centres = np.stack([places[rows[labels == m]].mean(axis=0) for m in range(labels.max() + 1)])
+        maps = _maps(x[rows], weights[rows], places[rows], labels, centres).astype(np.float32)
+        if turn == ROUNDS:
+            rows = np.arange(len(x))
+        own, at, costs = x[rows], places[rows], np.empty((len(rows), len(centres)), np.float32)
+        for m, centre in enumerate(centres):
+            left = np.square(own - (at - centre).astype(np.float32) @ maps[m, :3] - maps[m, 3])
+            if turn >= ROUNDS:
+                left = bits_of(left * (weights[rows, None] / theta).astype(np.float32), 1.0)
+            costs[:, m] = left.sum(axis=1)
         labels = costs.argmin(axis=1) if turn < ROUNDS else _runs(costs, np.float32(SWITCH))
     return np.unique(labels, return_inverse=True)[1]
 

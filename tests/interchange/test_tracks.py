@@ -127,7 +127,7 @@ def fitted(grouped):
 @pytest.mark.parametrize("grouped", (False, True))
 def test_tracks_follow_the_bodies(grouped):
     (tracks, done), change, places, times = fitted(grouped)
-    assert np.sqrt(np.mean(np.square(done["position"] - change.values))) < 4e-3
+    assert np.sqrt(np.mean(np.square(np.matmul(*done["position"]) - change.values))) < 4e-3
     whole = tracks.prepared(places.astype(np.float32), BOX)
     for i in (0, 7, 20):
         moved = change.values.reshape(len(places), 3, -1)[:, :, i]
