@@ -90,7 +90,7 @@ def tensors_of(splats: Splats) -> Tensors:
     quats, scales = turned(splats.quats.astype(np.float64), splats.scales, np.array([1.0, 0, 0, 0]))
     return {
         "position": splats.means.astype(np.float64),
-        "color": (splats.sh @ YCOCG.T).reshape(len(scales), -1),
+        "color": (splats.sh @ YCOCG.T).reshape(len(scales), 3 * splats.sh.shape[1]),
         "opacity": logits(splats.opacities)[:, None],
         "scale": log_scales(scales),
         "rotation": quats[:, 1:],
