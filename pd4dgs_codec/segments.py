@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 from bisect import bisect_right
 from collections.abc import Iterable
@@ -153,7 +154,7 @@ def _range(row: dict[str, Any], what: str) -> tuple[float, float]:
 
 def is_folder(path: str | Path) -> bool:
     """Whether a path is a folder of segments, or its index."""
-    return (Path(path) / INDEX).is_file() or Path(path).name == INDEX and Path(path).is_file()
+    return os.path.isfile(os.path.join(path, INDEX)) or os.path.basename(path) == INDEX and os.path.isfile(path)
 
 
 def read_index(path: str | Path) -> tuple[Path, Index]:
@@ -165,3 +166,22 @@ def read_index(path: str | Path) -> tuple[Path, Index]:
     if not index.segments:
         raise DataError(f"{place}: lists no segments, expected one at least")
     return place.parent, index
+
+
+def read_file(folder: Path, file: File) -> bytes:
+    """Reads a file of a folder. Raises DataError if it is missing, or is another one."""
+    from pd4dgs_codec.io import read_source
+
+    data = read_source(folder / file.file)
+    check(file, data, str(folder / file.file))
+    return data
+
+
+def base_beside(path: str | Path) -> bytes | None:
+    """Returns the base of a file, as the index of its folder has it; None without one. Raises DataError."""
+    place = Path(path)
+    if not is_folder(place.parent):
+        return None
+    folder, index = read_index(place.parent)
+    bases = [segment.base for segment in index.segments if segment.file == place.name and segment.base is not None]
+    return read_file(folder, index.bases[bases[0]]) if bases else None
