@@ -235,21 +235,16 @@ def read_header(data):
     reals([header[12]], 1, "the unit", 0)
     if 13 in header:
         read_camera(header[13])
-    some_bytes(header[14], 16, "the digest of the layers")
+    need(type(header[14]) is bytes and len(header[14]) == 16, "the digest of the layers is not 16 bytes")
     if 15 in header:
         read_reference(header[15])
     return header
 
 
-def some_bytes(value, count, what):
-    need(type(value) is bytes and len(value) == count, f"{what} is not {count} bytes")
-
-
 # 5.6 Base: "The key holds the base's scene id (3.3), its digest, the number b of its rows, 0..2^24, and the number P"
 def read_reference(value):
-    scene_id, digest, rows, size = a_list(value, "the base", 4)
-    some_bytes(scene_id, 8, "the base's scene id")
-    some_bytes(digest, 32, "the base's digest")
+    *names, rows, size = a_list(value, "the base", 4)
+    need([type(v) is bytes and len(v) for v in names] == [8, 32], "not a scene id of 8 and a digest of 32 bytes")
     limited(rows, 1 << 24, "the base's rows")
     limited(size, MAX_LENGTH, "the base's bytes", 1)
 
@@ -910,7 +905,7 @@ def dequantise(symbols, step):
     return list(struct.unpack(f"<{len(products)}f", struct.pack(f"<{len(products)}f", *products)))
 
 
-# 11.1 Masks: "its code in the layer before in the file plus its rise, and MUST NOT exceed 255"
+# 11.1 Masks: "its code in the layer before in the file plus its rise, and MUST NOT exceed 255 nor be 1 or 2"
 # 5.6 Base: "1 makes the code 0, which hides the row until a layer above raises it again"
 # 12.1 Order: "each voxel at most once over all slices of all layers so far, and dequantisation"
 def finish_last(layers):
@@ -919,6 +914,7 @@ def finish_last(layers):
         pairs = zip(codes, layer.symbols["rise"][0])
         codes = [code + rise if layer.number else code * (1 - rise) for code, rise in pairs] + layer.symbols["own"][0]
         need(not codes or max(codes) <= 255, "a mask code over 255")
+    need(not {1, 2} & set(codes), "a mask code of 1 or 2")
     need(len({cell for layer in layers for cell in layer.cells}) == len(codes), "a voxel holds more than one anchor")
     layers[-1].dequantise()
 
@@ -929,9 +925,12 @@ def finish_last(layers):
 def read_base(data, header):
     """The layer 0 of the base, as a layer before layer 0."""
     need(data is not None, "the file has a base", "BaseMissing")
-    base, scene_id, at = read_preamble(data)
-    need(15 not in base, "a base that has a base")
-    (layer,) = decode(data, 0)
+    try:
+        base, scene_id, at = read_preamble(data)
+        need(15 not in base, "a base that has a base")
+        (layer,) = decode(data, 0)
+    except Fault as fault:
+        raise Fault("BaseMismatch" if fault.name == "Truncated" else fault.name, fault) from None
     need(not layer.layer_rows[0], "a base with layer rows")
     parts = [base["identity"]]
     for kind, size in base[1]:

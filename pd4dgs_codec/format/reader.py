@@ -64,7 +64,11 @@ def _checked_base(header: Header, given: Source | Base | None) -> Base | None:
     wanted = header.base.scene_id.hex()
     if given is None:
         raise BaseMissing(f"the file adds to layer 0 of scene {wanted}: give this file as its base")
-    base = read_base(given)
+    try:
+        base = read_base(given)
+    except DecodeError as error:  # its place is none in this file, of which no bytes are missing
+        of = BaseMismatch if isinstance(error, Truncated) else type(error)
+        raise of(f"the base: {error}") from None
     found = base.reference
     if (found.scene_id, found.digest) != (header.base.scene_id, header.base.digest):
         same = "another layer 0 of it" if found.scene_id == header.base.scene_id else f"scene {found.scene_id.hex()}"
@@ -134,9 +138,8 @@ class LayerReader:
             raise ValueError(f"max_layer must be 0 or more, found {max_layer}")
         if self.header is None:
             preamble = read_preamble(data)
-            self._scene_id = scene_id_of(preamble.header)
             self._begin(unpack_header(preamble.header))
-            self.offset = preamble.size
+            self.offset, self._scene_id = preamble.size, scene_id_of(preamble.header)
         assert self.header is not None
         chunks = self.header.chunks
         while self._index < len(chunks):

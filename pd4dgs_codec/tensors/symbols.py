@@ -10,7 +10,7 @@ import numpy as np
 
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.morton import MAX_VOXEL, morton_order
-from pd4dgs_codec.scene import Network
+from pd4dgs_codec.scene import MASK_MIN_CODE, Network
 from pd4dgs_codec.tensors.quantise import NO_CLASSES, RowTable, all_finite, dequantise, row_blocks
 from pd4dgs_codec.tensors.tables import Fill, Tables, Tensors
 
@@ -296,13 +296,13 @@ def raised(before: np.ndarray, part: LayerSymbols) -> np.ndarray:
 def check_slice(part: LayerSymbols, before: np.ndarray, voxel_size: float) -> None:
     """Checks a slice against the header and the mask codes before it, uint8 [rows before].
 
-    Raises Malformed if a mask code is above 255 or a dequantised value would not be finite.
+    Raises Malformed if a mask code is above 255 or 1 or 2, or a dequantised value would not be finite.
     """
     where = f"layer {part.layer}"
     if part.rises.size:
-        highest = int(raised(before, part).max())
-        if highest > 255:
-            raise Malformed(f"{where}: mask code {highest}, expected at most 255")
+        codes = raised(before, part)
+        if (odd := codes[(codes > 255) | ((codes > 0) & (codes < MASK_MIN_CODE))]).size:
+            raise Malformed(f"{where}: mask code {int(odd.max())}, expected 0 or {MASK_MIN_CODE}..255")
     stored = [(part.anchor_q, voxel_size), *zip(part.tensors.arrays, part.tensors.tables.steps, strict=True)]
     for table, v in ((part.table, part.rows), (part.layer_table, part.layer_rows)):
         stored += [(own, tensor.step) for tensor, own in table.of_each(v)]
