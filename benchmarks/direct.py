@@ -25,7 +25,7 @@ from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.interchange.export import bake, eyes_of_scene
 from pd4dgs_codec.interchange.splats import evenly, fourdgs_bytes, picture, ply_bytes, read_splats, sphere, spz_bytes
 from pd4dgs_codec.interchange.teacher import Options, Teacher, cameras_of, read_model
-from pd4dgs_codec.kinds.splats import SH_C0, Splats, SplatScene, unit
+from pd4dgs_codec.kinds.splats import SH_C0, Splats, SplatScene, product, unit
 from pd4dgs_codec.quality.image import mpsnr, to_uint8
 from pd4dgs_codec.scene import Scene
 
@@ -72,17 +72,10 @@ def bodies(kind: str, seed: int) -> Callable[[float], Splats]:
             x, y, z = (rotation_matrix(turn) @ ball.T).astype(np.float64)
             y = y + bend * (x**2 - z**2)
             means = np.stack([x, y, z], axis=1) + at + shift
-            rows.append((means, multiplied(turn, quats), scales, opacities * shown, sh))
+            rows.append((means, product(turn, quats), scales, opacities * shown, sh))
         return Splats(*(np.concatenate(part).astype(np.float32) for part in zip(*rows, strict=True)))
 
     return splats
-
-
-def multiplied(turn: np.ndarray, quats: np.ndarray) -> np.ndarray:
-    """The quaternion `turn` [4] times quaternions [n, 4]."""
-    w, v = turn[0], turn[1:]
-    scalar = w * quats[:, :1] - quats[:, 1:] @ v[:, None]
-    return np.concatenate([scalar, w * quats[:, 1:] + quats[:, :1] * v + np.cross(v, quats[:, 1:])], axis=1)
 
 
 Motion = Callable[[float], tuple[np.ndarray, np.ndarray, float, float]]  #: rotation, shift, bend, visibility
@@ -243,8 +236,8 @@ def draw_curve(curves: dict[str, list[tuple[float, float]]], path: Path) -> None
     figure, axes = pyplot.subplots(figsize=(5, 3.2), dpi=110)
     for name, points in curves.items():
         axes.plot([size / 1e3 for size, _ in points], [db for _, db in points], "o-", label=name, markersize=3)
-    axes.set(xscale="log", xlabel="kB", ylabel="dB against the source")
-    axes.grid(alpha=0.3, which="both")
+    axes.set(xlabel="kB", ylabel="dB against the source", xlim=(0, None))
+    axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     figure.tight_layout()
     figure.savefig(path)

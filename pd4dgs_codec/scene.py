@@ -381,6 +381,10 @@ class LayeredScene:
         """Returns the deformations without those of absent layers, as arguments of `dataclasses.replace`."""
         raise NotImplementedError
 
+    def deformation(self, layer: int) -> Any:
+        """Returns what a layer moves the level by, None without any."""
+        raise NotImplementedError
+
     def _evaluated(self, t: float, eye: np.ndarray) -> Gaussians:
         """Returns the visible Gaussians of the highest level, seen from `eye` float32 [3]."""
         raise NotImplementedError
@@ -396,6 +400,11 @@ class LayeredScene:
     def level(self) -> int:
         """The highest level this scene can render."""
         return self.layers[-1]
+
+    @property
+    def still(self) -> bool:
+        """Whether the scene is the same at all times."""
+        return all(self.deformation(layer) is None for layer in self.layers[1:])
 
     @property
     def anchor(self) -> np.ndarray:

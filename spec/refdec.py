@@ -50,9 +50,9 @@ def limited(value, high, what, low=0):
 
 
 # 15 Errors and security: "an integer of whatever size and sign that is not a registered mode, predictor"
-def registered(value, what):
+def registered(value, what, count=2):
     need(type(value) is int, f"{what} is not an integer")
-    need(value in (0, 1), f"{what} is {value}, which is not registered", "UnsupportedFeature")
+    need(0 <= value < count, f"{what} is {value}, which is not registered", "UnsupportedFeature")
     return value
 
 
@@ -274,7 +274,7 @@ def read_rows(value, form):
     for tensor in a_list(value, "the rows", 1, 32):
         last = read_id(a_list(tensor, "a tensor of rows", 4), last)
         channels = limited(tensor[1], 256, "the number of channels", 1)
-        result.append((f"{form}.{last}", channels, a_step(tensor[2]), registered(tensor[3], "a predictor")))
+        result.append((f"{form}.{last}", channels, a_step(tensor[2]), registered(tensor[3], "a predictor", 3)))
     return result, limited(sum(row[1] for row in result), 512, "the number of channels of all rows")
 
 
@@ -491,9 +491,11 @@ class Layer:
 
 
 # 11.2 Rows: "v = s[c] + k·2^c, then s changes" "v MUST lie in −2^23..2^23, else Malformed." "s[j] = v for every j ≥ c"
+# 11.2 Rows: "c counts as 0 in every row"
 def row_values(symbols, classes, centre, predictor):
     last, result = [centre] * 7, []
     for k, c in zip(ranged(symbols, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of a row"), classes):
+        c = 0 if predictor == 2 else c
         result.append(last[c] + (k << c))
         if predictor:
             last[c:] = result[-1:] * (7 - c)

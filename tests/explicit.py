@@ -8,7 +8,7 @@ from strategies import LAYER_SETS, RANGES, info, symbols
 
 from pd4dgs_codec.kinds import splats
 from pd4dgs_codec.kinds.splats import TENSORS, SplatScene
-from pd4dgs_codec.kinds.tracks import HEADS, Head, Tracks
+from pd4dgs_codec.kinds.tracks import HEADS, NONE, Groups, Head, Tracks
 from pd4dgs_codec.scene import MAX_CLASS, Grading, SceneInfo
 from pd4dgs_codec.tensors.quantise import dequantise
 
@@ -28,10 +28,12 @@ def make_splats(
     heads: tuple[str, ...] = tuple(HEADS),
     instants: int = 4,
     bases: int = 2,
+    groups: int = 0,
     extent: int = 8,
 ) -> SplatScene:
     """A scene as the encoder takes it: Gaussians in random order, some inactive, all values multiples of their steps.
-    Layers above 0 have tracks with these heads, without any none."""
+    Layers above 0 have tracks with these heads, without any none, and maps of groups for about half of the heads. Some
+    rows have no group, said in two ways."""
     rng = np.random.default_rng(seed)
     cells = rng.permutation(np.unique(rng.integers(-extent, extent + 1, (count, 3), dtype=np.int32), axis=0))
     n = len(cells)
@@ -56,7 +58,13 @@ def make_splats(
             a[codes[:, index] == 0] = 0
             own = dequantise(symbols(rng, (bases, HEADS[name], instants), kind), 1 / 16)
             moved[name] = Head(own, dequantise(a, 1 / 32), 1 / 32)
-        tracks[layer] = Tracks.of(np.linspace(0, 1, instants) ** 2, 1 / 16, moved)
+        own = None
+        if groups:
+            rows = np.where(codes[:, index : index + 1] > 0, rng.integers(-1, groups + 1, (n, 1)), NONE)
+            places = dequantise(symbols(rng, (groups, 3), kind), 1 / 16)
+            maps = {name: dequantise(symbols(rng, (groups, 4, bases), kind), 1 / 16) for name in heads[::2]}
+            own = Groups(rows.astype(np.float32), places, maps)
+        tracks[layer] = Tracks.of(np.linspace(0, 1, instants) ** 2, 1 / 16, moved, own)
     return SplatScene(
         info=info(rng),
         layers=layers,
@@ -86,6 +94,7 @@ def splat_scenes(draw: st.DrawFn) -> SplatScene:
         heads=tuple(name for name in HEADS if name in heads),
         instants=draw(st.integers(2, 5)),
         bases=draw(st.integers(1, 3)),
+        groups=draw(st.sampled_from((0, 0, 1, 3))),
         extent=draw(st.sampled_from((1, 30, 1 << 19))),
     )
 
@@ -138,3 +147,4 @@ def assert_same_splats(a: SplatScene, b: SplatScene) -> None:
         assert tracks.step == other.step and list(tracks.heads) == list(other.heads)
         np.testing.assert_array_equal(tracks.instants, other.instants)
         np.testing.assert_equal(*({n: vars(head) for n, head in own.heads.items()} for own in (tracks, other)))
+        np.testing.assert_equal(*(own.groups and vars(own.groups) for own in (tracks, other)))

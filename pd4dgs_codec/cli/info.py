@@ -19,10 +19,10 @@ examples:
   pd4dgs-info http://127.0.0.1:8000/scene.pd4"""
 
 #: Shown per layer with -v: quantisation steps; planes as [channels, x, y, z, t], widths of the networks' layers and the
-#: normalised time of a key instant, or the numbers of instants and of bases by head; of an unknown kind the tensors of
-#: `Tables.json`.
-DETAIL_KEYS = ("steps", "planes", "networks", "key_instant", "instants", "heads", "kind", "grid_step", "grids",
-               "chain_step", "chains")  # fmt: skip
+#: normalised time of a key instant, or the numbers of instants, of bases by head and of groups; of an unknown kind the
+#: tensors of `Tables.json`.
+DETAIL_KEYS = ("steps", "planes", "networks", "key_instant", "instants", "heads", "groups", "kind", "grid_step",
+               "grids", "chain_step", "chains")  # fmt: skip
 
 SHOWN = 12  #: segments that are listed
 

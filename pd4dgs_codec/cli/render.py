@@ -56,7 +56,8 @@ def parser() -> options.Parser:
     options.add_reading(p, unset=("holdout",))
     what = "render a single picture at time T, as 0..1 of the file's time range"
     p.add_argument("--time", type=options.share, metavar="T", help=what)
-    what = f"number of evenly spaced frames (default: {FRAMES}); with --data, of evenly spread views (default: all)"
+    what = f"number of evenly spaced frames (default: {FRAMES}, or one image of a scene that stands still); with "
+    what += "--data, of evenly spread views (default: all)"
     p.add_argument("--frames", type=options.positive_int, metavar="N", help=what)
     what = "swing the file's camera by DEG degrees about its look-at point (default: 0)"
     p.add_argument("--orbit", type=options.finite_float, metavar="DEG", help=what)
@@ -90,7 +91,7 @@ def _render(args: argparse.Namespace, console: Console) -> int:
     )
     found = ", ".join(f"{row.level} ({row.anchors} anchors)" for row in levels)
     console.detail(f"{common.shown_name(args.input)}: levels {found}")
-    frames = _frames(args, levels[-1])
+    frames = _frames(args, kind, levels[-1])
     if kind in VIDEOS and len({(frame.camera.width, frame.camera.height) for frame in frames}) > 1:
         raise DataError(f"{args.data}: found views of several sizes, expected one size, or -o such as out/%04d.png")
     milliseconds: list[float] = []
@@ -134,13 +135,15 @@ def _check_usage(args: argparse.Namespace) -> str:
     return kind
 
 
-def _frames(args: argparse.Namespace, level: Level) -> list[Frame]:
+def _frames(args: argparse.Namespace, kind: str, level: Level) -> list[Frame]:
     from pd4dgs_codec.quality.frames import dataset_frames, own_frames
 
     if args.time is not None:
         return [replace(own_frames(level.model.info, 1, downscale=args.downscale)[0], time=args.time)]
     if args.data is None:
-        count = args.frames or (FRAMES if args.duration is None else max(1, round(args.duration * args.fps)))
+        same = level.still and args.orbit is None and kind not in VIDEOS
+        count = 1 if same else FRAMES if args.duration is None else max(1, round(args.duration * args.fps))
+        count = args.frames or count
         if count > MAX_FRAMES:
             raise UsageError(f"found {count:,} frames, expected at most {MAX_FRAMES:,}")
         return own_frames(level.model.info, count, args.orbit or 0.0, args.downscale)

@@ -50,6 +50,7 @@ class Drawer:
     def __init__(self, scene: AnyScene):
         self.info, self.level, self.background = scene.info, scene.level, scene.background()
         self.active = scene.active  #: int64 [n]: the anchors active at this level, ascending
+        self.still = scene.still  #: whether all times look alike
 
     def at(self, t: float) -> tuple[Drawer, float]:
         """Returns (what draws normalised time t, the time in its own range): of a scene in parts, the part."""

@@ -134,6 +134,14 @@ def _check_tracks(given: Tracks, own: str, rows: int) -> None:
         most = min(len(head.coefficients), rows)
         expect_array(f"{own} coefficients of {name}", head.coefficients, np.float32, (most, number))
         expect(is_step(head.step), f"{own} step of {name}: {head.step!r}, expected a positive normal binary32 value")
+    if groups := given.groups:
+        fits = groups.maps.keys() <= given.heads.keys()
+        expect(fits, f"{own}: maps of {list(groups.maps)}, expected some of {list(given.heads)}")
+        expect_array(f"{own} groups", groups.rows, np.float32, (min(len(groups.rows), rows), 1))
+        number = len(groups.centres)
+        expect_array(f"{own} centres", groups.centres, np.float32, (number, 3))
+        for name, maps in groups.maps.items():
+            expect_array(f"{own} maps of {name}", maps, np.float32, (number, 4, len(given.heads[name].bases)))
 
 
 def _check_masks(scene: AnyScene) -> None:

@@ -145,7 +145,8 @@ def to_npz_dict(scene: AnyScene, symbols: bool = False) -> dict[str, np.ndarray]
 
     A scaffold has mlp.NAME.weight.i and .bias.i with NAME opacity, covariance, color, {global,local}.trunk and
     {global,local}.HEAD, and planes.{global,local}.SCALE.PLANE. Splats have tracks.L.instants, tracks.L.bases.HEAD
-    [K c, 1, T] and tracks.L.coefficients.HEAD [n, K].
+    [K c, 1, T] and tracks.L.coefficients.HEAD [n, K], and with groups tracks.L.group [n, 1], tracks.L.centres [3, 1, M]
+    and tracks.L.maps.HEAD [4 K, 1, M].
 
     Step classes add step_class (uint8), and NAME_centre (float32) per attribute, whose values are the centre plus
     multiples of 2^step_class steps.
@@ -171,6 +172,8 @@ def to_npz_dict(scene: AnyScene, symbols: bool = False) -> dict[str, np.ndarray]
         for name, head in tracks[layer].heads.items() if tracks and layer in tracks else ():
             name = f"tracks.{layer}.coefficients.{name}"
             arrays[name], steps[name] = head.coefficients, head.step
+        if tracks and layer in tracks and (groups := tracks[layer].groups):
+            arrays[f"tracks.{layer}.group"], steps[f"tracks.{layer}.group"] = groups.rows, 1.0
     if symbols:
         quantised = {name: quantise(arrays[name], step, name) for name, step in steps.items()}
         classes = NO_CLASSES if scene.grading is None else scene.grading.classes.astype(np.int32)

@@ -22,7 +22,7 @@ from pd4dgs_codec.kinds import AnyScene, hexplane
 from pd4dgs_codec.kinds.splats import SplatScene
 from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import MAX_CLASS, Deformation, S, Scene, SceneInfo
-from pd4dgs_codec.tensors.quantise import NO_CLASSES, ROW_PREDICTORS, Rows, RowTable, expect
+from pd4dgs_codec.tensors.quantise import NO_CLASSES, WHOLE, Rows, RowTable, expect
 from pd4dgs_codec.tensors.symbols import NO_LAYER_ROWS, Growing, LayerSymbols, first_duplicate
 from pd4dgs_codec.tensors.tables import NOTHING, Kind, Tensors
 
@@ -163,7 +163,9 @@ def _predicted(table: RowTable, values: Sequence[np.ndarray], classes: np.ndarra
 
     centres = [None] * len(values) if table.centre is None else [m for _, m in table.of_each(table.centre)]
     chosen = [
-        min((replace(tensor, predictor=p) for p in ROW_PREDICTORS), key=lambda one: bits(one, x, m))  # noqa: B023
+        tensor
+        if tensor.predictor == WHOLE
+        else min((replace(tensor, predictor=p) for p in (0, 1)), key=lambda one: bits(one, x, m))  # noqa: B023
         for tensor, x, m in zip(table.tensors, values, centres, strict=True)
     ]
     return RowTable(tuple(chosen), table.centre)
@@ -211,7 +213,9 @@ def _with_layer_rows(own: LayerSymbols, scene: SplatScene, last: int, options: E
     """Adds the layer rows of the scene's first `last` rows. Raises EncodeError for others that are not 0."""
     given = scene.tracks[own.layer]
     lost = [name for name, head in given.heads.items() if head.coefficients[last:].any()]
-    expect(not lost, f"tracks of layer {own.layer}: {lost} of anchors of a later layer, expected coefficients of 0")
+    if given.groups and given.groups.maps and (given.groups.rows[last:] != kinds.tracks.NONE).any():
+        lost.append("groups")
+    expect(not lost, f"tracks of layer {own.layer}: {lost} of anchors of a later layer, expected 0 or no group")
     earlier = NO_CLASSES if scene.grading is None else scene.grading.classes[: last - len(own.codes)].astype(np.int32)
     own, values = replace(own, earlier=earlier), kinds.tracks.coefficients(given, last)
     table = own.layer_table

@@ -8,14 +8,14 @@ all bases are nearly straight are left out. Layer 2 takes the components that ma
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
+from pd4dgs_codec.draw.player import SplatPlayer
 from pd4dgs_codec.interchange.pack import (
-    YCOCG,
     Grid,
     Ordered,
     Packed,
@@ -28,15 +28,14 @@ from pd4dgs_codec.interchange.pack import (
     turned,
 )
 from pd4dgs_codec.interchange.sampled import Sampled
-from pd4dgs_codec.interchange.splats import picture
-from pd4dgs_codec.interchange.tracks import STRAIGHT, Change, layer
+from pd4dgs_codec.interchange.splats import evenly, picture
+from pd4dgs_codec.interchange.teacher import GOLDEN
+from pd4dgs_codec.interchange.tracks import STRAIGHT, Change, Grouping, layer
 from pd4dgs_codec.kinds import splats
-from pd4dgs_codec.kinds.splats import Splats, product
-from pd4dgs_codec.kinds.tracks import Tracks
+from pd4dgs_codec.kinds.splats import YCOCG, product
+from pd4dgs_codec.kinds.tracks import Tracks, place
 from pd4dgs_codec.scene import Camera, SceneInfo
 
-#: Consecutive views without times are this share of the duration apart, so that few views cover all of it.
-GOLDEN = (5**0.5 - 1) / 2
 CHECKED = 12  #: pictures that measure the error
 #: Windows are precise to PRECISE of the width that all but the share SHORT of them have.
 PRECISE, SHORT = 0.1, 0.01
@@ -58,12 +57,7 @@ class Views(Sequence[Any]):
         return len(self.cameras)
 
     def __getitem__(self, i: Any) -> Any:
-        if isinstance(i, slice):
-            return Views(self.source, self.cameras[i], self.chosen[i])
         return self.cameras[i], self.source.frame(self.chosen[i], bare=False)
-
-    def __iter__(self) -> Iterator[tuple[Camera, Splats]]:
-        return (self[i] for i in range(len(self)))
 
 
 class Packer:
@@ -76,11 +70,10 @@ class Packer:
         pictures = Pictures(views, info.background, info.near)
         weights = sensitivity(pictures)
         step()
-        some = Views(
-            source, *zip(*[(views.cameras[i], views.chosen[i]) for i in _spread(len(views), CHECKED)], strict=True)
-        )
+        some = Views(source, evenly(views.cameras, CHECKED), evenly(views.chosen, CHECKED))
         self.pictures, self.times = Pictures(some, info.background, info.near), source.times[some.chosen]
         self.ordered = Ordered.of(source.frame(self.key), weights)
+        self.grouping: Grouping | None = None
         self.changes = self._changes() if len(source.times) > 1 else {}
         step()
 
@@ -97,18 +90,22 @@ class Packer:
     def scene(self, psnr: float) -> splats.SplatScene:
         """Returns the scene whose pictures have `psnr` dB against those of the source."""
         scalars = self.scalars
+        theta = 10 ** (-psnr / 10) / scalars
+        if self.changes and not self.grouping:  # for all qualities: it takes longer than all else
+            places = place(self.ordered.values["position"], self.info.box)
+            self.grouping = Grouping.of(self.changes, places, theta)
 
         def build(theta: float) -> tuple[splats.SplatScene, float]:
             scene = self._scene(theta, 10 ** (-psnr / 10))
             return scene, self._error(scene)
 
-        return matched(build, psnr, 10 ** (-psnr / 10) / scalars)
+        return matched(build, psnr, theta)
 
     def _error(self, scene: splats.SplatScene) -> float:
         """Returns the squared error of the pictures that stands for their mean PSNR."""
-        errors, info = [], self.info
+        errors, info, player = [], self.info, SplatPlayer(scene)
         for (camera, _), t, truth in zip(self.pictures.views, self.times, self.pictures.images, strict=True):
-            image = picture(scene.splats(float(t))[0], camera, info.background, info.near)
+            image = picture(player.splats(float(t))[0], camera, info.background, info.near)
             errors.append(np.square(image - truth, dtype=np.float64).mean())
         return float(np.exp(np.mean(np.log(np.maximum(errors, 1e-12)))))
 
@@ -119,14 +116,14 @@ class Packer:
         found = splats.scene(
             replace(self.info, voxel_size=packed.voxel_size), packed.cells, tensors, steps,
             classes=packed.classes, centres=centres,
-            tracks=self._tracks(grid, error),
+            tracks=self._tracks(grid, error, packed),
         )  # fmt: skip
         return found
 
     def _tensors(self, packed: Packed) -> tuple[dict[str, np.ndarray], dict[str, float], dict[str, np.ndarray]]:
         """Returns tensors, steps and centres with the windows, exact multiples of the finest step of all classes."""
         tensors, steps, centres = dict(packed.tensors), dict(packed.steps), dict(packed.centres)
-        if "harmonics" not in tensors and tensors["color"].shape[1] > 3:
+        if tensors["color"].shape[1] > 3:
             color, middle = tensors["color"], centres["color"]
             tensors["color"], tensors["harmonics"] = color[:, :3], color[:, 3:]
             centres["color"], centres["harmonics"], steps["harmonics"] = middle[:3], middle[3:], steps["color"]
@@ -165,7 +162,7 @@ class Packer:
                 found[name] = change
         return found
 
-    def _tracks(self, grid: Grid, error: float) -> dict[int, Tracks]:
+    def _tracks(self, grid: Grid, error: float, packed: Packed) -> dict[int, Tracks]:
         """Returns the tracks of layers 1 and 2. error: the mean squared error of pictures that is aimed at."""
         kept = [
             (change.energies[k], name, int(k))
@@ -176,6 +173,8 @@ class Packer:
         rest = np.cumsum([energy for energy, *_ in kept][::-1])[::-1]
         first = [row for row, behind in zip(kept, rest, strict=True) if behind > error]
         allowed = STRAIGHT * grid.theta * self.scalars
+        at = (packed.cells + packed.tensors["offset"].astype(np.float64)) * packed.voxel_size
+        grouping = self.grouping and replace(self.grouping, places=place(at, self.info.box))
         changes, layers = self.changes, {1: first or kept, 2: kept[len(first) :] if first else []}
         found = dict[int, Tracks]()
         for number, own in layers.items():
@@ -183,14 +182,11 @@ class Packer:
                 continue
             chosen = {name: np.array([k for _, other, k in own if other == name]) for name in changes}
             chosen = {name: ks for name, ks in chosen.items() if len(ks)}
-            found[number], done = layer(changes, chosen, grid, self.source.times, self.key, allowed)
+            groups = grouping if number == 1 else None
+            found[number], done = layer(changes, chosen, grid, self.source.times, self.key, allowed, groups)
             for name, values in done.items():
                 changes = changes | {name: replace(changes[name], values=changes[name].values - values)}
         return found
-
-
-def _spread(count: int, most: int) -> list[int]:
-    return sorted({round(x) for x in np.linspace(0, count - 1, min(most, count))})
 
 
 def _logs(scales: np.ndarray) -> np.ndarray:

@@ -12,14 +12,15 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.data.view import depth_range, held_out, points_box, seconds_range
+from pd4dgs_codec.draw.player import SplatPlayer
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import Report, encode_with_report, with_metadata
 from pd4dgs_codec.format.metadata import Metadata
-from pd4dgs_codec.interchange.direct import GOLDEN, Packer
+from pd4dgs_codec.interchange.direct import Packer
 from pd4dgs_codec.interchange.sampled import Sampled, sampled
 from pd4dgs_codec.interchange.splats import evenly, picture
-from pd4dgs_codec.interchange.teacher import SOLID, Options, Teacher, cameras_of, read_model
+from pd4dgs_codec.interchange.teacher import GOLDEN, SOLID, Options, Teacher, cameras_of, read_model
 from pd4dgs_codec.kinds.splats import Splats, SplatScene
 from pd4dgs_codec.quality.image import mpsnr
 from pd4dgs_codec.scene import Camera, SceneInfo
@@ -180,11 +181,12 @@ def _quality(
     model: Teacher, scene: SplatScene, judges: list[tuple[Camera, float]], step: Callable[[], None]
 ) -> dict[int, float]:
     """Returns the mean PSNR in dB of each level against the source's own pictures."""
+    players = {level: SplatPlayer(scene.prefix(level)) for level in scene.layers}
     found: dict[int, list[float]] = {level: [] for level in scene.layers}
     for camera, t in judges:
         truth = picture(model.splats(t), camera, scene.info.background, scene.info.near)
-        for level, row in found.items():
-            image = picture(scene.splats(t, level)[0], camera, scene.background(level), scene.info.near)
-            row.append(min(mpsnr(image, truth), BEST))
+        for level, player in players.items():
+            image = picture(player.splats(t)[0], camera, player.background, scene.info.near)
+            found[level].append(min(mpsnr(image, truth), BEST))
         step()
     return {level: float(np.mean(row)) for level, row in found.items()}

@@ -18,12 +18,10 @@ import numpy as np
 
 from pd4dgs_codec.draw.rasteriser import Geometry, backward, composite, project
 from pd4dgs_codec.interchange.splats import picture, quaternions
-from pd4dgs_codec.kinds.splats import SH_C0, Splats, product
+from pd4dgs_codec.kinds.splats import SH_C0, YCOCG, Splats, product
 from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import MAX_CLASS, Camera
 
-#: Red, green and blue -> Y, Co, Cg.
-YCOCG = np.array([[0.25, 0.5, 0.25], [0.5, 0.0, -0.5], [-0.25, 0.5, -0.25]])
 #: Opacities and scales are bounded before their logits and logarithms: a Gaussian thinner than this share of its length
 #: looks like a sheet.
 LEAST_OPACITY, LEAST_SHARE = 1e-3, np.exp(-6)
@@ -36,7 +34,8 @@ FARTHEST = 2.0**18  #: most voxels between 0 and a position, far within the rang
 KEYS = np.array([1, 1 << 21, 1 << 42])  #: of voxels, which are numbers
 DRAWN = 0.3  #: the most by which a symbol is drawn to 0, in steps
 PROBES = 4  #: random pictures of signs per view
-ROUNDS, CLOSE, SLOPE = 7, 0.15, 3.0  #: of matching a PSNR; how close, dB; and the least slope, dB for a factor of 10
+#: Of matching a PSNR: rounds; how close, dB; the least slope, dB for a factor of 10; the farthest from the first guess.
+ROUNDS, CLOSE, SLOPE, DECADES = 7, 0.15, 3.0, 4.0
 
 T = TypeVar("T")
 Tensors = dict[str, np.ndarray]
@@ -146,8 +145,9 @@ class Pictures:
 
 def matched(build: Callable[[float], tuple[T, float]], psnr: float, theta: float) -> T:
     """Returns what build(theta) makes at the theta where its error, the second result, is nearest to `psnr` dB: by
-    secants of dB over the logarithm of theta, within the bracket that is known."""
-    tried, low, high, place = list[tuple[float, float, T]](), -np.inf, np.inf, float(np.log10(theta))
+    secants of dB over the logarithm of theta, within the bracket that is known and DECADES of `theta`."""
+    tried, place = list[tuple[float, float, T]](), float(np.log10(theta))
+    low, high = place - DECADES, place + DECADES
     for _ in range(ROUNDS):
         made, error = build(10**place)
         excess = -10 * np.log10(max(error, 1e-20)) - psnr

@@ -392,12 +392,6 @@ SPACETIME = b"property float trbf_center"  #: in the header of its PLY files
 BELL_REACH = 2.5
 
 
-def visible(windows: np.ndarray, t: float) -> np.ndarray:
-    """Returns float32 [n]: the factors on opacities at time t of windows [n, 3] (centre, half width, softness)."""
-    outside = np.maximum(np.abs(t - windows[:, 0]) - windows[:, 1], 0)
-    return np.asarray(np.exp(-0.5 * np.square(outside / windows[:, 2])), np.float32)
-
-
 def read_spacetime(path: Path, raw: bytes) -> tuple[Callable[[float], Splats], np.ndarray]:
     """Reads a PLY file of the lite model as (function of time 0..1 -> Gaussians without their bells, bells as windows
     float32 [n, 3]). Raises DataError."""

@@ -15,12 +15,11 @@ import numpy as np
 
 from pd4dgs_codec.draw.simd import kernel
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.interchange.runs import visible
+from pd4dgs_codec.format.registry import MAX_SIDE
 from pd4dgs_codec.interchange.splats import evenly
 from pd4dgs_codec.interchange.teacher import Teacher
-from pd4dgs_codec.kinds.splats import Splats
+from pd4dgs_codec.kinds.splats import Splats, unit, visible
 
-MOST_FRAMES = 4096  #: instants of tracks, a limit of the format
 MOST_NUMBERS = 1 << 29  #: numbers of all samples, which take 2 GiB
 NUMBERS = 14  #: of a Gaussian that may change over time: all but harmonics
 #: Samples of a model that knows all times: at first, and at most.
@@ -88,8 +87,8 @@ def sampled(model: Teacher, where: str, fps: float = 30.0, step: Step = lambda: 
         exact, frames = _by_error(read, where, step)
         same = True
     else:
-        if len(times) > MOST_FRAMES:
-            raise DataError(f"{where}: holds {len(times):,} frames, expected at most {MOST_FRAMES:,}")
+        if len(times) > MAX_SIDE:
+            raise DataError(f"{where}: holds {len(times):,} frames, expected at most {MAX_SIDE:,}")
         exact, frames = np.asarray(times), list[Splats]()
         for t in times:
             frame = read(float(t))
@@ -170,9 +169,7 @@ def _bend(a: Splats, middle: Splats, b: Splats) -> float:
 
 def _halfway(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """Returns the unit quaternions [n, 4] between a and b."""
-    middle = a + b * np.where(np.einsum("nd,nd->n", a, b) < 0, -1, 1)[:, None]
-    halfway: np.ndarray = middle / np.maximum(np.linalg.norm(middle, axis=1, keepdims=True), 1e-12)
-    return halfway
+    return unit(a + b * np.where(np.einsum("nd,nd->n", a, b) < 0, np.float32(-1), np.float32(1))[:, None])
 
 
 # -- frames ------------------------------------------------------------------------------------------------------------

@@ -26,11 +26,11 @@ from pd4dgs_codec.format.encoder import encode_with_report, with_metadata
 from pd4dgs_codec.format.info import info as about
 from pd4dgs_codec.format.metadata import Metadata
 from pd4dgs_codec.format.reader import Base, read_base
+from pd4dgs_codec.format.registry import MAX_SIDE
 from pd4dgs_codec.interchange.direct import CHECKED, Packer, Views, _canonical
 from pd4dgs_codec.interchange.imported import BEST, BOX_INSTANTS, Progress, scene_info
 from pd4dgs_codec.interchange.pack import Grid, Ordered, Pictures, Tensors, cells_of, matched, sensitivity
 from pd4dgs_codec.interchange.sampled import (
-    MOST_FRAMES,
     MOVES,
     Sampled,
     _features,
@@ -348,7 +348,7 @@ def import_segments(
     if len(times) < 2:
         raise DataError(f"{place}: stands still, expected frames for --segments")
     frames, last = Frames(model, times), len(times) - 1
-    count = max(round(total / length), math.ceil(last / (MOST_FRAMES - 1)), 1)
+    count = max(round(total / length), math.ceil(last / (MAX_SIDE - 1)), 1)
     cuts = [round(i * last / count) for i in range(count + 1)]
     if count > last:
         raise DataError(f"{place}: has {last + 1:,} frames in {total:g} s, expected two at least in each segment")

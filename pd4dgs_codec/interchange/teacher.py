@@ -41,7 +41,6 @@ from pd4dgs_codec.interchange.runs import (
     read_deformed,
     read_spacetime,
     run_of,
-    visible,
 )
 from pd4dgs_codec.interchange.splats import (
     EXTRA,
@@ -53,7 +52,7 @@ from pd4dgs_codec.interchange.splats import (
     read_splats,
     sphere,
 )
-from pd4dgs_codec.kinds.splats import SH_C0, Splats
+from pd4dgs_codec.kinds.splats import SH_C0, Splats, visible
 from pd4dgs_codec.quality.frames import shrunk
 from pd4dgs_codec.scene import Camera
 

@@ -1,26 +1,37 @@
-"""Fits the motion of many Gaussians: bases over time, and a coefficient of each Gaussian and basis.
+"""Fits the motion of many Gaussians: bases over time, a coefficient of each Gaussian and basis, and what groups share.
 
 The principal components of what changes, weighted by what pictures depend on, become bases over time. A component stays
-while it lowers the error by more than its bits are worth.
+while it lowers the error by more than its bits are worth. Groups of Gaussians move alike, as a rigid body does: within
+one, coefficients are nearly linear in the position, and what is left costs few bits.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pd4dgs_codec.draw.simd import kernel
+from pd4dgs_codec.format.registry import MAX_CHANNELS
 from pd4dgs_codec.interchange.pack import Grid
-from pd4dgs_codec.kinds.tracks import Head, Tracks
+from pd4dgs_codec.kinds.tracks import Groups, Head, Tracks
+from pd4dgs_codec.morton import morton_order
+from pd4dgs_codec.tensors.quantise import MAX_SYMBOL
 
-BASIS_STEP = 2.0**-10  #: of all grids; bases are scaled to it
+BASIS_STEP = 2.0**-10  #: of grids without maps; bases are scaled to it
 COARSEST = 0.05  #: the largest step of bases, whose mean square over time is 1
 BITS = 6  #: about those of a basis at an instant
 BIT = 2 * np.log(2)  #: what a bit is worth, in units of the error that a scalar may add
-MOST_BASES = 80  #: of a head, components and a limit of the format on channels
+MOST_BASES = MAX_CHANNELS // 4  #: of a head: its map has four channels for each, as rotations have
 STRAIGHT = 0.05  #: the share of the allowed error that left-out instants may add
 STATIC = 1e-12  #: the least share of a picture's squared error for which anything changes
+#: Groups at first, Gaussians among which they start, rounds of finding them, and of finding runs of them.
+GROUPS, STARTS, ROUNDS, RUNS = 64, 4096, 10, 2
+#: Bits of another group than the row before, and of a number of a map. Without groups a row's coefficients are coded as
+#: differences from the row before, which leaves them this share of their bits.
+SWITCH, MAP_BITS, PREDICTED = 7.0, 12.0, 0.75
+FINE = 20.0  #: a map is so many times as precise as coefficients of class 0, since all of its group depend on it
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,24 +101,145 @@ def layer(
     times: np.ndarray,
     key: int,
     allowed: float,
+    grouping: Grouping | None = None,
 ) -> tuple[Tracks, dict[str, np.ndarray]]:
-    """Returns (the tracks of a layer, what they add, float32 [n, c T] at all instants by head).
+    """Returns (the tracks of a layer, their residuals float32 [n, c T] at all instants by head).
 
     chosen: components by head. times: float64 [T], normalised; key: the key instant. allowed: the squared error that
-    leaving out instants may add.
+    leaving out instants may add. grouping: None for tracks without groups.
     """
     paths = [changes[name].vectors[:, own] * np.sqrt(changes[name].energies[own]) for name, own in chosen.items()]
     kept = knots(np.concatenate([path.T.reshape(-1, len(times)) for path in paths]), times, key, allowed)
-    heads, added = {}, {}
+    largest = {name: changes[name].energies[own].max() for name, own in chosen.items()}
+    fine = {name: min(np.sqrt(12 * grid.theta * len(times) / x), COARSEST) for name, x in largest.items()}  # of bases
+    step, bases, wholes, values = BASIS_STEP, {}, {}, {}
+    if grouping:  # centres and maps have no scale of their own
+        main = max(largest, key=lambda name: largest[name])
+        step = float(np.float32(np.sqrt(fine[main] * grid.steps[main] / FINE)))
+    scales = {name: step / x for name, x in fine.items()}
+    weights = {name: changes[name].weights * x**2 for name, x in scales.items()}
     for name, own in chosen.items():
         change = changes[name]
-        fine = min(np.sqrt(12 * grid.theta * len(times) / change.energies[own].max()), COARSEST)  # step of bases
-        scale = BASIS_STEP / fine
         exact = change.vectors[:, own].T.reshape(len(own), change.components, -1)[:, :, kept]
-        bases = (np.rint(exact / fine) * BASIS_STEP).astype(np.float32)
-        whole = between(times[kept], bases.astype(np.float64), times).reshape(len(own), -1)
-        step = float(np.float32(grid.steps[name] / scale))
-        coefficients = grid.rounded(change.values @ np.linalg.pinv(whole), step, change.weights * scale**2)
-        heads[name] = Head(bases, coefficients, step)
-        added[name] = (coefficients @ whole).astype(np.float32)
-    return Tracks.of(times[kept], BASIS_STEP, heads), added
+        bases[name] = (np.rint(exact / fine[name]) * step).astype(np.float32)
+        wholes[name] = between(times[kept], bases[name].astype(np.float64), times).reshape(len(own), -1)
+        values[name] = (change.values @ np.linalg.pinv(wholes[name])).astype(np.float64)
+    groups = grouping.fitted(values, weights, grid.theta, step) if grouping else None
+    heads, residuals = {}, {}
+    for name, x in values.items():
+        shared = groups.added(name, grouping.places) if grouping and groups and name in groups.maps else np.zeros(1)
+        own_step = float(np.float32(grid.steps[name] / scales[name]))
+        rest = grid.rounded(x - shared, own_step, weights[name])
+        heads[name] = Head(bases[name], rest, own_step)
+        residuals[name] = ((rest + shared) @ wholes[name]).astype(np.float32)
+    return Tracks.of(times[kept], step, heads, groups), residuals
+
+
+# -- groups ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class Grouping:
+    """n Gaussians in Morton order that are in groups. places: float64 [n, 3], see `place`. labels: int64 [n], the
+    groups, from 0 without gaps."""
+
+    places: np.ndarray
+    labels: np.ndarray
+
+    @staticmethod
+    def of(changes: Mapping[str, Change], places: np.ndarray, theta: float) -> Grouping:
+        """Groups the Gaussians by the head whose coefficients take most bits at this theta."""
+        most, found = 0.0, np.zeros(len(places), np.int64)
+        for change in changes.values():
+            own = change.vectors[:, change.gains(theta) > 0] / change.instants
+            coefficients = (change.values @ own).astype(np.float64)
+            bits = bits_of(change.weights[:, None] * np.square(coefficients), theta).sum()
+            if bits > most:
+                most, found = bits, _labels(coefficients, change.weights, places, theta)
+        return Grouping(places, found)
+
+    def fitted(
+        self, values: Mapping[str, np.ndarray], weights: Mapping[str, np.ndarray], theta: float, step: float
+    ) -> Groups | None:
+        """Returns the groups with maps for the heads whose bits they save, multiples of `step`; None if they save none.
+
+        values: coefficients float64 [n, K] by head. weights: float64 [n], what a squared error of one adds to that of
+        pictures.
+        """
+        places, labels = self.places, self.labels
+        centres = np.stack([places[labels == m].mean(axis=0) for m in range(labels.max() + 1)])
+        span = max(float(np.ptp(centres)), 1e-9)
+        order = morton_order(np.rint((centres - centres.min(axis=0)) * (255 / span)).astype(np.int64))
+        centres, labels = np.rint(centres[order] / step) * step, np.argsort(order)[labels]
+        found = Groups(labels[:, None].astype(np.float32), centres.astype(np.float32), {})
+        saved = -SWITCH * np.count_nonzero(np.diff(labels))
+        for name, x in values.items():
+            maps = np.rint(_maps(x, weights[name], places, labels, centres) / step)
+            own = replace(found, maps={name: (maps * step).astype(np.float32)})
+            left, cost = (
+                bits_of(weights[name][:, None] * np.square(rest), theta).sum()
+                for rest in (x - own.added(name, places), x)
+            )
+            gain = PREDICTED * cost - left - MAP_BITS * maps.size
+            if gain > 0 and np.abs(maps).max() <= MAX_SYMBOL:
+                found.maps.update(own.maps)
+                saved += gain
+        return found if saved > 0 and np.abs(centres).max() <= MAX_SYMBOL * step else None
+
+
+def _maps(
+    x: np.ndarray, weights: np.ndarray, places: np.ndarray, labels: np.ndarray, centres: np.ndarray
+) -> np.ndarray:
+    """Fits coefficients [n, K] linearly to positions [n, 3] within each of M groups: float64 [M, 4, K]."""
+    maps = np.zeros((len(centres), 4, x.shape[1]))
+    for m, centre in enumerate(centres):
+        rows = np.flatnonzero(labels == m)
+        if len(rows):
+            near = np.concatenate([places[rows] - centre, np.ones((len(rows), 1))], axis=1)
+            weighed = near.T * (weights[rows] + 1e-6 * weights[rows].mean() + 1e-30)
+            normal = weighed @ near
+            normal[range(3), range(3)] += 1e-3 * normal.trace() / 4  # what hardly any Gaussian shows has no slope
+            maps[m] = np.linalg.solve(normal + 1e-12 * normal.trace() * np.eye(4), weighed @ x[rows])
+    return maps
+
+
+def _labels(x: np.ndarray, weights: np.ndarray, places: np.ndarray, theta: float) -> np.ndarray:
+    """Finds groups within which coefficients [n, K] are nearly linear in the position, in long runs of rows: int64 [n],
+    from 0 without gaps."""
+    n, rng = len(x), np.random.default_rng(0)
+    motion = x / max(float(np.sqrt(np.average(np.square(x).sum(axis=1), weights=weights))), 1e-30)
+    near = np.concatenate([places / max(float(places.std()), 1e-30), motion], axis=1)
+    some = rng.permutation(n)[:STARTS]
+    starts, far = [near[some[0]]], np.full(len(some), np.inf)
+    for _ in range(min(GROUPS, len(some)) - 1):
+        far = np.minimum(far, np.square(near[some] - starts[-1]).sum(axis=1))
+        starts.append(near[some[far.argmax()]])
+    labels = np.argmin([np.square(near - start).sum(axis=1) for start in starts], axis=0)
+    for turn in range(ROUNDS + RUNS):
+        _, labels = np.unique(labels, return_inverse=True)
+        centres = np.stack([places[labels == m].mean(axis=0) for m in range(labels.max() + 1)])
+        maps, costs = _maps(x, weights, places, labels, centres), np.empty((n, len(centres)), np.float32)
+        for m, (own, centre) in enumerate(zip(maps, centres, strict=True)):
+            left = np.square(x - (places - centre) @ own[:3] - own[3])
+            costs[:, m] = left.sum(axis=1) if turn < ROUNDS else bits_of(weights[:, None] * left, theta).sum(axis=1)
+        labels = costs.argmin(axis=1) if turn < ROUNDS else _runs(costs, np.float32(SWITCH))
+    return np.unique(labels, return_inverse=True)[1]
+
+
+@kernel()
+def _runs(costs: np.ndarray, switch: np.float32) -> np.ndarray:
+    """Returns the labels int64 [n] of least total cost, costs [n, M] plus `switch` wherever a label differs from the
+    one before: by dynamic programming."""
+    n, groups = costs.shape
+    total, came, best = costs[0].copy(), np.zeros((n, groups), np.bool_), np.zeros(n, np.int64)
+    for i in range(1, n):
+        best[i] = total.argmin()
+        least = total[best[i]]
+        for m in range(groups):
+            came[i, m] = total[m] - least > switch
+            total[m] = min(total[m] - least, switch) + costs[i, m]
+    labels = np.empty(n, np.int64)
+    labels[n - 1] = total.argmin()
+    for i in range(n - 1, 0, -1):
+        labels[i - 1] = best[i] if came[i, labels[i]] else labels[i]
+    return labels

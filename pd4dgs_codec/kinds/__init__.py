@@ -17,7 +17,7 @@ import numpy as np
 from pd4dgs_codec.errors import DecodeError, Malformed, UnsupportedFeature
 from pd4dgs_codec.kinds import hexplane, scaffold, splats, tracks
 from pd4dgs_codec.kinds.splats import SplatScene
-from pd4dgs_codec.scene import ATTRIBUTES, PLANES, SCAFFOLD_NETWORKS, Scene, SceneInfo, Steps
+from pd4dgs_codec.scene import ATTRIBUTES, PLANES, SCAFFOLD_NETWORKS, Grading, Scene, SceneInfo, Steps
 from pd4dgs_codec.tensors.quantise import Rows, RowTable, quantise
 from pd4dgs_codec.tensors.symbols import Growing
 from pd4dgs_codec.tensors.tables import NOTHING, Kind, Tables, Tensors
@@ -56,10 +56,8 @@ def check(kind: Kind, table: RowTable, layers: Mapping[int, Tensors]) -> None:
         if layer == 0:
             SCENES[kind[0]].check(tables, widths)
         elif tables != NOTHING.tables:
-            found, expected = (
-                tables.kind and _known(f"{where}: deformation", tables.kind, DEFORMATIONS),
-                MOVED_BY[kind[0]],
-            )
+            found = tables.kind and _known(f"{where}: deformation", tables.kind, DEFORMATIONS)
+            expected = MOVED_BY[kind[0]]
             if found is not expected:
                 stated = found.NAME if found else "without a kind"
                 raise Malformed(f"{where}: deformation {stated}, expected {expected.NAME}")
@@ -76,13 +74,25 @@ def _known(what: str, kind: Kind, registry: Mapping[int, Any]) -> Any:
 def scene_of(kind: Kind, table: RowTable, info: SceneInfo, grown: Growing, writeable: bool = True) -> AnyScene:
     """Returns the scene of the slices so far, of at least one, which `check` has let pass. Scenes share their arrays:
     write to at most one of them."""
+    (anchor_q, classes, *rows), codes, layer_rows = grown.arrays(writeable)
+    common = {
+        "info": info,
+        "layers": tuple(grown.tensors),
+        "rows": tuple(len(own) for own in codes),
+        "anchor_q": anchor_q,
+        "mask": tuple(codes),
+        "grading": Grading(classes, table.centre_values) if table.graded else None,
+        "fills": tuple(grown.fills.values()),
+    }
     if kind[0] == splats.NUMBER:
-        return splats.scene_of(table, info, grown, writeable)
+        pairs = zip(grown.tensors.items(), layer_rows, strict=True)
+        return splats.scene_of(table, common, rows, {i: tracks.tracks_of(own, x) for (i, own), x in pairs if x})
     steps = {ATTRIBUTES[tensor.id]: tensor.step for tensor in table.tensors}
     for layer, tensors in grown.tensors.items():
         steps |= _steps(layer, tensors.tables)
     moved = {i: hexplane.deformation_of(tensors) for i, tensors in grown.tensors.items() if i and tensors.weights}
-    return scaffold.scene_of(kind, table, info, Steps(**steps), grown, moved, writeable)
+    networks = scaffold.networks_of(grown.tensors[0])
+    return scaffold.scene_of(kind, table, common, rows, Steps(**steps), networks, moved)
 
 
 def _steps(layer: int, tables: Tables) -> dict[str, float]:

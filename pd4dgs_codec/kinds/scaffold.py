@@ -6,8 +6,10 @@ Parameters: [G, V], the slots and the bits of the networks that take the view di
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.scene import (
@@ -16,15 +18,12 @@ from pd4dgs_codec.scene import (
     MAX_SLOTS,
     SCAFFOLD_NETWORKS,
     Deformation,
-    Grading,
     Network,
     Scene,
-    SceneInfo,
     Steps,
     Widths,
 )
 from pd4dgs_codec.tensors.quantise import RowTable
-from pd4dgs_codec.tensors.symbols import Growing
 from pd4dgs_codec.tensors.tables import Chain, Kind, Tables, Tensors
 
 NUMBER, NAME = 0, "scaffold"
@@ -96,27 +95,21 @@ def json_of_layer(tables: Tables) -> dict[str, Any]:
 def scene_of(
     kind: Kind,
     table: RowTable,
-    info: SceneInfo,
+    common: Mapping[str, Any],
+    rows: Sequence[np.ndarray],
     steps: Steps,
-    grown: Growing,
+    networks: dict[str, Network],
     deformations: Mapping[int, Deformation],
-    writeable: bool,
 ) -> Scene:
-    """Returns the scene of the slices so far, of at least one. deformations: by layer."""
-    widths = widths_of(kind, table)
-    (anchor_q, classes, *rows), codes, _ = grown.arrays(writeable)
-    shapes = widths.attributes.items()
+    """Returns a scene. common: arguments of `LayeredScene`. rows: float32 [N, C] of each tensor. deformations: by
+    layer."""
+    shapes = widths_of(kind, table).attributes.items()
+    named: dict[str, Any] = {name: x.reshape(-1, *shape) for (name, shape), x in zip(shapes, rows, strict=True)}
     return Scene(
-        info=info,
+        **common,
+        **named,
         steps=steps,
-        layers=tuple(grown.tensors),
-        rows=tuple(len(own) for own in codes),
-        anchor_q=anchor_q,
-        **{name: x.reshape(-1, *shape) for (name, shape), x in zip(shapes, rows, strict=True)},
-        mask=tuple(codes),
-        networks=networks_of(grown.tensors[0]),
+        networks=networks,
         global_deformation=deformations.get(1),
         local_deformation=deformations.get(2),
-        grading=Grading(classes, table.centre_values) if table.graded else None,
-        fills=tuple(grown.fills.values()),
     )

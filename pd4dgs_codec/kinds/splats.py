@@ -6,17 +6,16 @@ harmonics Y_j with their signs, and max(0, 0.5 + sum c_j Y_j(d)), d the unit vec
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from pd4dgs_codec.errors import Malformed
-from pd4dgs_codec.kinds.tracks import Tracks, total, tracks_of
+from pd4dgs_codec.kinds.tracks import Tracks, total
 from pd4dgs_codec.scene import MASK_STEP, MIN_OPACITY, Gaussians, Grading, LayeredScene, SceneInfo
 from pd4dgs_codec.tensors.quantise import RowTable, dequantise
-from pd4dgs_codec.tensors.symbols import Growing
 from pd4dgs_codec.tensors.tables import Kind, Tables
 
 NUMBER, NAME = 1, "splats"
@@ -119,8 +118,12 @@ def harmonics(directions: np.ndarray, degree: int) -> np.ndarray:
     return np.moveaxis(np.stack(rows).astype(directions.dtype, copy=False), 0, -1)
 
 
+#: Red, green and blue -> Y, Co and Cg.
+YCOCG = np.array([[0.25, 0.5, 0.25], [0.5, 0.0, -0.5], [-0.25, 0.5, -0.25]])
+
+
 def rgb(channels: np.ndarray) -> np.ndarray:
-    """Returns red, green and blue of Y, Co and Cg, both [..., 3, n]."""
+    """The inverse of YCOCG: both [..., 3, n]."""
     y, co, cg = np.moveaxis(channels, -2, 0)
     return np.stack([y - cg + co, y + cg, y - cg - co], axis=-2)
 
@@ -147,6 +150,15 @@ def _rotations(p: np.ndarray) -> np.ndarray:
     found = p / np.where(length > 0, length, 1)[:, None]
     found[length == 0, 0] = 1
     return np.asarray(found)
+
+
+@np.errstate(all="ignore")
+def visible(windows: np.ndarray, t: float) -> np.ndarray:
+    """Returns float32 [n]: the factors on opacities at normalised time t of windows float32 [n, 3], whose columns are
+    centre, half width and softness."""
+    centre, half, softness = windows.T
+    excess = np.maximum(np.abs(np.float32(t) - centre) - half, 0)
+    return np.asarray(np.where(excess > 0, np.exp(-0.5 * np.square(excess / softness)), np.float32(1)))
 
 
 def sigmoid(x: np.ndarray) -> np.ndarray:
@@ -179,6 +191,10 @@ class SplatScene(LayeredScene):
         place = self.anchor_q[rows] + self.tensors["offset"][rows].astype(np.float64)
         place *= np.float32(self.info.voxel_size)
         return place.astype(np.float32)
+
+    @property
+    def still(self) -> bool:
+        return super().still and "window" not in self.tensors
 
     def deformation(self, layer: int) -> Tracks | None:
         """Returns the tracks of a layer, None without any."""
@@ -228,13 +244,14 @@ class Moving:
         self._rows, self._mask, self._fades = rows, mask, "opacity" in heads or "window" in tensors
         self._logits, self._logs, self._window = tensors["opacity"][:, 0], tensors["scale"], None
         if "window" in tensors:
-            centre, half, log = tensors["window"].T
-            self._window = centre.copy(), half.copy(), np.exp(log)
+            self._window = np.array(tensors["window"], order="F")
+            self._window[:, 2] = np.exp(self._window[:, 2])
         if "scale" not in heads:
             self._rest = replace(self._rest, scales=self._rest.scales * mask[:, None])
         columns = {name: np.asfortranarray(getattr(self._rest, name)) for name in ("means", "quats") if heads}
         self._rest = replace(self._rest, **columns)  # in the order in memory of what is added to them
-        self._tracks = {layer: own.of_rows(rows).by_columns() for layer, own in scene.tracks.items()}
+        own = {layer: tracks.of_rows(rows) for layer, tracks in scene.tracks.items()}
+        self._tracks = {i: tracks.prepared(self._rest.means, scene.info.box) for i, tracks in own.items()}
 
     @np.errstate(all="ignore")
     def at(self, t: float) -> tuple[Splats, np.ndarray]:
@@ -242,9 +259,7 @@ class Moving:
         rest, mask, added = self._rest, self._mask, total(self._tracks, t, len(self._rows))
         opacities = rest.opacities if "opacity" not in added else sigmoid(self._logits + added["opacity"][:, 0])
         if self._window is not None:
-            centre, half, softness = self._window
-            excess = np.maximum(np.abs(np.float32(t) - centre) - half, 0)
-            opacities = opacities * np.where(excess > 0, np.exp(-0.5 * np.square(excess / softness)), 1)
+            opacities = opacities * visible(self._window, t)
         changed: dict[str, np.ndarray] = {"opacities": opacities * mask}
         if "position" in added:
             changed["means"] = rest.means + added["position"]
@@ -329,20 +344,14 @@ def json(kind: Kind, table: RowTable) -> dict[str, Any]:
     return {"degree": degree, "windows": "window" in steps, "steps": steps}
 
 
-def scene_of(table: RowTable, info: SceneInfo, grown: Growing, writeable: bool) -> SplatScene:
-    """Returns the scene of the slices so far, of at least one."""
+def scene_of(
+    table: RowTable, common: Mapping[str, Any], rows: Sequence[np.ndarray], tracks: dict[int, Tracks]
+) -> SplatScene:
+    """Returns a scene. common: arguments of `LayeredScene`. rows: float32 [N, C] of each tensor. tracks: by layer."""
     names = list(TENSORS)
-    (anchor_q, classes, *rows), codes, layer_rows = grown.arrays(writeable)
-    pairs = zip(grown.tensors.items(), layer_rows, strict=True)
     return SplatScene(
-        info=info,
-        layers=tuple(grown.tensors),
-        rows=tuple(len(own) for own in codes),
-        anchor_q=anchor_q,
-        mask=tuple(codes),
-        grading=Grading(classes, table.centre_values) if table.graded else None,
-        fills=tuple(grown.fills.values()),
+        **common,
         steps={names[tensor.id]: tensor.step for tensor in table.tensors},
         tensors={names[tensor.id]: x for tensor, x in zip(table.tensors, rows, strict=True)},
-        tracks={layer: tracks_of(tensors, own) for (layer, tensors), own in pairs if own},
+        tracks=tracks,
     )

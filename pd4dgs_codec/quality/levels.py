@@ -43,6 +43,11 @@ class Level:
         """RGB in 0..1 behind every Gaussian."""
         return self.model.background if isinstance(self.model, Drawer) else self.model.shown(self.level).background
 
+    @property
+    def still(self) -> bool:
+        """Whether a decoded level looks alike at all times."""
+        return isinstance(self.model, Drawer) and self.model.still
+
     def picture(self, camera: Camera, time: float) -> np.ndarray:
         """Renders float32 [H, W, 3] in 0..1 at normalised time 0..1."""
         if isinstance(self.model, Drawer):

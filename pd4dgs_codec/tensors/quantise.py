@@ -114,7 +114,8 @@ def row_blocks(n: int) -> Iterator[slice]:
 
 
 #: Predictors of rows by their id in the bitstream.
-ROW_PREDICTORS = {0: "none", 1: "previous row"}
+ROW_PREDICTORS = {0: "none", 1: "previous row", 2: "previous row in whole steps"}
+WHOLE = 2  #: for labels: step classes do not concern it
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,8 @@ class RowTable:
     """The tensors of a row. Their values are v Q with an integer v, int32 [W, n], channel-major (clause 11.2).
 
     Without a predictor v is m + k 2^c, with a symbol k, the centre m of the channel and the step class c of the row.
-    With predictor 1, k 2^c is the difference from the last row before of class c or lower, or from m.
+    With predictor 1, k 2^c is the difference from the last row before of class c or lower, or from m. With predictor
+    WHOLE, k is the difference from the row before, or from m, whatever the classes.
 
     tensors: by ascending id. centre: int32 [W], None if rows have no step classes. Classes: int32 [n], or NO_CLASSES.
     """
@@ -172,19 +174,24 @@ class RowTable:
         parts = zip(self.of_each(a), self.of_each(b), self.of_each(self._centres[:, None]), strict=True)
         yield from ((tensor, own, other, m) for (tensor, own), (_, other), (_, m) in parts)
 
+    def _used(self, tensor: Rows, classes: np.ndarray) -> np.ndarray:
+        """The step classes that concern a tensor, or NO_CLASSES."""
+        return classes if self.graded and tensor.predictor != WHOLE else NO_CLASSES
+
     def quantise(self, given: Sequence[np.ndarray], classes: np.ndarray, names: Sequence[str]) -> np.ndarray:
         """Returns v of float32 [n, any], one array per tensor, the nearest that symbols can give. names: for messages.
         Raises EncodeError for a value without a symbol."""
         v = np.empty((self.channels, len(given[0])), np.int32)
-        spacing = np.int32(1) << classes if self.graded else np.ones(v.shape[1], np.int32)
         for x, name, (tensor, own, _, m) in zip(given, names, self._mapped(v, v), strict=True):
-            if tensor.predictor and self.graded:  # v is whole steps from that of the last row of a lower class
+            used = self._used(tensor, classes)
+            if tensor.predictor and used.size:  # v is whole steps from that of the last row of a lower class
                 flat = x.reshape(-1, tensor.channels).T
-                for c, upto, of_class in _runs(classes, v.shape[1]):
+                for c, upto, of_class in _runs(used, v.shape[1]):
                     last, rows = _last_lower(of_class)[of_class], upto[of_class]
                     base = np.concatenate([own[:, upto], m], axis=1)[:, last]
                     own[:, rows] = base + (quantise(flat[:, rows], tensor.step, name, base, 1 << c) << c)
                 continue
+            spacing = np.int32(1) << used if used.size else np.ones(v.shape[1], np.int32)
             for rows in row_blocks(v.shape[1]):
                 channels = x[rows].reshape(-1, tensor.channels).T
                 own[:, rows] = quantise(channels, tensor.step, name, m, spacing[rows]) * spacing[rows] + m
@@ -205,9 +212,10 @@ class RowTable:
             raise Malformed(f"a symbol of a row over {MAX_SYMBOL} in magnitude")
         if self._plain:
             return symbols
-        v, shifts = np.empty_like(symbols), classes if self.graded else 0
+        v = np.empty_like(symbols)
         for tensor, k, out, m in self._mapped(symbols, v):
-            found = _accumulated(k, m, classes) if tensor.predictor else (k << shifts) + m
+            used = self._used(tensor, classes)
+            found = _accumulated(k, m, used) if tensor.predictor else (k << (used if used.size else 0)) + m
             if magnitude(found) > MAX_SYMBOL:
                 raise Malformed(f"a value of a row more than {MAX_SYMBOL} steps from 0")
             out[:] = found
@@ -217,9 +225,11 @@ class RowTable:
         """The inverse of `values`. Raises EncodeError if no symbols give v."""
         if self._plain:
             return v
-        symbols, shifts = np.empty_like(v), classes if self.graded else 0
+        symbols = np.empty_like(v)
         for tensor, own, out, m in self._mapped(v, symbols):
-            steps = _differences(own, m, classes) if tensor.predictor else own - m
+            used = self._used(tensor, classes)
+            shifts = used if used.size else 0
+            steps = _differences(own, m, used) if tensor.predictor else own - m
             out[:] = steps >> shifts
             expect(np.array_equal(out << shifts, steps), f"rows {tensor.id}: values between the steps of their class")
             expect(magnitude(out) <= MAX_SYMBOL, f"rows {tensor.id}: a symbol over {MAX_SYMBOL} in magnitude")

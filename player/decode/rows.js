@@ -8,7 +8,9 @@ import { MAX_SYMBOL } from "./limits.js";
 /** @import { RowTensor } from "./tensors.js" */
 
 /** How many predictors of rows 11.2 has. */
-export const ROW_PREDICTORS = 2;
+export const ROW_PREDICTORS = 3;
+/** The one that step classes do not concern. */
+const WHOLE = 2;
 export const STEP_CLASSES = 7;
 
 /** Channels of all these tensors. @param {RowTensor[]} tensors */
@@ -45,7 +47,7 @@ function restore(values, classes, centre, predictor) {
   }
   const last = new Int32Array(STEP_CLASSES).fill(centre);
   for (let i = 0; i < values.length; i++) {
-    const c = classes ? classes[i] : 0;
+    const c = classes && predictor < WHOLE ? classes[i] : 0;
     values[i] = checked(last[c] + (values[i] << c));
     for (let j = c; j < STEP_CLASSES; j++) last[j] = values[i];
   }

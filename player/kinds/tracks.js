@@ -1,4 +1,5 @@
 // Deformation kind 1 (clause 13.8), tracks: what is added to Gaussians over time, sums of trajectories that they share.
+// Gaussians that move alike may be in a group, which adds to their coefficients what is linear in their positions.
 
 import { malformed } from "../decode/errors.js";
 import { checkAlike, describedRows, rowsOf } from "./rules.js";
@@ -8,18 +9,25 @@ import { checkAlike, describedRows, rowsOf } from "./rules.js";
 
 /**
  * bases: [K, c, T], trajectories of c components at the instants. coefficients: [rows, K], of all rows up to those of
- * the layer.
+ * the layer. maps: [4, K, M], null if groups add nothing.
  *
- * @typedef {{components: number, bases: Float32Array, coefficients: Float32Array}} Head
+ * @typedef {{components: number, bases: Float32Array, coefficients: Float32Array, maps: Float32Array | null}} Head
+ *
+ * M groups. of: [rows], the group of each; numbers outside 0..M - 1 stand for none. centres: [3, M].
+ *
+ * @typedef {{of: Float32Array, centres: Float32Array}} Groups
  *
  * The tracks of one layer. instants: [T] ascending from 0 to 1, normalised time. heads: by what they add to, position,
  * rotation, scale, opacity, color; null where there is none.
  *
- * @typedef {{instants: Float64Array, heads: (Head | null)[]}} Tracks
+ * @typedef {{instants: Float64Array, heads: (Head | null)[], groups: Groups | null}} Tracks
  */
 
 /** Components of the heads position, rotation (w x y z), scale, opacity and color, by id. */
 export const COMPONENTS = [3, 4, 3, 1, 3];
+
+/** Ids of the layer rows of groups, of the grid of their centres, and of the maps of head 0. */
+const [GROUP, CENTRES, MAPS] = [5, 6, 7];
 
 /** @param {number} id @param {number} channels @param {number[]} sides */
 const gridOf = (id, channels, sides) => `grid ${id} of ${channels} channels on ${sides.join(" x ")}`;
@@ -36,11 +44,21 @@ export const tracks = {
     const parameters = (kind?.length ?? 1) - 1;
     if (parameters) throw malformed(`${where} of ${parameters} parameters, expected none`);
     const heads = rowTensors.filter(({ id }) => id in COMPONENTS);
-    checkAlike(where, rowTensors.map(describedRows), heads.map(({ id, channels }) => rowsOf(id, channels)));
+    const own = heads.map(({ id, channels }) => rowsOf(id, channels));
+    const groups = rowTensors.find(({ id }) => id === GROUP);
+    if (!heads.length) throw malformed(`${where} without heads`);
+    if (groups && groups.step !== 1) throw malformed(`${where}: groups of step ${groups.step}, expected 1`);
+    checkAlike(where, rowTensors.map(describedRows), [...own, ...(groups ? [rowsOf(GROUP, 1)] : [])]);
     const sides = grids[0].sides.slice(0, 1);
     const bases = heads.map(({ id, channels }) => gridOf(1 + id, channels * COMPONENTS[id], sides));
-    const found = grids.map((grid) => gridOf(grid.id, grid.channels, grid.sides));
-    checkAlike(where, found, [gridOf(0, 1, sides), ...bases]);
+    const expected = [gridOf(0, 1, sides), ...bases];
+    if (groups) {
+      const along = grids.find(({ id }) => id === CENTRES)?.sides.slice(0, 1) ?? [];
+      const mapped = heads.filter((head) => grids.some(({ id }) => id === MAPS + head.id));
+      const maps = mapped.map(({ id, channels }) => gridOf(MAPS + id, 4 * channels, along));
+      expected.push(gridOf(CENTRES, 3, along), ...maps);
+    }
+    checkAlike(where, grids.map((grid) => gridOf(grid.id, grid.channels, grid.sides)), expected);
     const [{ data }] = grids[0].planes;
     const ascending = data[0] === 0 && data.every((value, i) => !i || value > data[i - 1]);
     if (data.length < 2 || !ascending) throw malformed(`${where}: instants that do not ascend from 0, or less than two`);
@@ -49,12 +67,18 @@ export const tracks = {
   /** The tracks of all these layers. @param {Header} _header @param {LayerTensors[]} layers @returns {Tracks[]} */
   deformationOf(_header, layers) {
     const tracked = layers.filter(({ kind }) => kind);
-    return tracked.map(({ grids: [{ planes: [{ data }] }, ...bases], rowTensors, rows }) => {
+    return tracked.map(({ grids, rowTensors, rows }) => {
+      /** @param {number} wanted @returns {Float32Array | null} */
+      const plane = (wanted) => grids.find(({ id }) => id === wanted)?.planes[0].data ?? null;
+      /** @param {number} wanted @returns {Float32Array | null} */
+      const rowsOfId = (wanted) => rows[rowTensors.findIndex(({ id }) => id === wanted)] ?? null;
       const heads = COMPONENTS.map((components, head) => {
-        const i = rowTensors.findIndex(({ id }) => id === head);
-        return i < 0 ? null : { components, bases: bases[i].planes[0].data, coefficients: rows[i] };
+        const [bases, coefficients] = [plane(1 + head), rowsOfId(head)];
+        return bases && coefficients && { components, bases, coefficients, maps: plane(MAPS + head) };
       });
-      return { instants: Float64Array.from(data, (value) => value / data[data.length - 1]), heads };
+      const [of, centres, [{ planes: [{ data }] }]] = [rowsOfId(GROUP), plane(CENTRES), grids];
+      const instants = Float64Array.from(data, (value) => value / data[data.length - 1]);
+      return { instants, heads, groups: of && centres && { of, centres } };
     });
   },
 };

@@ -5,9 +5,10 @@
 
 import { COMPONENTS } from "../kinds/tracks.js";
 import { Arena } from "./kernel.js";
-import { MIN_OPACITY, levelOf, texelsFor } from "./level.js";
+import { MIN_OPACITY, deformationUnit, levelOf, texelsFor } from "./level.js";
 /** @import { Network } from "../decode/tensors.js" */
 /** @import { SplatScene, Tracks } from "../kinds/index.js" */
+/** @import { Groups } from "../kinds/tracks.js" */
 /** @import { Packed } from "./kernel.js" */
 /** @import { Texels } from "./level.js" */
 
@@ -170,11 +171,6 @@ export class SplatEvaluator {
       const value = /** @type {Float32Array} */ (window)[3 * rows[Math.floor(k / 3)] + (k % 3)];
       windows[k] = k % 3 === 2 ? 1 / Math.exp(value) : value;
     });
-    const moving = (this._moving = this._movingOf(motion ?? []));
-    this._sums = COMPONENTS.map((_, head) => {
-      if (!moving || !has[head]) return NO_SUMS;
-      return { values: moving.arena.floats, at: moving.out + moving.starts[head], stride: moving.layer.stride };
-    });
     const { data: still } = texelsFor(rows.length, null);
     const block = still.length / 4;
     rows.forEach((row, i) => {
@@ -193,17 +189,22 @@ export class SplatEvaluator {
       putColor(still, shade, Y0 * color[from], Y0 * color[from + 1], Y0 * color[from + 2]);
     });
     this._still = still;
+    const moving = (this._moving = this._movingOf(motion ?? []));
+    this._sums = COMPONENTS.map((_, head) => {
+      if (!moving || !has[head]) return NO_SUMS;
+      return { values: moving.arena.floats, at: moving.out + moving.starts[head], stride: moving.layer.stride };
+    });
   }
 
   /** @param {Tracks[]} tracks @returns {Moving | null} */
   _movingOf(tracks) {
     const { _rows: rows, _has: has } = this;
     let inputs = 0;
-    const heads = tracks.flatMap(({ instants, heads }) => heads.flatMap((found, head) => {
+    const heads = tracks.flatMap(({ instants, heads, groups }) => heads.flatMap((found, head) => {
       if (!found) return [];
       const [first, width] = [inputs, found.bases.length / COMPONENTS[head] / instants.length];
       inputs += width;
-      return { head, first, width, instants, ...found };
+      return { head, first, width, instants, groups, ...found };
     }));
     if (!inputs) return null;
     let outputs = 0;
@@ -213,13 +214,32 @@ export class SplatEvaluator {
     const arena = new Arena(this._wasm, Math.ceil(outputs / 4));
     const layer = arena.pack(network, false);
     const [out, x] = [arena.take(BATCH * layer.stride), arena.take(rows.length * inputs)];
-    for (const { first, width, coefficients } of heads) {
+    for (const { first, width, coefficients, groups, maps } of heads) {
       for (let i = 0, to = x + first; i < rows.length; i++, to += inputs) {
         // layers have nothing for the rows of later ones
         for (let k = 0; k < width; k++) arena.floats[to + k] = coefficients[width * rows[i] + k] ?? 0;
       }
+      if (groups && maps) this._addGroups(groups, maps, arena.floats.subarray(x + first), inputs);
     }
     return { arena, layer, x, out, network, starts, heads };
+  }
+
+  /** Adds to coefficients what groups have for them. @param {Groups} groups @param {Float32Array} maps of a head
+   * @param {Float32Array} coefficients of the rows that may be seen @param {number} stride from one row's to the next */
+  _addGroups({ of, centres }, maps, coefficients, stride) {
+    const { _rows: rows, _still: still } = this;
+    const count = centres.length / 3;
+    const width = maps.length / count / 4;
+    const scale = 1 / (deformationUnit(this.scene) || Infinity);
+    for (let i = 0, to = 0; i < rows.length; i++, to += stride) {
+      const group = of[rows[i]];
+      if (!(group >= 0 && group < count)) continue;
+      const [x, y, z] = [0, 1, 2].map((axis) => still[4 * i + axis] * scale - centres[axis * count + group]);
+      for (let k = 0, from = group, step = width * count; k < width; k++, from += count) {
+        const turned = x * maps[from] + y * maps[from + step] + z * maps[from + 2 * step];
+        coefficients[to + k] += turned + maps[from + 3 * step];
+      }
+    }
   }
 
   /** Makes the bases at a time the weights. @param {Moving} moving @param {number} t 0..1 */

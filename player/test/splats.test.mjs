@@ -13,14 +13,18 @@ let state = 1;
 const numbers = (count, size = 1) =>
   Float32Array.from({ length: count }, () => size * ((state = (state * 48271) % 2147483647) / 1073741824 - 1));
 
-/** @param {number} rows @param {number[]} instants @param {number[]} heads @returns {Tracks} */
-function tracksOf(rows, instants, heads) {
+/** With groups, every second head has maps, and some rows have no group, said in two ways. @param {number} rows
+ * @param {number[]} instants @param {number[]} heads @param {number} groups @returns {Tracks} */
+function tracksOf(rows, instants, heads, groups) {
   const made = COMPONENTS.map((components, head) => {
     const K = 1 + head;
     const bases = numbers(K * components * instants.length);
-    return heads.includes(head) ? { components, bases, coefficients: numbers(rows * K, 0.5) } : null;
+    const maps = groups && !(head % 2) ? numbers(4 * K * groups, 0.3) : null;
+    return heads.includes(head) ? { components, bases, coefficients: numbers(rows * K, 0.5), maps } : null;
   });
-  return { instants: Float64Array.from(instants), heads: made };
+  const of = Float32Array.from({ length: rows }, (_, i) => (i % (groups + 2)) - 1);
+  const own = groups ? { of, centres: numbers(3 * groups) } : null;
+  return { instants: Float64Array.from(instants), heads: made, groups: own };
 }
 
 /** Rows with each layer; more than a batch. */
@@ -30,20 +34,22 @@ const ALL_HEADS = [0, 1, 2, 3, 4];
 /**
  * A scene of three layers. Layer 1 has tracks at instants that are not even, layer 2 others.
  *
- * @param {{degree?: number, window?: boolean, heads?: number[][]}} [options] heads: of layers 1 and 2
+ * @param {{degree?: number, window?: boolean, heads?: number[][], groups?: number, flat?: boolean}} [options] heads: of
+ * layers 1 and 2. flat: the box has no extent
  * @returns {SplatScene}
  */
-function sceneOf({ degree = 0, window = false, heads: [first, second] = [ALL_HEADS, [0, 1]] } = {}) {
+function sceneOf({ degree = 0, window = false, heads = [ALL_HEADS, [0, 1]], groups = 0, flat = false } = {}) {
+  const [first, second] = heads;
   const N = ROWS[2];
-  const one = first.length ? [tracksOf(ROWS[1], [0, 0.125, 0.5, 0.75, 1], first)] : [];
-  const two = second.length ? [tracksOf(N, [0, 1], second)] : [];
+  const one = first.length ? [tracksOf(ROWS[1], [0, 0.125, 0.5, 0.75, 1], first, groups)] : [];
+  const two = second.length ? [tracksOf(N, [0, 1], second, groups)] : [];
   const windows = numbers(3 * N, 0.5).map((v, k) => [v + 0.5, (v + 0.5) / 4, 4 * v - 2][k % 3]);
   const motion = [[], one, [...one, ...two]].map((tracks) => (tracks.length || window ? tracks : null));
   const mask = ROWS.map((rows) => numbers(rows).map((v) => (v < -0.8 ? 0 : 255 * Math.min(1, 1 + v))));
   return {
     kind: "splats",
     info: {
-      voxelSize: 1 / 16, box: [[-1, -1, -1], [1, 1, 1]], timeRange: [1, 3], background: [0, 0, 0], near: 0.1, far: 9,
+      voxelSize: 1 / 16, box: flat ? [[2, 2, 2], [2, 2, 2]] : [[-1, -2, 3], [1, 1, 4]], timeRange: [1, 3], background: [0, 0, 0], near: 0.1, far: 9,
       up: [0, 1, 0], unit: 0, camera: null,
     },
     layers: [0, 1, 2],
@@ -82,20 +88,30 @@ function harmonicsAt([x, y, z]) {
 }
 
 /** D of a head. @param {SplatScene} scene @param {number} level @param {number} head @param {number} i @param {number} t */
-function residual({ layers, motion }, level, head, i, t) {
+function residual({ layers, motion, info, anchorQ, offset }, level, head, i, t) {
+  const { voxelSize, box: [low, high] } = info;
+  const unit = max(...high.map((v, k) => v - low[k])) / 4;
+  const place = [0, 1, 2].map((k) => unit && ((anchorQ[3 * i + k] + offset[3 * i + k]) * voxelSize) / unit);
   const sum = new Array(COMPONENTS[head]).fill(0);
-  for (const { instants, heads } of motion[layers.indexOf(level)] ?? []) {
+  for (const { instants, heads, groups } of motion[layers.indexOf(level)] ?? []) {
     const found = heads[head];
     if (!found) continue;
-    const { bases, coefficients } = found;
+    const { bases, coefficients, maps } = found;
     const [T, c] = [instants.length, COMPONENTS[head]];
     const M = bases.length / T / c;
     const j = Math.min(instants.filter((instant) => instant <= t).length - 1, T - 2);
     const f = (t - instants[j]) / (instants[j + 1] - instants[j]);
     for (let m = 0; m < M && M * i < coefficients.length; m++) {
+      let a = coefficients[M * i + m];
+      if (groups && maps) {
+        const { centres, of: { [i]: g } } = groups;
+        const P = centres.length / 3;
+        const d = [...place.map((p, k) => p - centres[k * P + g]), 1];
+        if (g >= 0 && g < P) d.forEach((v, k) => (a += v * maps[(k * M + m) * P + g]));
+      }
       for (let k = 0; k < c; k++) {
         const at = (m * c + k) * T + j;
-        sum[k] += coefficients[M * i + m] * ((1 - f) * bases[at] + f * bases[at + 1]);
+        sum[k] += a * ((1 - f) * bases[at] + f * bases[at + 1]);
       }
     }
   }
@@ -149,6 +165,8 @@ const CASES = {
   "harmonics of degree 1": { degree: 1, heads: [[], []] },
   "harmonics of degree 2 and windows": { degree: 2, window: true, heads: [[], []] },
   "harmonics of degree 3 and tracks": { degree: 3 },
+  "tracks in groups": { groups: 5 },
+  "tracks in one group, in a box without extent": { groups: 1, flat: true },
   "tracks and windows": { window: true },
   "positions move, in layer 2 alone": { degree: 1, heads: [[], [0]] },
   "opacities and colours change": { heads: [[3], [4]] },

@@ -67,6 +67,9 @@ def test_pictures_scores_and_packages(cli, splats_pd4, tmp_path):
     still = tmp_path / "s.png"
     assert cli("render", splats_pd4, "-o", still, "--time", 0.5, "--level", 1).code == 0
     assert np.asarray(Image.open(still)).min() < 100
+    assert cli("render", splats_pd4, "-o", tmp_path / "0.png", "--level", 0).code == 0  # nothing moves: one image
+    moving = cli("render", splats_pd4, "-o", tmp_path / "1.png", "--level", 1)
+    assert moving.code == 2 and "for 60 images" in moving.err
     levels = cli("eval", splats_pd4, "synthetic:local?size=24x16&frames=4", "--json").json["levels"]
     assert [row["level"] for row in levels] == [0, 1, 2] and all(row["mpsnr"] > 0 for row in levels)
     made = cli("package", splats_pd4, "-o", tmp_path / "out", "--no-video", "--json")

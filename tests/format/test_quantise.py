@@ -7,7 +7,16 @@ from hypothesis import strategies as st
 
 from pd4dgs_codec.errors import EncodeError, Malformed
 from pd4dgs_codec.scene import MAX_CLASS
-from pd4dgs_codec.tensors.quantise import MAX_SYMBOL, NO_CLASSES, Rows, RowTable, dequantise, mask_codes, quantise
+from pd4dgs_codec.tensors.quantise import (
+    MAX_SYMBOL,
+    NO_CLASSES,
+    WHOLE,
+    Rows,
+    RowTable,
+    dequantise,
+    mask_codes,
+    quantise,
+)
 
 steps = st.floats(2.0**-100, 2.0**90, width=32)
 
@@ -111,3 +120,12 @@ def test_values_between_the_steps_of_their_class_have_no_symbols():
         rows = RowTable((Rows(4, 1, 1.0, predictor),), np.zeros(1, np.int32))
         with pytest.raises(EncodeError, match="rows 4: values between the steps"):
             rows.symbols(np.array([[1, 2]], np.int32), np.array([0, 2], np.int32))
+
+
+@given(st.lists(st.tuples(st.integers(-9, 9), st.integers(0, 6)), max_size=20))
+def test_classes_do_not_concern_labels(pairs):
+    k, classes = np.array(pairs, np.int32).reshape(-1, 2).T
+    table = RowTable((Rows(5, 1, 1.0, WHOLE),), np.zeros(1, np.int32))
+    v = table.values(k[None], classes)
+    np.testing.assert_array_equal(v[0], np.cumsum(k))
+    np.testing.assert_array_equal(table.symbols(v, classes), k[None])

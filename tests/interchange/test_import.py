@@ -117,6 +117,28 @@ def test_a_function_is_sampled_where_it_bends(tmp_path, monkeypatch, cli):
     assert 0.85 * 4000 < Path("late.pd4").stat().st_size <= 4000 and max(result.json["psnr"].values()) > 30
 
 
+SPINS = """
+import numpy as np
+from test_import import body
+rng = np.random.default_rng(1)
+axes, speeds, phases = (rng.normal(size=(200, k)) for k in (3, 1, 1))
+axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+def model(t):
+    half = np.sin(120 * speeds * t + phases)
+    return vars(body(200)) | {"quats": np.concatenate([np.cos(half), axes * np.sin(half)], axis=1)}
+"""
+
+
+def test_no_head_has_more_bases_than_a_file_can_hold(tmp_path, monkeypatch, cli):
+    """Each Gaussian turns in its own way: no few bases do."""
+    (tmp_path / "spins.py").write_text(SPINS)
+    monkeypatch.chdir(tmp_path)
+    result = cli("import_model", "spins:model", "-o", "spins.pd4", "--psnr", 50, "--json")
+    assert result.code == 0, result.err
+    heads = [tracks.heads for tracks in decode(Path("spins.pd4").read_bytes()).tracks.values()]
+    assert sum(len(own["rotation"].bases) for own in heads if "rotation" in own) == 64
+
+
 def test_spacetime_gaussians(tmp_path, cli):
     """Against their formulas, written out here."""
     rng, n = np.random.default_rng(0), 50

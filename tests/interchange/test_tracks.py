@@ -1,17 +1,21 @@
-"""Packing without training: ellipsoids stay, voxels are distinct, errors are as predicted, bodies move."""
+"""Packing without training: ellipsoids stay, voxels are distinct, errors are as predicted, bodies move in groups."""
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from pd4dgs_codec.data.view import rotation_matrix
 from pd4dgs_codec.interchange.pack import Grid, Pictures, sensitivity, tensors_of, turned, voxels
 from pd4dgs_codec.interchange.splats import picture
-from pd4dgs_codec.interchange.tracks import Change, between, knots, layer
+from pd4dgs_codec.interchange.tracks import Change, Grouping, _runs, between, knots, layer
 from pd4dgs_codec.kinds.splats import Splats, splats_of, unit
+from pd4dgs_codec.kinds.tracks import place
 from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import Camera
 
 UPRIGHT = np.array([1.0, 0, 0, 0])
+BOX = np.array([[-1.0, -2, 0], [3, 1, 2]], np.float32)
 
 
 def cloud(count, seed=0):
@@ -109,27 +113,38 @@ def bodies(per_body=600, instants=21):
     return (values - values[:, :, key : key + 1]).astype(np.float32), np.concatenate(parts)[order], times
 
 
-def fitted():
+def fitted(grouped):
     values, places, times = bodies()
     n = len(values)
     change = Change.of(values, np.ones(n))
     grid = Grid(1e-6, {"position": np.ones(n)}, {"position": 2e-3}, np.zeros(n, np.uint8))
     chosen = {"position": np.flatnonzero(change.gains(grid.theta) > 0)}
+    grouping = Grouping.of({"position": change}, place(places, BOX), grid.theta)
     return (
-        layer({"position": change}, chosen, grid, times, 10, 1e-9),
+        layer({"position": change}, chosen, grid, times, 10, 1e-9, grouping if grouped else None),
         change,
         places,
         times,
     )
 
 
-def test_tracks_follow_the_bodies():
-    (whole, done), change, places, times = fitted()
+@pytest.mark.parametrize("grouped", (False, True))
+def test_tracks_follow_the_bodies(grouped):
+    (tracks, done), change, places, times = fitted(grouped)
     assert np.sqrt(np.mean(np.square(done["position"] - change.values))) < 4e-3
+    whole = tracks.prepared(places.astype(np.float32), BOX)
     for i in (0, 7, 20):
         moved = change.values.reshape(len(places), 3, -1)[:, :, i]
         np.testing.assert_allclose(whole.residuals(times[i])["position"], moved, atol=0.03)
     assert np.abs(whole.residuals(times[10])["position"]).max() < 0.01  # the key instant stays
+
+
+def test_groups_leave_little_to_code():
+    (plain, _), *_ = fitted(False)
+    (shared, _), *_ = fitted(True)
+    assert shared.groups is not None and plain.groups is None
+    counts = [np.count_nonzero(tracks.heads["position"].coefficients) for tracks in (plain, shared)]
+    assert counts[1] < 0.1 * counts[0]
 
 
 def test_knots_are_where_paths_bend():
@@ -138,3 +153,22 @@ def test_knots_are_where_paths_bend():
     found = knots(paths, times, 5, 1e-12)
     assert found.tolist() == [0, 5, 12, 20, 30]
     np.testing.assert_allclose(between(times[found], paths[:, found], times), paths, atol=1e-12)
+
+
+@given(st.integers(1, 6), st.integers(1, 3), st.integers(0, 10**6))
+def test_runs_have_the_least_cost(n, groups, seed):
+    costs = np.random.default_rng(seed).uniform(0, 3, (n, groups)).astype(np.float32)
+
+    def cost(labels):
+        return costs[np.arange(n), labels].sum() + 1.5 * np.count_nonzero(np.diff(labels))
+
+    every = np.stack(np.meshgrid(*[np.arange(groups)] * n), axis=-1).reshape(-1, n)
+    assert cost(_runs(costs, np.float32(1.5))) == pytest.approx(min(map(cost, every)), abs=1e-4)
+
+
+def test_maps_that_no_symbol_can_say_are_left_out():
+    x, places = np.arange(300.0)[:, None] @ np.ones((1, 2)), np.repeat(np.arange(300.0)[:, None], 3, axis=1)
+    for far, found in ((1.0, True), (1e7, False)):
+        grouping = Grouping(places * far, np.zeros(300, np.int64))
+        groups = grouping.fitted({"position": x}, {"position": np.ones(300)}, 1e-4, 2**-4)
+        assert (groups is not None) == found

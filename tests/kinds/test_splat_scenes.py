@@ -22,7 +22,7 @@ from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.format.reader import decode_tensors, read_layers
 from pd4dgs_codec.kinds import splats
 from pd4dgs_codec.kinds.splats import harmonics
-from pd4dgs_codec.kinds.tracks import HEADS, Head, Tracks
+from pd4dgs_codec.kinds.tracks import HEADS, Groups, Head, Tracks
 from pd4dgs_codec.tensors.quantise import Rows, RowTable
 from pd4dgs_codec.tensors.tables import Chain, Grid
 
@@ -166,6 +166,15 @@ def test_arrays_for_other_readers():
 # -- Gaussians ---------------------------------------------------------------------------------------------------------
 
 
+def from_group(scene, groups, name, row):
+    """What the group of a row adds to its coefficients of a head."""
+    group, unit = int(groups.rows[row, 0]), float((scene.info.box[1] - scene.info.box[0]).max()) / 4
+    if name not in groups.maps or not 0 <= group < len(groups.centres):
+        return np.zeros(len(groups.maps.get(name, np.zeros((1, 4, 9)))[0, 0]))
+    at = (scene.anchor_q[row] + scene.tensors["offset"][row].astype(float)) * scene.info.voxel_size
+    return np.array([*(at / unit - groups.centres[group]), 1]) @ groups.maps[name][group]
+
+
 def expected(scene, level, t, eye):
     """One Gaussian after the other by the formulas of 13.7 and 13.8, in binary64; by row."""
     info, layers, found = scene.info, [i for i in scene.layers if i <= level], {}
@@ -177,6 +186,7 @@ def expected(scene, level, t, eye):
             tracks = scene.tracks.get(layer)
             for name, head in tracks.heads.items() if tracks else ():
                 for k, a in enumerate(head.coefficients[row] if row < len(head.coefficients) else ()):
+                    a += from_group(scene, tracks.groups, name, row)[k] if tracks.groups else 0
                     for c in range(HEADS[name]):
                         added[name][c] += a * np.interp(t, tracks.times, head.bases[k, c])
         mean = (scene.anchor_q[row] + x["offset"]) * info.voxel_size + added["position"]
@@ -204,7 +214,8 @@ def expected(scene, level, t, eye):
 @pytest.mark.parametrize("layers", LAYER_SETS)
 @pytest.mark.parametrize("window", [False, True])
 def test_gaussians_follow_the_formulas(layers, degree, window):
-    scene = decode(encode(make_splats(4, layers=layers, count=40, degree=degree, window=window), layers=2, effort=1))
+    given_ = make_splats(4, layers=layers, count=40, degree=degree, window=window, groups=3 * window)
+    scene = decode(encode(given_, layers=2, effort=1))
     eye, seen = np.array([0.3, -0.2, 4.0]), 0
     for level in range(3):
         for t in TIMES:
@@ -286,12 +297,14 @@ def grids(*sizes, sides=(5,)):
 
 
 ROWS = tuple(Rows(i, 2, 1 / 64) for i in (0, 1, 4))
+GROUPS = Rows(5, 1, 1.0)
+MAPPED = (*grids((0, 1), (1, 6), (2, 8), (5, 6)), Grid(6, 3, (3,)), Grid(8, 8, (3,)))
 #: Rule -> (what is other in the tables of layer 1, what the error says).
 BROKEN = {
     "a parameter": ({"kind": (1, 0)}, r"layer 1: deformation \[1, 0\], expected \[1\]"),
     "no kind": ({"kind": ()}, "layer 1: deformation without a kind, expected tracks"),
     "the kind of a scaffold": ({"kind": (0,)}, "layer 1: deformation hexplane, expected tracks"),
-    "chains": ({"chains": (Chain(0, (1, 1)),), "chain_step": 1.0}, "tracks, expected grids and layer rows and no"),
+    "chains": ({"chains": (Chain(0, (1, 1)),), "chain_step": 1.0}, "tracks, expected grids and layer rows of heads"),
     "no grids": ({"grids": (), "grid_step": 0.0}, "tracks, expected grids and layer rows"),
     "no layer rows": ({"rows": ()}, "tracks, expected grids and layer rows"),
     "two axes": ({"grids": grids((0, 1), (1, 6), (2, 8), (5, 6), sides=(5, 2))}, r"grids of sides \[\[5, 2\]"),
@@ -300,7 +313,16 @@ BROKEN = {
     "a head without bases": ({"grids": grids((0, 1), (1, 6), (2, 8))}, r"expected \[\(0, 1\), \(1, 6\), \(2, 8\), \(5"),
     "bases without a head": ({"rows": ROWS[:2]}, r"expected \[\(0, 1\), \(1, 6\), \(2, 8\)\]"),
     "bases of other components": ({"grids": grids((0, 1), (1, 6), (2, 6), (5, 6))}, r"\(2, 6\).*expected .*\(2, 8\)"),
-    "a head of no meaning": ({"rows": (*ROWS, Rows(5, 1, 1.0))}, "layer rows 5, expected 0..4"),
+    "a head of no meaning": ({"rows": (*ROWS, Rows(6, 1, 1.0))}, r"layer rows 6, expected 0\.\.5"),
+    "groups alone": ({"rows": (GROUPS,), "grids": grids((0, 1), (6, 3))}, "tracks, expected grids and layer rows of"),
+    "groups of two channels": ({"rows": (*ROWS, Rows(5, 2, 1.0)), "grids": MAPPED}, r"layer rows 5 of \[\(2, 1.0\)"),
+    "groups of another step": ({"rows": (*ROWS, Rows(5, 1, 0.5)), "grids": MAPPED}, r"layer rows 5 of \[\(1, 0.5\)"),
+    "groups without centres": ({"rows": (*ROWS, GROUPS)}, r"expected \[.*\(6, 3\)\]"),
+    "centres without groups": ({"grids": MAPPED[:5]}, r"expected \[\(0, 1\), \(1, 6\), \(2, 8\), \(5, 6\)\]"),
+    "centres of two axes": ({"rows": (*ROWS, GROUPS), "grids": (*MAPPED[:4], Grid(6, 3, (2, 2)))}, r"\[\[2, 2\]\]"),
+    "maps of other groups": ({"rows": (*ROWS, GROUPS), "grids": (*MAPPED[:5], Grid(8, 8, (2,)))}, r"\[\[3\], \[2\]\]"),
+    "maps of other bases": ({"rows": (*ROWS, GROUPS), "grids": (*MAPPED[:5], Grid(8, 4, (3,)))}, r"\(8, 4\).*\(8, 8\)"),
+    "maps without a head": ({"rows": (*ROWS, GROUPS), "grids": (*MAPPED[:5], Grid(9, 8, (3,)))}, r"\(9, 8\).*expected"),
     "two instants at once": ({"instants": [0, 1, 1, 2, 3]}, "layer 1: instants do not ascend from 0"),
     "instants from 1": ({"instants": [1, 2, 3, 4, 5]}, "layer 1: instants do not ascend from 0"),
 }  # fmt: skip
@@ -317,8 +339,10 @@ def test_a_broken_rule_of_tracks_is_malformed_at_its_slice(rule):
     assert info(data)["layers"][1]["anchors"] == 0
 
 
-def test_the_file_of_the_rules_is_whole():
+def test_the_files_of_the_rules_are_whole():
     assert decode(file_with()).tracks[1].heads.keys() == {"position", "rotation", "color"}
+    groups = decode(file_with(rows=(*ROWS, GROUPS), grids=MAPPED, instants=range(5))).tracks[1].groups
+    assert groups.maps.keys() == {"rotation"} and len(groups.centres) == 3
 
 
 @pytest.mark.parametrize(
@@ -362,6 +386,13 @@ def without_bases(head):
         ),
         (lambda t: replace(t, instants=t.instants[::-1].copy()), "instants do not ascend from 0"),
         (lambda t: replace(t, heads={}), "tracks, expected grids and layer rows"),
+        (lambda t: replace(t, groups=Groups(np.zeros((9, 1)), t.heads["color"].bases[0, :1], {})), "groups: float64"),
+        (
+            lambda t: replace(
+                t, groups=Groups(np.zeros((9, 1), np.float32), np.zeros((2, 3), np.float32), {"scale": 0})
+            ),
+            "maps of .'scale'., expected some of",
+        ),
         (
             lambda t: replace(t, heads={"color": replace(t.heads["color"], coefficients=t.heads["color"].bases)}),
             "coefficients of color",
@@ -379,9 +410,13 @@ def test_coefficients_of_later_layers_are_not_lost_silently():
     later = np.zeros(len(scene.anchor_q), np.uint8)
     later[3] = 2
     moved = splats.scene(scene.info, scene.anchor_q, scene.tensors, STEPS, tracks=scene.tracks, layer=later)
-    with pytest.raises(EncodeError, match=r"tracks of layer 1: \['position', .* of a later layer, expected coef"):
+    with pytest.raises(EncodeError, match=r"tracks of layer 1: \['position', .* of a later layer, expected 0"):
         encode(moved)
     assert moved.rows == (len(later),) * 3 and [codes[3] for codes in moved.mask] == [0, 0, 255]
     for head in moved.tracks[1].heads.values():
         head.coefficients[3] = 0
+    rows, maps = np.zeros((len(later), 1), np.float32), {"color": np.ones((1, 4, 2), np.float32)}
+    grouped = replace(moved.tracks[1], groups=Groups(rows, np.zeros((1, 3), np.float32), maps))
+    with pytest.raises(EncodeError, match=r"tracks of layer 1: \['groups'\] of anchors of a later layer"):
+        encode(moved.with_deformation(1, grouped))
     assert decode(encode(moved)).rows == (len(later) - 1, len(later) - 1, len(later))

@@ -124,8 +124,9 @@ def test_the_tables_and_limits_of_the_specification():
     found = refdec.relative_magnitude([[int(v.replace("−", "-")) for v in residuals.split(",")]], 4)
     assert found == [int(v) for v in magnitudes.split(",")]
     sentence = r"predictor 1 and m = (\d+), symbols ([\d, −]+) of classes ([\d, ]+) give v = ([\d, ]+)\."
+    sentence += r"\s+With predictor 2 they give v = ([\d, ]+)\."
     (m,), *lists = ([int(v.replace("−", "-")) for v in part.split(",")] for part in re.search(sentence, text).groups())
-    assert refdec.row_values(*lists[:2], m, 1) == lists[2]
+    assert [refdec.row_values(*lists[:2], m, predictor) for predictor in (1, 2)] == lists[2:]
 
 
 def test_the_formulas_of_harmonics():

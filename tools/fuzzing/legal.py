@@ -45,6 +45,7 @@ from . import ROOT
 VECTORS = ROOT / "spec" / "vectors"
 LARGEST_SEED = 6000  #: bytes of a vector: larger ones decode slowly
 M, K, V = 1 << 23, 1 << 24, 1 << 20  #: largest symbol of a value, of a channel, and voxel index
+GROUP = 5  #: layer rows of splats whose step is 1
 LEAST, LARGEST = 2.0**-126, (2.0 - 2.0**-23) * 2.0**127
 
 
@@ -232,7 +233,7 @@ class Scaffold(Anything):
 
 
 class Splats(Anything):
-    """Splats with tracks."""
+    """Splats with tracks, in groups or not."""
 
     def __init__(self, rng: random.Random):
         super().__init__(rng)
@@ -247,7 +248,12 @@ class Splats(Anything):
         side = rng.choice((2, 3, 7, 40))
         heads = {h: near(rng, 1, 9) for h in sorted(rng.sample(range(5), rng.randint(1, 3)))}
         grids = {1 + h: (m * (3, 4, 3, 1, 3)[h], (side,)) for h, m in heads.items()}
-        return Tables({0: (1, (side,))} | grids, {}, heads, [1])
+        grids = {0: (1, (side,))} | grids
+        if rng.random() < 0.5:
+            return Tables(grids, {}, heads, [1])
+        count = rng.choice((1, 2, 5, 40))
+        grids |= {6: (3, (count,))} | {7 + h: (4 * m, (count,)) for h, m in heads.items() if rng.random() < 0.6}
+        return Tables(grids, {}, heads | {GROUP: 1}, [1])
 
 
 def bend(rng: random.Random, tables: Tables) -> None:
@@ -285,7 +291,7 @@ class Maker:
             self.plan.kind[-1] += rng.choice((1, 2, 60))
         elif bent and rng.random() < 0.4:
             self.plan.widths[rng.choice((1, 2, 7))] = rng.choice((1, 6, 9))
-        self.table = [[i, c, 1.0, rng.randrange(2)] for i, c in sorted(self.plan.widths.items())]
+        self.table = [[i, c, 1.0, rng.randrange(3)] for i, c in sorted(self.plan.widths.items())]
         width = sum(c for _, c, _, _ in self.table)
         self.centres = symbols(rng, width).tolist() if rng.random() < 0.4 else None
         self.layer_table = list[Any]()  # of the layer
@@ -357,7 +363,9 @@ class Maker:
             bend(rng, tables)
         tables.rows = {} if self.base and number == 0 else tables.rows
         if first:
-            self.layer_table = [[i, c, step(rng, (), M), rng.randrange(2)] for i, c in sorted(tables.rows.items())]
+            whole = {GROUP} if isinstance(self.plan, Splats) else set()
+            steps = {i: 1.0 if i in whole else step(rng, (), M) for i in sorted(tables.rows)}
+            self.layer_table = [[i, tables.rows[i], own, rng.randrange(3)] for i, own in steps.items()]
         cells = self.cells(rng.choices((0, 1, 2, 3, 5, 12, 40, 150), (4, 4, 4, 4, 4, 4, 1, 0.2))[0])
         lowest, high = rng.choice((3, 3, 200, 255)), rng.choice((0, 2, 255))
         graded = self.centres is not None

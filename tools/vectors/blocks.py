@@ -480,6 +480,7 @@ def make_layer(
     classes: Sequence[int] | None = None,
     earlier: Sequence[int] = (),
     layer_rows: Mapping[int, np.ndarray] = {},  # noqa: B006  (never changed)
+    labels: Sequence[int] = (),
     grids: Sequence[Grid] = (),
     chains: Mapping[int, Any] | None = None,
     kind: list[int] | None = None,
@@ -496,8 +497,8 @@ def make_layer(
 
     Defaults: every rise 0, every code 77, rows all 2; in layer 0 the networks of a scaffold without hidden layers,
     elsewhere a trunk and the head 1 if there are `grids`. rows: int32 [sum of widths, n]. layer_rows: int32 [C, earlier
-    rows + n] by id. chains: widths by id, or weight, bias, weight, .. steps: of grids and of chains. priors:
-    of some channels, by piece and number; choose: of all.
+    rows + n] by id. labels: ids of those with step 1 and predictor 2. chains: widths by id, or weight, bias, weight, ..
+    steps: of grids and of chains. priors: of some channels, by piece and number; choose: of all.
     """
     n, features = len(cells), below + sum(grid.channels for grid in grids)
     if chains is None:
@@ -514,7 +515,9 @@ def make_layer(
         4: [steps[0], *(grid.row() for grid in grids)] if grids else None,
         5: [steps[1], *([i, own[0].shape[1], *map(len, own[1::2])] for i, own in made.items())] if made else None,
         6: [0] if number and grids and kind is None else kind,
-        7: [[i, len(k), 2.0**-5, i % 2] for i, k in layer_rows.items()] if first and layer_rows else None,
+        7: [[i, len(k), *((1.0, 2) if i in labels else (2.0**-5, i % 2))] for i, k in layer_rows.items()]
+        if first and layer_rows
+        else None,
     }
     return Layer(
         number,
@@ -684,6 +687,7 @@ def row_values(k: np.ndarray, classes: Any, centres: Any, predictor: int, mend: 
     last = np.repeat(np.array(centres, np.int64)[:, None], 7, axis=1)
     v = np.zeros(k.shape, np.int64)
     for row, c in enumerate(np.broadcast_to(classes, k.shape[1:]).tolist()):
+        c = 0 if predictor == 2 else c
         v[:, row] = last[:, c] + (k[:, row].astype(np.int64) << c)
         if mend:
             k[abs(v[:, row]) > 1 << 23, row] = 0
