@@ -61,8 +61,8 @@ class Unordered(Exception):
 
 
 class Frames(Sequence[Any]):
-    """The frames of a model, read when they are asked for, with harmonics of one degree. rows: the number of Gaussians of
-    each, else Unordered is raised; None: any."""
+    """The frames of a model, read when they are asked for, with harmonics of one degree. rows: the number of Gaussians
+    in each, else Unordered is raised; None: any."""
 
     def __init__(self, model: Teacher, times: Sequence[float]):
         self.model, self.times = model, times
