@@ -56,18 +56,27 @@ JUDGED = 3  #: pictures that measure a segment
 ALWAYS, PRECISE = (0.5, 1.0, 1.0), 0.05
 
 
+class Unordered(Exception):
+    """Frames do not keep their rows."""
+
+
 class Frames(Sequence[Any]):
-    """The frames of a model, read when they are asked for, with harmonics of one degree."""
+    """The frames of a model, read when they are asked for, with harmonics of one degree. rows: the number of Gaussians
+    in each, else Unordered is raised; None: any."""
 
     def __init__(self, model: Teacher, times: Sequence[float]):
         self.model, self.times = model, times
+        self.rows: int | None = None
         self.harmonics = min(self[i].sh.shape[1] for i in {0, len(times) - 1})
+        self.rows = len(self[0].means)
 
     def __len__(self) -> int:
         return len(self.times)
 
     def __getitem__(self, i: Any) -> Any:
         frame = self.model.splats(float(self.times[i]))
+        if self.rows not in (None, len(frame.means)):
+            raise Unordered
         most = getattr(self, "harmonics", frame.sh.shape[1])
         if frame.sh.shape[1] < most:
             raise DataError(f"frame {i}: has {frame.sh.shape[1]} harmonics, expected {most} as the first and last have")
@@ -160,8 +169,11 @@ def groups(
     """Returns (number of the first segment, what stands still) of each group of segments. cuts: frames at their ends.
 
     A segment joins a group if the base then still saves half of what stands still in the segment, and more than it
-    would have to be repeated in the segments before.
+    would have to be repeated in the segments before. reach: of matches; None if frames keep their rows, else Unordered
+    is raised.
     """
+    if reach is None and not _in_order(frames):
+        raise Unordered
     found = list[tuple[int, Still]]()
     for k, (a, b) in enumerate(zip(cuts[:-1], cuts[1:], strict=True)):
         first, own = frames[a], Still.of(frames[a], reach)
@@ -362,9 +374,12 @@ def import_segments(
     target.mkdir(parents=True, exist_ok=True)
 
     first = frames[0]
-    reach = None if _ordered(frames) else _reach(first)
     with progress("looking for what stands still", last) as step:
-        found = groups(frames, cuts, reach, step)
+        try:
+            found, reach = groups(frames, cuts, None, step), None
+        except Unordered:
+            frames.rows, reach = None, _reach(first)
+            found = groups(frames, cuts, reach, step)
     some = [frames[i] for i in evenly(range(len(times)), BOX_INSTANTS)]
     info, cameras, judges = scene_info(place, model, some, total, background, up)
     still = [len(own.rows) for _, own in found]
@@ -383,12 +398,6 @@ def import_segments(
                 step()
     quality = float(np.mean(measured)) if measured else None
     return Made(writer.index, quality, count - len(measured), len(first.means), still)
-
-
-def _ordered(frames: Frames) -> bool:
-    """Whether rows keep their Gaussians, as far as some frames show."""
-    some = evenly(range(len(frames)), BOX_INSTANTS)
-    return len({len(frames[i].means) for i in some}) == 1 and _in_order(frames)
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,7 @@ from pd4dgs_codec.format.info import info
 from pd4dgs_codec.format.reader import Base, read_base
 from pd4dgs_codec.kinds import AnyScene
 from pd4dgs_codec.segments import INDEX as SEGMENTS_INDEX
-from pd4dgs_codec.segments import File, Segment, read_file, read_index
+from pd4dgs_codec.segments import File, Index, Segment, read_file, read_index
 from pd4dgs_codec.web import PAGE
 from pd4dgs_codec.web.headers import cache_control
 from pd4dgs_codec.web.manifests import (
@@ -111,8 +111,9 @@ def package_segments(
 ) -> Iterator[tuple[str, bytes]]:
     """Yields (name, content) of every file of the package of a folder of segments; those that name others come last.
 
-    render, draw: as for `package`; `render` is called with each segment, `draw` with the first. The index of the
-    segments also has the slices of each file. Raises DataError or DecodeError for a file that is missing or damaged.
+    render, draw: as for `package`; `render` is called with each segment, `draw` with the first. `index.json` has the
+    slices of each file; `segments.json`, which players fetch first, has not. Raises DataError or DecodeError for a file
+    that is missing or damaged.
     """
     place, index = read_index(folder)
     rows: dict[str, list[dict[str, Any]]] = {"bases": [], "segments": []}
@@ -149,14 +150,16 @@ def package_segments(
         shared = [] if segment.base is None else rows["bases"][segment.base]["layers"]
         shared = [row for row in shared if row["layer"] == 0]
         periods.append(Period(rows["segments"][-1]["layers"], end - start, tracks[-1] if video else None, shared))
-    files = {MPD: dash(periods), PLAYLIST: hls(SEGMENTS_INDEX, tracks[0] if tracks else None, VIDEO_PLAYLIST)}
+    files = {MPD: dash(periods), PLAYLIST: hls(INDEX, tracks[0] if tracks else None, VIDEO_PLAYLIST)}
     files |= {VIDEO_PLAYLIST: hls_video(tracks)} if tracks else {}
     files |= {POSTER: poster} if poster else {}
     first = read_file(
         place, index.segments[0] if index.segments[0].base is None else index.bases[index.segments[0].base]
     )
     files[PAGE] = page(SEGMENTS_INDEX, first, still).encode()
-    content = _json(replace(index, made={}).json() | rows)
+    bases = [replace(file, file=row["file"]) for file, row in zip(index.bases, rows["bases"], strict=True)]
+    parts = [replace(file, file=row["file"]) for file, row in zip(index.segments, rows["segments"], strict=True)]
+    content = Index(tuple(bases), tuple(parts)).packed()
     low, high = index.time_range
     about = {
         "file": SEGMENTS_INDEX,
@@ -169,6 +172,7 @@ def package_segments(
         "dash": MPD,
         "hls": PLAYLIST,
         "poster": POSTER if poster else None,
+        **rows,
     }
     end = about["layers"][0]["range"][1]
     about["first_frame_seconds"] = {name: 8 * end / rate for name, rate in RATES.items()}

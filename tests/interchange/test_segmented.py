@@ -71,6 +71,15 @@ def shown(splats, info):
     return picture(splats, info.camera, info.background, info.near)
 
 
+def test_a_frame_that_lost_a_row_has_no_order(tmp_path, cli):
+    frames = list(swaying())
+    frames[4] = frames[4].taken(np.arange(299))
+    result = imported(cli, write(tmp_path / "set", frames), tmp_path / "out")
+    assert result.code == 0, result.err
+    assert result.json["still"] == [179] and result.json["psnr"] > 36
+    assert "window" in scenes(tmp_path / "out")[1][0].tensors
+
+
 def test_segments_that_are_there_are_kept_and_the_others_are_made_again(tmp_path, cli):
     source, out = write(tmp_path / "set", swaying()), tmp_path / "out"
     assert imported(cli, source, out).json["kept"] == 0

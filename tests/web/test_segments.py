@@ -31,8 +31,9 @@ def packaged(request):
 
 def test_the_index_gives_every_slice_by_its_bytes(packaged):
     folder, index = read_index(segmented.folder())
-    content = json.loads(packaged[INDEX])
-    assert parse(packaged[INDEX], "it").segments == index.segments and "made" not in content
+    content, shown = json.loads(packaged["index.json"]), parse(packaged[INDEX], "it")
+    assert (shown.bases, shown.segments, shown.made) == (index.bases, index.segments, {})
+    assert len(packaged[INDEX]) < 60 + 180 * len(index.files)  # players fetch it before anything else
     for row in content["bases"] + content["segments"]:
         data = packaged[row["file"]]
         assert data == (folder / row["file"]).read_bytes() and hashlib.sha256(data).hexdigest() == row["sha256"]
@@ -41,8 +42,7 @@ def test_the_index_gives_every_slice_by_its_bytes(packaged):
             piece = packaged[part["dash"]["file"]][slice(*part["dash"]["range"])]
             *_, mdat = manifests.boxes(piece)
             assert piece[mdat.content : mdat.end] == data[slice(*part["range"])]
-    library = json.loads(packaged["index.json"])
-    assert library["seconds"] == 4 and library["bytes"] == sum(file.bytes for file in index.files)
+    assert content["seconds"] == 4 and content["bytes"] == sum(file.bytes for file in index.files)
 
 
 def test_periods_share_the_sets_of_their_base(packaged):
@@ -78,7 +78,7 @@ def test_the_manifest_is_valid(packaged):
 
 
 def test_the_playlist_is_discontinuous_between_segments(packaged):
-    assert f'URI="{INDEX}"' in packaged["scene.m3u8"].decode()
+    assert 'URI="index.json"' in packaged["scene.m3u8"].decode()
     if "fallback.m3u8" not in packaged:
         return
     lines = packaged["fallback.m3u8"].decode().splitlines()
@@ -91,7 +91,8 @@ def test_the_playlist_is_discontinuous_between_segments(packaged):
 def test_names_may_carry_digests(tmp_path):
     files = dict(package_segments(segmented.folder(), immutable=True))
     assert all(re.search(r"-[0-9a-f]{16}\.(pd4|mp4)$", name) for name in files if name.endswith((".pd4", ".mp4")))
-    for row in json.loads(files[INDEX])["segments"]:
+    assert {file.file for file in parse(files[INDEX], "it").files} < set(files)
+    for row in json.loads(files["index.json"])["segments"]:
         assert row["file"] in files and row["layers"][0]["dash"]["file"] in files
 
 
