@@ -1,4 +1,4 @@
-"""Runs in the layouts of 4DGaussians and Deformable-3DGS, from their published formulas, and the quality lost by
+"""Runs in the layouts of 4DGaussians, Deformable-3DGS and SC-GS, from their published formulas, and the quality lost by
 learning from them.
 
 The modules stand on their own: plain torch layers and `grid_sample`, so that tests compare the package's readers with
@@ -147,36 +147,48 @@ def encoded(values: Tensor, octaves: int) -> Tensor:
     return torch.cat([values, *waves], dim=1)
 
 
-class Deformable(nn.Module):
-    """Deformable-3DGS."""
+class Positional(nn.Module):
+    """The layers of Deformable-3DGS and SC-GS, with their skip."""
 
-    def __init__(self, splats: Splats, is_blender: bool = False, is_6dof: bool = False):
+    def __init__(self, is_blender: bool):
         super().__init__()
-        self.rest, self.is_blender, self.is_6dof = parameters(splats), is_blender, is_6dof
-        depth, width = 8, 64  # theirs are 8 and 256
-        inputs = 63 + (30 if is_blender else 21)
+        self.is_blender = is_blender
+        depth, self.width = 8, 64  # theirs are 8 and 256
+        self.inputs = 63 + (30 if is_blender else 21)
         if is_blender:
             self.timenet = nn.Sequential(nn.Linear(13, 256), nn.ReLU(), nn.Linear(256, 30))
-        wide = [inputs, *(width + inputs * (i == depth // 2) for i in range(depth - 1))]
-        self.linear = nn.ModuleList([nn.Linear(n, width) for n in wide])
-        if is_6dof:
-            self.branch_w, self.branch_v = nn.Linear(width, 3), nn.Linear(width, 3)
-        else:
-            self.gaussian_warp = nn.Linear(width, 3)
-        self.gaussian_rotation, self.gaussian_scaling = nn.Linear(width, 4), nn.Linear(width, 3)
+        wide = [self.inputs, *(self.width + self.inputs * (i == depth // 2) for i in range(depth - 1))]
+        self.linear = nn.ModuleList([nn.Linear(n, self.width) for n in wide])
 
-    def forward(self, t: float) -> dict[str, Tensor]:
-        """The Gaussians at a time 0..1; quaternions of any length, which enter the matrix's formula as they are."""
-        rest = self.rest
-        times = encoded(torch.full_like(rest["means"][:, :1], t), 6 if self.is_blender else 10)
+    def features(self, points: Tensor, t: float) -> tuple[Tensor, Tensor]:
+        """What enters the layers and what leaves them, for points [n, 3] at a time 0..1."""
+        times = encoded(torch.full_like(points[:, :1], t), 6 if self.is_blender else 10)
         if self.is_blender:
             times = self.timenet(times)
-        given = hidden = torch.cat([encoded(rest["means"], 10), times], dim=1)
+        given = hidden = torch.cat([encoded(points, 10), times], dim=1)
         for i, layer in enumerate(self.linear):
             hidden = torch.relu(layer(hidden))
             if i == len(self.linear) // 2:
                 hidden = torch.cat([given, hidden], dim=1)
-        means = rest["means"]
+        return given, hidden
+
+
+class Deformable(Positional):
+    """Deformable-3DGS."""
+
+    def __init__(self, splats: Splats, is_blender: bool = False, is_6dof: bool = False):
+        super().__init__(is_blender)
+        self.rest, self.is_6dof = parameters(splats), is_6dof
+        if is_6dof:
+            self.branch_w, self.branch_v = nn.Linear(self.width, 3), nn.Linear(self.width, 3)
+        else:
+            self.gaussian_warp = nn.Linear(self.width, 3)
+        self.gaussian_rotation, self.gaussian_scaling = nn.Linear(self.width, 4), nn.Linear(self.width, 3)
+
+    def forward(self, t: float) -> dict[str, Tensor]:
+        """The Gaussians at a time 0..1; quaternions of any length, which enter the matrix's formula as they are."""
+        rest, means = self.rest, self.rest["means"]
+        _, hidden = self.features(means, t)
         if self.is_6dof:
             means = self._screw(self.branch_w(hidden), self.branch_v(hidden))
         else:
@@ -202,6 +214,78 @@ class Deformable(nn.Module):
         """A run of it."""
         options = {"is_blender": self.is_blender, "is_6dof": self.is_6dof, "white_background": True}
         return save(run, splats, self, "deform/iteration_7/deform.pth", options)
+
+
+class Nodes(nn.Module):
+    """SC-GS with `count` nodes. coordinates: of nodes and Gaussians beside those of space. options: of cfg_args."""
+
+    def __init__(self, splats: Splats, count: int = 20, coordinates: int = 2, **options: object):
+        super().__init__()
+        self.rest = parameters(splats)
+        defaults = {"K": 3, "local_frame": False, "gs_with_motion_mask": False, "max_d_scale": -1.0}
+        self.options = defaults | options
+        net = self.network = Positional(bool(self.options.get("is_blender")))
+        for name, outputs in dict(warp=3, scaling=3, rotation=4).items():
+            setattr(net, f"gaussian_{name}", nn.Linear(net.width, outputs))
+        if self.options["local_frame"]:
+            net.local_rotation = nn.Linear(net.width, 4)
+        rows = torch.randperm(len(self.rest["means"]))[:count]
+        self.nodes = nn.Parameter(torch.cat([self.rest["means"][rows], torch.randn(count, coordinates) * 0.1], dim=1))
+        self._node_radius = nn.Parameter(torch.randn(count) * 0.3 - 0.5)
+        self._node_weight = nn.Parameter(torch.randn(count, 1))
+        self.register_buffer("inited", torch.tensor(True))
+        masked = bool(self.options["gs_with_motion_mask"])
+        self.feature = torch.randn(len(self.rest["means"]), coordinates + masked) * 0.1
+
+    def forward(self, t: float) -> dict[str, Tensor]:
+        """The Gaussians at a time 0..1."""
+        rest, net, on = self.rest, self.network, self.options
+        x, nodes, coordinates = rest["means"], self.nodes[:, :3], self.nodes.shape[1] - 3
+        here = torch.cat([x, self.feature[:, :coordinates]], dim=1)
+        apart, near = torch.cdist(here.double(), self.nodes.double()).float().topk(int(str(on["K"])), largest=False)
+        weights = torch.exp(-(apart**2) / (2 * torch.exp(self._node_radius)[near] ** 2))
+        weights = weights * torch.sigmoid(self._node_weight)[near][..., 0] + 1e-7
+        weights = (weights / weights.sum(dim=1, keepdim=True))[..., None]
+        _, hidden = net.features(nodes, t)
+
+        def mean(values: Tensor) -> Tensor:
+            return (values[near] * weights).sum(dim=1)
+
+        shift = net.gaussian_warp(hidden)
+        if on["local_frame"]:
+            turn = matrices(functional.normalize(net.local_rotation(hidden) + torch.tensor([1.0, 0, 0, 0])))
+            around = (turn[near] @ (x[:, None] - nodes[near])[..., None])[..., 0] + nodes[near] + shift[near]
+            moved = (around * weights).sum(dim=1) - x
+        else:
+            moved = mean(shift)
+        mask = torch.sigmoid(self.feature[:, -1:]) if on["gs_with_motion_mask"] else torch.ones(len(x), 1)
+        scaling = net.gaussian_scaling(hidden)
+        if (limit := float(str(on["max_d_scale"]))) > 0:
+            scaling = torch.tanh(scaling) * np.log(limit)
+        return rest | {
+            "means": x + moved * mask,
+            "quats": functional.normalize(rest["quats"] + mean(net.gaussian_rotation(hidden)) * mask),
+            "scales": rest["scales"].exp() + mean(scaling) * mask,
+            "opacities": rest["opacities"].sigmoid(),
+        }
+
+    def save(self, run: Path, splats: Splats) -> Path:
+        """A run of it, whose PLY file also has the features."""
+        save(run, splats, self, "deform/iteration_7/deform.pth", self.options | {"white_background": True})
+        path = run / "point_cloud/iteration_7/point_cloud.ply"
+        head, body = path.read_bytes().split(b"end_header\n", 1)
+        head += b"".join(b"property float fea_%d\n" % i for i in range(self.feature.shape[1])) + b"end_header\n"
+        rows = np.frombuffer(body, "<f4").reshape(len(splats.means), -1)
+        path.write_bytes(head + np.concatenate([rows, self.feature.numpy()], axis=1).astype("<f4").tobytes())
+        return run
+
+
+def matrices(quats: Tensor) -> Tensor:
+    """Rotations [n, 3, 3] of unit quaternions wxyz: I + 2 w [v] + 2 [v]^2."""
+    w, x, y, z = quats.unbind(1)
+    zero = torch.zeros_like(w)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=1).reshape(-1, 3, 3)
+    return torch.eye(3) + 2 * w[:, None, None] * cross + 2 * cross @ cross
 
 
 # -- lost quality -----------------------------------------------------------------------------------------------------

@@ -50,6 +50,9 @@ class Refused(Exception):
 
 
 ORDERED = Name("collections", "OrderedDict")
+#: What pickles of numpy's single numbers call: a dtype, bytes from text, and a number from both.
+DTYPE, BYTES = Name("numpy", "dtype"), Name("_codecs", "encode")
+NUMBERS = [Name(f"numpy.{core}.multiarray", "scalar") for core in ("core", "_core")]
 TENSOR, PARAMETER = Name("torch._utils", "_rebuild_tensor_v2"), Name("torch._utils", "_rebuild_parameter")
 
 
@@ -158,15 +161,21 @@ class _Machine:
             return self._tensor(*values)
         if what == PARAMETER:
             return values[0]
+        if what == DTYPE and values[0] in ("f4", "f8", "i4", "i8"):
+            return np.dtype(f"<{values[0]}")
+        if what == BYTES and values[1:] == ("latin1",) and len(values[0]) <= 8:
+            return values[0].encode("latin1")
+        if what in NUMBERS and isinstance(values[0], np.dtype):
+            return np.frombuffer(values[1], values[0], 1)[0].item()
         if isinstance(what, Name) and what.module.startswith("__torch__."):
             return Module(what.name)
         raise Refused("the pickle calls something other than a class of tensors or modules")
 
     def _build(self, state: Any) -> None:
-        """Sets the members of a module. Ignores those of an OrderedDict, which are torch's own metadata."""
+        """Sets the members of a module. Ignores those of an OrderedDict, torch's own metadata, and of a dtype."""
         if isinstance(self.stack[-1], Module) and isinstance(state, dict):
             self.stack[-1].members.update(state)
-        elif not isinstance(self.stack[-1], dict):
+        elif not isinstance(self.stack[-1], (dict, np.dtype)):
             raise Refused("the pickle sets the state of something other than a module")
 
     def _tensor(self, storage: np.ndarray, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: Any) -> Any:
@@ -189,7 +198,7 @@ def _known(module: str, name: str) -> Any:
     if module == "torch" and name in STORAGES:
         return np.dtype(STORAGES[name])
     found = Name(module, name)
-    if found not in (ORDERED, TENSOR, PARAMETER) and not module.startswith("__torch__."):
+    if found not in (ORDERED, TENSOR, PARAMETER, DTYPE, BYTES, *NUMBERS) and not module.startswith("__torch__."):
         raise Refused(f"the pickle imports {one_line(f'{module}.{name}', 80)}")
     return found
 

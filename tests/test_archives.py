@@ -86,6 +86,14 @@ REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
     "an operation that none needs": (lambda: b"(" + text("a") + b"l", "the operation LIST"),
     "a memo of 2^31 places": (lambda: b"]r\xff\xff\xff\x7f" * 3, "not a zip archive of tensors"),
     "code": (lambda: b"cos\nsystem\n" + text("true") + b"\x85R", "the pickle imports os.system"),
+    "a number of numpy that holds objects": (lambda: b"cnumpy\ndtype\n(" + text("O8") + b"tR", "calls something other"),
+    "a number of numpy without a kind": (
+        lambda: b"cnumpy.core.multiarray\nscalar\n(N" + text("x") + b"tR", "calls something other"
+    ),
+    "a long text as bytes": (
+        lambda: b"c_codecs\nencode\n(" + text("x" * 9) + text("latin1") + b"tR", "calls something other"
+    ),
+    "a text in another code": (lambda: b"c_codecs\nencode\n(" + text("x") + text("zip") + b"tR", "something other"),
     "a class of code": (lambda: b"cbuiltins\neval\n)\x81", "the pickle imports builtins.eval"),
     "an end in the middle": (lambda: b"t", "not a zip archive of tensors"),
     "overlapping members": (overlapping, "refused: members overlap"),
@@ -113,6 +121,15 @@ def test_deep_and_wide_content_is_read_in_one_pass():
     assert depth == 2999
     wide = {f"key {i}": (i, 1.5, None, True, [i]) for i in range(3000)}
     assert read_tensors(archive(pickle.dumps(wide, 2)[2:-1]), "m.pt") == wide
+
+
+@pytest.mark.parametrize("core", [b"core", b"_core"])
+def test_single_numbers_of_numpy_are_read(core):
+    """As trainers leave them in checkpoints; numpy 2 has renamed their module."""
+    values = {"rate": np.float64(0.1), "radius": np.float32(1.5), "step": np.int64(-3), "again": np.float64(2)}
+    data = pickle.dumps(values, 2)[2:-1].replace(b"numpy._core.", b"numpy." + core + b".")
+    found = read_tensors(archive(data), "m.pt")
+    assert found == {name: value.item() for name, value in values.items()} and type(found["step"]) is int
 
 
 def test_tensors_are_views_of_the_file():

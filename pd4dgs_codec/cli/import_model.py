@@ -14,11 +14,12 @@ if TYPE_CHECKING:
 
 DETAILS = """\
 SOURCE is found by its content:
-  a PLY, compressed PLY, SPZ or .splat file, or a checkpoint of gsplat: a static scene
-  a folder of PLY, SPZ or .splat files, one per frame; whether rows keep their Gaussians is found out, and
+  a PLY, compressed PLY, SPZ, SOG or .splat file, or a checkpoint of gsplat: a static scene
+  a folder of PLY, SPZ, SOG or .splat files, one per frame; whether rows keep their Gaussians is found out, and
     Gaussians without a counterpart in the frames beside get a window in time
-  a run of 4DGaussians or Deformable-3DGS, or one of its point_cloud/iteration_N
-  a PLY file of SpacetimeGaussians (lite), a .4dgs file
+  a run of 4DGaussians, Deformable-3DGS or SC-GS, or one of its point_cloud/iteration_N
+  a run of 4DGS or one of its chkpnt*.pth, whose duration --seconds gives if it is not found right
+  a PLY file of SpacetimeGaussians (lite), a .splatv or .4dgs file
   module:function, a Python function from time 0..1 to Gaussians
 Its Gaussians and their motion are packed as they are, without training. pd4dgs-train teacher:SOURCE learns a neural
 scene from its renderings instead: fewer bytes at low quality, in minutes. Code in files is never executed.

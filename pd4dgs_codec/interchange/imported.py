@@ -81,15 +81,15 @@ def import_model(
     fps: frames per second of a folder. seconds: the duration instead. tell: gets lines about what was read. progress:
     (task, number of steps or None) -> a context whose value is called after each step. Raises DataError, EncodeError.
     """
-    model = read_model(place, fps)
+    model = read_model(place, fps, seconds)
     with progress("reading", None if model.times is None else len(model.times)) as step:
         source = sampled(model, place, fps, step)
     instants, count = source.means.shape[:2]
     about, seconds = metadata or Metadata(), seconds or model.seconds
     static = float(source.static.mean())
     tell(f"{place}: {_about(source, seconds, static)}")
-    some = map(source.frame, evenly(range(instants), BOX_INSTANTS))
-    info, cameras, judges = scene_info(place, model, list(some), seconds, background, up)
+    some = [source.frame(i, bare=False) for i in evenly(range(instants), BOX_INSTANTS)]
+    info, cameras, judges = scene_info(place, model, some, seconds, background, up)
     with progress("packing", None) as step:
         packer = Packer(source, cameras, info, step)
         write = _writer(packer, slices, step)

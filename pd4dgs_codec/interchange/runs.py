@@ -14,8 +14,8 @@ Deformable-3DGS (`deform/iteration_N/deform.pth`): a network with a skip takes s
 adds to scales and unit quaternions, and adds to means or moves them by a screw (6DoF). The sums of quaternions are not
 normalised, so the rotation matrix also scales: https://github.com/ingra14m/Deformable-3D-Gaussians/issues/18
 
-SpacetimeGaussians (Li et al. 2024): a PLY file with cubic polynomials of means and linear ones of quaternions, in the
-time since the centre of a bell that multiplies the opacity. The lite model has plain colours.
+SC-GS (Huang et al. 2024): such a network moves nodes in `deform.pth`, and Gaussians go with the nodes near them in
+space and in the first features of the PLY file. The last feature may say how much of the motion they take part in.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ import numpy as np
 from pd4dgs_codec.archives import read_tensors
 from pd4dgs_codec.data.files import LARGEST, WHITE, Color, array, number, read_file, read_vertices, whole_number
 from pd4dgs_codec.data.view import check_rotation, rotation_matrix, up_direction, world_to_camera
-from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.errors import DataError, one_line
 from pd4dgs_codec.interchange.splats import (
     activated,
     checked,
@@ -43,7 +43,7 @@ from pd4dgs_codec.interchange.splats import (
     quaternions,
     read_parameters,
 )
-from pd4dgs_codec.kinds.splats import SH_C0, Splats, unit
+from pd4dgs_codec.kinds.splats import Splats, product, unit
 from pd4dgs_codec.scene import Camera
 
 PLY = "point_cloud.ply"
@@ -104,6 +104,14 @@ class Config:
             raise DataError(f"{self.path}: {name} is {found or 'missing'}, expected True or False")
         return found == "True"
 
+    def number(self, name: str, usual: str = "missing") -> float:
+        """Returns a number. usual: its text if the option is missing. Raises DataError."""
+        found = self.get(name) or usual
+        try:
+            return float(found)
+        except ValueError:
+            raise DataError(f"{self.path}: {name} is {found}, expected a number") from None
+
     @property
     def background(self) -> Color:
         """White if `white_background` is True, else black."""
@@ -130,8 +138,8 @@ class State:
             raise DataError(f"{path}: holds a {type(content).__name__}, expected a dict of tensors")
         return cls(path, content)
 
-    def take(self, name: str, *shape: int | None) -> np.ndarray:
-        """Returns a tensor as float32. shape: its lengths, None for any but 0."""
+    def take(self, name: str, *shape: int | None, finite: bool = True) -> np.ndarray:
+        """Returns a tensor as float32. shape: its lengths, None for any but 0. finite: refuse any other number."""
         found = self.tensors.get(name)
         if not isinstance(found, np.ndarray):
             raise DataError(f"{self.path}: has no tensor {name}")
@@ -140,7 +148,7 @@ class State:
         ):
             expected = ", ".join(str(n or "any") for n in shape)
             raise DataError(f"{self.path}: {name} has shape {found.shape}, expected ({expected})")
-        if not (np.abs(found) <= LARGEST).all():  # also true of NaN
+        if finite and not (np.abs(found) <= LARGEST).all():  # also true of NaN
             raise DataError(f"{self.path}: {name} holds a NaN or a number over {LARGEST:g}")
         return found.astype(np.float32)
 
@@ -218,6 +226,11 @@ def read_deformed(folder: Path) -> tuple[Callable[[float], Splats], Color] | Non
     state = State.read(network)
     if network.parent == place:
         move = _hexplane_move(state, config, rest)
+    elif "nodes" in state.tensors:
+        table = read_vertices(place / PLY)[good]
+        names = [name for name in table.dtype.names or () if name.startswith("fea_")]
+        features = np.array([table[name] for name in names], np.float32).reshape(len(names), len(table)).T
+        rest, move = _node_move(state, config, rest, features)
     else:
         rest = activated(rest) | {"quats": unit(rest["quats"])}
         move = _positional_move(state)
@@ -232,10 +245,12 @@ def _moved(where: str, rest: Parts, move: Move, t: float) -> Splats:
             blocks.append(move({name: values[start : start + ROWS] for name, values in rest.items()}, t))
     if not blocks:
         raise DataError(f"{where}: holds no Gaussian that is finite, expected one at least")
-    return checked(f"{where} at {t:g}", **{name: np.concatenate([block[name] for block in blocks]) for name in rest})
+    return checked(
+        f"{where} at {t:g}", **{name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
+    )
 
 
-def _through(layers: list[Layer], values: np.ndarray) -> np.ndarray:
+def through(layers: list[Layer], values: np.ndarray) -> np.ndarray:
     """Applies linear layers with a ReLU between them."""
     for i, (weight, bias) in enumerate(layers):
         values = (np.maximum(values, 0) if i else values) @ weight.T + bias
@@ -264,14 +279,14 @@ def _hexplane_move(state: State, config: Config, rest: Parts) -> Move:
     turns = config.flag("apply_rotation", "False")
 
     def move(parts: Parts, t: float) -> Parts:
-        hidden = np.maximum(_through(trunk, field(parts["means"], t)), 0)
-        keep = _through(static, hidden) if static else np.ones((len(hidden), 1), np.float32)
+        hidden = np.maximum(through(trunk, field(parts["means"], t)), 0)
+        keep = through(static, hidden) if static else np.ones((len(hidden), 1), np.float32)
         moved = dict(parts)
         for name, head in heads.items():
             values = parts[name]
-            change = _through(head, hidden).reshape(values.shape)
+            change = through(head, hidden).reshape(values.shape)
             if name == "quats":
-                moved[name] = _product(values, change) if turns else values + change
+                moved[name] = product(values, change) if turns else values + change
             else:
                 moved[name] = values * keep.reshape(-1, *[1] * (values.ndim - 1)) + change
         return activated(moved)
@@ -323,42 +338,47 @@ def _bilinear(plane: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.nda
     return np.asarray(above * (1 - v) + below * v)
 
 
-def _product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Products of quaternions [n, 4] wxyz."""
-    w, v = a[:, :1] * b[:, :1] - (a[:, 1:] * b[:, 1:]).sum(axis=1, keepdims=True), np.cross(a[:, 1:], b[:, 1:])
-    return np.concatenate([w, a[:, :1] * b[:, 1:] + b[:, :1] * a[:, 1:] + v], axis=1)
-
-
 # -- Deformable-3DGS ---------------------------------------------------------------------------------------------------
+
+
+def positional(state: State, prefix: str = "") -> tuple[Callable[[np.ndarray, float], np.ndarray], int, int]:
+    """Reads a network of layers with a skip, whose names begin with `prefix`. Returns (function of points [n, 3] and a
+    time -> what enters the network and its last features, [n, F + W]; F; W)."""
+    has_net = f"{prefix}timenet.0.weight" in state.tensors  # the option is_blender
+    octaves = NET_OCTAVES if has_net else TIME_OCTAVES
+    timenet = state.chain(f"{prefix}timenet", (0, 2), 1 + 2 * octaves) if has_net else []
+    inputs = 3 * (1 + 2 * MEAN_OCTAVES) + (len(timenet[-1][1]) if timenet else 1 + 2 * octaves)
+    count = sum(f"{prefix}linear.{i}.weight" in state.tensors for i in range(MOST_LAYERS))
+    layers = [state.linear(f"{prefix}linear.0", inputs)]
+    for i in range(1, count):
+        joined = inputs if i == count // 2 + 1 else 0
+        layers.append(state.linear(f"{prefix}linear.{i}", joined + len(layers[-1][1])))
+
+    def features(points: np.ndarray, t: float) -> np.ndarray:
+        time = through(timenet, _waves(np.full((1, 1), t, np.float32), octaves))
+        given = np.concatenate([_waves(points, MEAN_OCTAVES), np.repeat(time, len(points), axis=0)], axis=1)
+        hidden = given
+        for i, layer in enumerate(layers):
+            taken = np.concatenate([given, hidden], axis=1) if i == count // 2 + 1 else hidden
+            hidden = np.maximum(through([layer], taken), 0)
+        return np.concatenate([given, hidden], axis=1)
+
+    return features, inputs, len(layers[-1][1])
 
 
 def _positional_move(state: State) -> Move:
     """Reads the network of Deformable-3DGS. Its Move takes activated Gaussians with unit quaternions."""
-    has_net = "timenet.0.weight" in state.tensors  # the option is_blender
-    octaves = NET_OCTAVES if has_net else TIME_OCTAVES
-    timenet = state.chain("timenet", (0, 2), 1 + 2 * octaves) if has_net else []
-    inputs = 3 * (1 + 2 * MEAN_OCTAVES) + (len(timenet[-1][1]) if timenet else 1 + 2 * octaves)
-    count = sum(f"linear.{i}.weight" in state.tensors for i in range(MOST_LAYERS))
-    layers = [state.linear("linear.0", inputs)]
-    for i in range(1, count):
-        joined = inputs if i == count // 2 + 1 else 0
-        layers.append(state.linear(f"linear.{i}", joined + len(layers[-1][1])))
-    width = len(layers[-1][1])
+    features, inputs, width = positional(state)
     screw = "branch_w.weight" in state.tensors  # the option is_6dof
     shifts = [state.linear(name, width, 3) for name in (("branch_w", "branch_v") if screw else ("gaussian_warp",))]
     turn, grow = state.linear("gaussian_rotation", width, 4), state.linear("gaussian_scaling", width, 3)
 
     def move(parts: Parts, t: float) -> Parts:
         means = parts["means"]
-        time = _through(timenet, _waves(np.full((1, 1), t, np.float32), octaves))
-        given = np.concatenate([_waves(means, MEAN_OCTAVES), np.repeat(time, len(means), axis=0)], axis=1)
-        hidden = given
-        for i, layer in enumerate(layers):
-            taken = np.concatenate([given, hidden], axis=1) if i == count // 2 + 1 else hidden
-            hidden = np.maximum(_through([layer], taken), 0)
-        shift, *more = (_through([layer], hidden) for layer in shifts)
-        factors = rotation_matrix(parts["quats"] + _through([turn], hidden))
-        factors = factors * (parts["scales"] + _through([grow], hidden))[:, None, :]
+        hidden = features(means, t)[:, inputs:]
+        shift, *more = (through([layer], hidden) for layer in shifts)
+        factors = rotation_matrix(parts["quats"] + through([turn], hidden))
+        factors = factors * (parts["scales"] + through([grow], hidden))[:, None, :]
         scales, axes = principal_axes(factors @ factors.transpose(0, 2, 1))
         moved = _screwed(means, shift, more[0]) if more else means + shift
         return parts | {"means": moved, "scales": scales, "quats": quaternions(axes)}
@@ -385,44 +405,66 @@ def _screwed(means: np.ndarray, axis: np.ndarray, way: np.ndarray) -> np.ndarray
     return np.asarray(combined(means, 1.0, sine, versine) + combined(way, angle, versine, angle - sine))
 
 
-# -- SpacetimeGaussians ------------------------------------------------------------------------------------------------
+# -- SC-GS -------------------------------------------------------------------------------------------------------------
 
-SPACETIME = b"property float trbf_center"  #: in the header of its PLY files
-#: Beyond so many widths of its bell a Gaussian is invisible and stays where it is, which keeps polynomials small.
-BELL_REACH = 2.5
+MOST_NODES, MOST_NEAR = 1 << 12, 16  #: nodes, and those that move a Gaussian
+FLOOR = 1e-7  #: added to the weights of nodes
+#: Tensors of SC-GS's options use_hash, progressive_brand_time, pred_opacity and pred_color.
+UNREAD_BY_NODES = tuple(f"network.{name}" for name in ("hashgrid", "embed_time", "gaussian_opacity", "gaussian_color"))
+NODE_LAYERS = {"gaussian_warp": 3, "gaussian_scaling": 3, "gaussian_rotation": 4, "local_rotation": 4}
 
 
-def read_spacetime(path: Path, raw: bytes) -> tuple[Callable[[float], Splats], np.ndarray]:
-    """Reads a PLY file of the lite model as (function of time 0..1 -> Gaussians without their bells, bells as windows
-    float32 [n, 3]). Raises DataError."""
-    rows = read_vertices(path, raw)
-    names = set(rows.dtype.names or ())
-    if names & {"f_t_0", "f_dc_3"}:
-        what = "SpacetimeGaussians' full model, whose colours come from a network"
-        raise DataError(f"{path}: is {what}, expected the lite model with plain colours")
+def _node_move(state: State, config: Config, rest: Parts, features: np.ndarray) -> tuple[Parts, Move]:
+    """Reads the nodes of SC-GS and their network. features: float32 [n, F], coordinates of Gaussians beside means, and
+    perhaps the logit of their share of the motion. Returns (activated Gaussians and their nodes, Move of them)."""
+    if odd := [name for name in state.tensors if str(name).startswith(UNREAD_BY_NODES)]:
+        raise DataError(f"{state.path}: has {one_line(odd[0], 60)}, which no published setting of SC-GS has")
+    nodes, near, local = state.take("nodes", None, None), config.number("K"), "network.local_rotation.weight"
+    count, more, most = len(nodes), nodes.shape[1] - 3, min(len(nodes), MOST_NEAR)
+    masked = features.shape[1] - more == 1  # the option gs_with_motion_mask
+    if count > MOST_NODES or not 0 <= more == features.shape[1] - masked or near not in range(1, most + 1):
+        found = f"nodes {nodes.shape}, {features.shape[1]} features in the PLY file, K={near:g}"
+        raise DataError(f"{state.path}: {found}, expected at most {MOST_NODES}, 3 and the features, 1 to {most}")
+    limit, (layers_of, inputs, width) = config.number("max_d_scale", "-1"), positional(state, "network.")
+    names = [name for name in NODE_LAYERS if name != "local_rotation" or local in state.tensors]
+    layers = {name: state.linear(f"network.{name}", width, NODE_LAYERS[name]) for name in names}
+    radii, logits = state.take("_node_radius", count), state.take("_node_weight", count, 1)[:, 0]
+    places, k = np.concatenate([rest["means"], features[:, :more]], axis=1), int(near)
+    rows, weights = np.empty((len(places), k), np.int64), np.empty((len(places), k), np.float32)
+    with np.errstate(over="ignore", under="ignore"):
+        for start in range(0, len(places), 1 << 10):
+            own = places[start : start + (1 << 10)]
+            apart = np.square(nodes).sum(axis=1) - 2 * own @ nodes.T  # less the square of the place
+            nearest = np.argpartition(apart, k - 1, axis=1)[:, :k]
+            apart = np.square(own[:, None] - nodes[nearest]).sum(axis=2)
+            bells = np.exp(-apart / (2 * np.exp(2 * radii[nearest]))) / (1 + np.exp(-logits[nearest])) + FLOOR
+            rows[start : start + len(own)], weights[start : start + len(own)] = nearest, bells
+        share = 1 / (1 + np.exp(-features[:, -1:])) if masked else np.ones((len(places), 1), np.float32)
+    weights /= weights.sum(axis=1, keepdims=True)
+    nodes = nodes[:, :3]
 
-    def stack(prefix: str, places: Iterable[object]) -> np.ndarray:
-        wanted = [f"{prefix}{place}" for place in places]
-        if missing := [name for name in wanted if name not in names]:
-            raise DataError(f"{path}: has no property {missing[0]}, expected those of SpacetimeGaussians")
-        return np.stack([rows[name] for name in wanted], axis=1).astype(np.float32)
+    @lru_cache(maxsize=2)
+    def of_nodes(t: float) -> Parts:
+        hidden = layers_of(nodes, t)[:, inputs:]
+        made = {name: through([layer], hidden) for name, layer in layers.items()}
+        if limit > 0:
+            made["gaussian_scaling"] = np.tanh(made["gaussian_scaling"]) * np.float32(np.log(limit))
+        return made
 
-    parts = {
-        "means": stack("", "xyz"), "motion": stack("motion_", range(9)), "quats": stack("rot_", range(4)),
-        "omega": stack("omega_", range(4)), "scales": stack("scale_", range(3)), "opacities": stack("opacity", [""]),
-        "colors": stack("f_dc_", range(3)), "bell": stack("trbf_", ["center", "scale"]),
-    }  # fmt: skip
-    good = finite_rows(parts) & (np.abs(parts["quats"]).sum(axis=1) > 0) & (np.abs(parts["bell"][:, 1]) < 20)
-    parts = {name: values[good] for name, values in parts.items()}
-    center, width = parts["bell"][:, :1], np.exp(parts["bell"][:, 1:])
-    still = activated(parts)
+    def move(parts: Parts, t: float) -> Parts:
+        added, means = of_nodes(t), parts["means"]
 
-    def bare(t: float) -> Splats:
-        past = np.clip(t - center, -BELL_REACH * width, BELL_REACH * width)
-        powers = (past, past**2, past**3)
-        means = parts["means"] + sum(parts["motion"][:, 3 * i : 3 * i + 3] * x for i, x in enumerate(powers))
-        sh = (parts["colors"][:, None] - np.float32(0.5)) / np.float32(SH_C0)
-        quats = parts["quats"] + past * parts["omega"]
-        return checked(f"{path} at {t:g}", means, quats, still["scales"], still["opacities"][:, 0], sh)
+        def mean(values: np.ndarray) -> np.ndarray:
+            return np.asarray(np.einsum("nk,nk...->n...", parts["weights"], values[parts["nodes"]]))
 
-    return bare, np.concatenate([center, np.zeros_like(center), width / np.float32(2**0.5)], axis=1)
+        shift = mean(added["gaussian_warp"])
+        if "local_rotation" in added:  # turns what is around a node
+            turns = rotation_matrix(unit(added["local_rotation"] + np.array([1, 0, 0, 0], np.float32)))
+            around = mean(nodes - np.einsum("mab,mb->ma", turns, nodes))
+            shift = shift + np.einsum("nab,nb->na", mean(turns), means) + around - means
+        quats = parts["quats"] + mean(added["gaussian_rotation"]) * parts["share"]
+        scales = np.abs(parts["scales"] + mean(added["gaussian_scaling"]) * parts["share"])
+        kept = {name: parts[name] for name in ("opacities", "sh")}
+        return kept | {"means": means + shift * parts["share"], "quats": quats, "scales": scales}
+
+    return activated(rest) | {"nodes": rows, "weights": weights, "share": share}, move

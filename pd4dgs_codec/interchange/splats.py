@@ -1,6 +1,6 @@
 """Files of explicit Gaussians as in 3D Gaussian splatting, see `kinds.splats`, and pictures of them.
 
-Reads PLY, SPZ, .splat and gsplat checkpoints, which it tells apart by their content, and writes PLY, glTF, SPZ
+Reads PLY, SPZ, SOG, .splat and gsplat checkpoints, which it tells apart by their content, and writes PLY, glTF, SPZ
 and 4dgs. SPZ and compressed PLY need gaussforge, 4dgs needs fourdgs; the extra `interchange` installs both.
 """
 
@@ -28,6 +28,7 @@ from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, LARGEST, MAX_HEADER, r
 from pd4dgs_codec.data.view import world_to_camera
 from pd4dgs_codec.draw.rasteriser import draw
 from pd4dgs_codec.errors import DamageWarning, DataError, one_line, required
+from pd4dgs_codec.interchange.sog import META, read_sog
 from pd4dgs_codec.kinds.splats import MAX_DEGREE, SH_C0, Splats, unit
 from pd4dgs_codec.scene import Camera
 
@@ -52,13 +53,12 @@ SPZ_SCALE = float(np.exp(255 / 16 - 10))  #: the largest scale of an SPZ file, s
 SPZ_MAGIC, SPZ_MOST, SPZ_LEAST, SPZ_BYTES = b"NGSP", 10_000_000, 16, 128
 GZIP, ZIP, PICKLE = b"\x1f\x8b\x08", b"PK\3\4", b"\x80\x02\x8a"  #: first bytes of SPZ below version 4, of torch's files
 PACKED = b"\nproperty uint packed_position"  #: in the header of a compressed PLY
-KINDS = "a PLY, SPZ, .splat or .4dgs file or a checkpoint of gsplat"
+KINDS = "a PLY, SPZ, SOG, .splat, .splatv or .4dgs file or a checkpoint"
 #: Files of Gaussians that are not read: the first bytes, bytes that are in them, and what they are. The first of a
 #: .ksplat file, which has no signature, are its version.
 #: https://github.com/mkkellogg/GaussianSplats3D/blob/main/src/loaders/SplatBuffer.js
 NOT_READ = (
     (b"\0\1\0\0", bytes(2048), "a .ksplat file"),
-    (ZIP, b"means_l.webp", "a .sog file"),
     (b"glTF", b"KHR_gaussian_splatting", "a glTF file"),
 )
 #: A row of a .splat file: linear scales, and as 0..255 sRGB, opacity and a quaternion wxyz around 128.
@@ -136,26 +136,35 @@ def checked(
 ) -> Splats:
     """Returns the arrays as Splats with unit rotations. Drops Gaussians that are huge, invalid or not finite. Raises
     DataError for wrong shapes, or if no Gaussian is left."""
+    parts = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
+    return usable(where, parts)[0]
+
+
+def usable(where: str, parts: dict[str, np.ndarray], also: np.ndarray | bool = True) -> tuple[Splats, np.ndarray]:
+    """Returns (Splats as `checked` does, their rows bool [n]), without Gaussians for which `also` is false. parts: by
+    the names of Splats."""
+    means, sh = parts["means"], parts["sh"]
     n = len(means) if means.ndim else 0
     harmonics = sh.shape[-2] if sh.ndim == 3 else 1
     shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, harmonics, 3)}
-    parts = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
     for name, array in parts.items():
         if array.shape != shapes[name]:
             raise DataError(f"{where}: {name} has shape {array.shape}, expected {shapes[name]}")
     if sh.shape[1] - 1 not in REST:
         expected = ", ".join(str(k + 1) for k in REST)
         raise DataError(f"{where}: {sh.shape[1]} coefficients per colour, expected {expected}")
-    good = finite_rows(parts)
-    good &= (np.linalg.norm(quats, axis=1) > 0) & (scales >= 0).all(axis=1) & (opacities >= 0) & (opacities <= 1)
-    usable = f"finite and at most {LARGEST:g}, with a quaternion other than 0"
+    scales, opacities = parts["scales"], parts["opacities"]
+    good = np.asarray(finite_rows(parts) & also)
+    good &= (np.linalg.norm(parts["quats"], axis=1) > 0) & (scales >= 0).all(axis=1)
+    good &= (opacities >= 0) & (opacities <= 1)
+    wanted = f"finite and at most {LARGEST:g}, with a quaternion other than 0{'' if also is True else ', and a window'}"
     if not good.any():
-        raise DataError(f"{where}: none of {n} Gaussians is {usable}, expected one")
+        raise DataError(f"{where}: none of {n} Gaussians is {wanted}, expected one")
     if not good.all():
-        left = f"{n - np.count_nonzero(good):,} of {n:,} Gaussians are left out, expected all to be {usable}"
+        left = f"{n - np.count_nonzero(good):,} of {n:,} Gaussians are left out, expected all to be {wanted}"
         warnings.warn(DamageWarning(f"{where}: {left}"), stacklevel=2)
     kept = {name: np.ascontiguousarray(array[good], np.float32) for name, array in parts.items()}
-    return Splats(**kept | {"quats": unit(kept["quats"])})
+    return Splats(**kept | {"quats": unit(kept["quats"])}), good
 
 
 def finite_rows(parts: dict[str, np.ndarray]) -> np.ndarray:
@@ -183,16 +192,26 @@ def quiet() -> Iterator[None]:
                 os.close(old)
 
 
-def read_splats(path: Path, raw: bytes | None = None) -> Splats:
-    """Reads a PLY file of 3D Gaussian splatting, a compressed PLY, an SPZ or .splat file, or a checkpoint of gsplat,
-    whatever its name. raw: its bytes, if known. Raises DataError."""
+def read_splats(path: Path, raw: bytes | None = None, content: Any = None) -> Splats:
+    """Reads a PLY file of 3D Gaussian splatting, a compressed PLY, an SPZ, SOG or .splat file, or a checkpoint of
+    gsplat, whatever its name. raw: its bytes, if known; content: its `torch_content`. Raises DataError."""
     raw = read_file(path) if raw is None else raw
     for first, inside, kind in NOT_READ:
         if raw.startswith(first) and inside in raw:
             raise DataError(f"{path}: is {kind}, expected {KINDS}: convert it to PLY first")
-    if raw.startswith((ZIP, PICKLE)):
-        return _read_gsplat(path, raw)
+    if raw.startswith(ZIP) and META in raw:
+        return checked(str(path), **read_sog(path, raw))
+    content = torch_content(path, raw) if content is None else content
+    if content is not None:
+        return _read_gsplat(path, content)
     return checked(str(path), **activated(read_parameters(path, raw)))
+
+
+def torch_content(path: Path, raw: bytes) -> Any:
+    """Returns what a file of torch holds, None for others. Raises DataError."""
+    if not raw.startswith((ZIP, PICKLE)) or raw.startswith(ZIP) and META in raw:
+        return None
+    return read_tensors(raw, str(path))
 
 
 def read_parameters(path: Path, raw: bytes | None = None) -> dict[str, np.ndarray]:
@@ -297,9 +316,8 @@ def _check_spz(path: Path, data: bytes) -> None:
         raise DataError(f"{path}: unpacks to {size:,} bytes, too few for the {count:,} Gaussians that it declares")
 
 
-def _read_gsplat(path: Path, raw: bytes) -> Splats:
+def _read_gsplat(path: Path, content: Any) -> Splats:
     """Reads a checkpoint of gsplat's trainers, {"splats": state dict}. Raises DataError."""
-    content = read_tensors(raw, str(path))
     state = content.get("splats") if isinstance(content, dict) else None
     wanted = ("means", "quats", "scales", "opacities", "sh0", "shN")
     missing = [name for name in wanted if not isinstance(state, dict) or not isinstance(state.get(name), np.ndarray)]

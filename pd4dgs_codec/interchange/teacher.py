@@ -1,10 +1,10 @@
 """Renders other programs' Gaussians over time into a dataset: the source `teacher:PATH[?key=value&...]`.
 
-PATH is a folder of PLY, SPZ or .splat files, one per frame, in the order of the last number in their names, or one such
-file; a `.4dgs` file; a PLY file of SpacetimeGaussians (lite); a static gsplat checkpoint; a run of 3D Gaussian
-splatting, 4DGaussians or Deformable-3DGS or one of its `point_cloud/iteration_N`; or `module:function`, called with t
-in 0..1. The function returns means, quats (wxyz), scales, opacities and either colors or sh, as a mapping or as
-attributes, numpy arrays or tensors.
+PATH is a folder of PLY, SPZ, SOG or .splat files, one per frame, in the order of the last number in their names, or
+one such file; a `.4dgs` or `.splatv` file; a PLY file of SpacetimeGaussians (lite); a checkpoint of gsplat or 4DGS; a
+run of 3D Gaussian splatting, 4DGaussians, Deformable-3DGS or SC-GS or one of its `point_cloud/iteration_N`, or of 4DGS;
+or `module:function`, called with t in 0..1. The function returns means, quats (wxyz), scales, opacities and either
+colors or sh, as a mapping or as attributes, numpy arrays or tensors.
 
 Keys: cameras=SOURCE uses the training cameras of a dataset and their times. Otherwise views=N cameras (200) of
 size=WxH pixels (400x400) surround the Gaussians; a `cameras.json` beside them gives at most N cameras instead. fps=F
@@ -22,24 +22,23 @@ import struct
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pd4dgs_codec.data.dataset import color, load
-from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, MAX_HEADER, files_of, last_numbers, read_file, split_options
+from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, files_of, last_numbers, read_file, split_options
 from pd4dgs_codec.data.view import Dataset, View, depth_range, held_out, normalised_times, points_box, seconds_range
 from pd4dgs_codec.errors import DataError, one_line, required
+from pd4dgs_codec.interchange import polynomials
 from pd4dgs_codec.interchange.runs import (
     PLY,
-    SPACETIME,
     Config,
     iteration,
     read_cameras,
     read_deformed,
-    read_spacetime,
     run_of,
 )
 from pd4dgs_codec.interchange.splats import (
@@ -51,13 +50,14 @@ from pd4dgs_codec.interchange.splats import (
     picture,
     read_splats,
     sphere,
+    torch_content,
 )
-from pd4dgs_codec.kinds.splats import SH_C0, Splats, visible
+from pd4dgs_codec.kinds.splats import SH_C0, Splats
 from pd4dgs_codec.quality.frames import shrunk
 from pd4dgs_codec.scene import Camera
 
 PREFIX = "teacher:"
-FRAME_SUFFIXES = (".ply", ".spz", ".splat")
+FRAME_SUFFIXES = (".ply", ".spz", ".sog", ".splat")
 FOURDGS = b"\x894DGS"  #: a .4dgs file begins with it
 #: Keys of a function's result, which has colors instead of sh if there are no harmonics.
 PARTS = ("means", "quats", "scales", "opacities", "sh")
@@ -226,24 +226,28 @@ class Teacher:
         return t if self.times is None else min(self.times, key=lambda known: abs(known - t))
 
 
-def read_model(place: str, fps: float) -> Teacher:
-    """Reads the teacher at a path or `module:function`. fps: frames per second of a folder. Raises DataError."""
+def read_model(place: str, fps: float, seconds: float | None = None) -> Teacher:
+    """Reads the teacher at a path or `module:function`. fps: frames per second of a folder. seconds: the duration of a
+    model that does not say it. Raises DataError."""
     path = Path(place)
     if path.is_dir():
+        if last := polynomials.last_checkpoint(path):
+            return read_model(str(last), fps, seconds)
         run = read_deformed(path)
         return Teacher(run[0], None, 1.0, run[1]) if run else _still_run(path) or _folder(path, fps)
     if path.is_file():
         raw = read_file(path)
         if raw.startswith(FOURDGS):
             return _fourdgs(path, raw)
-        if SPACETIME in raw[:MAX_HEADER]:
-            return _spacetime(path, raw)
-        splats = read_splats(path, raw)
+        content = torch_content(path, raw)
+        if moving := polynomials.read(path, raw, content, seconds):
+            return replace(_moving(*moving), background=Config.of(path.parent).background)
+        splats = read_splats(path, raw, content)
         return Teacher(lambda t: splats, (0.0,), 1.0)
     if match := re.fullmatch(r"([A-Za-z_][\w.]*):([A-Za-z_]\w*)", place):
         return Teacher(_function(*match.groups()), None, 1.0)
     raise DataError(
-        f"{place}: found nothing, expected a folder of PLY, SPZ or .splat files, a run, a file, or module:function"
+        f"{place}: found nothing, expected a folder of PLY, SPZ, SOG or .splat files, a run, a file, or module:function"
     )
 
 
@@ -257,15 +261,12 @@ def _still_run(folder: Path) -> Teacher | None:
     return replace(read_model(str(place / PLY), 1.0), background=Config.of(run_of(place)).background)
 
 
-def _spacetime(path: Path, raw: bytes) -> Teacher:
-    """Reads a PLY file of SpacetimeGaussians."""
-    bare, windows = read_spacetime(path, raw)
-
-    def splats(t: float) -> Splats:
-        found = bare(t)
-        return replace(found, opacities=found.opacities * visible(windows, t))
-
-    return Teacher(splats, None, 1.0, windows=windows, bare=bare)
+def _moving(paths: polynomials.Paths, seconds: float) -> Teacher:
+    """Returns a model of polynomials and windows. Windows that show all Gaussians at all times are left out."""
+    (center, half, _), bare = paths.windows.T, partial(paths.splats, bare=True)
+    if (half >= np.maximum(center, 1 - center)).all():
+        return Teacher(bare, None, seconds)
+    return Teacher(paths.splats, None, seconds, windows=paths.windows, bare=bare)
 
 
 def _folder(folder: Path, fps: float) -> Teacher:
@@ -294,28 +295,35 @@ def _fourdgs(path: Path, data: bytes) -> Teacher:
         raise DataError(f"{path}: more than {most:,} numbers in a file of {len(data):,} bytes")
     try:
         with np.errstate(all="ignore"):  # `checked` drops Gaussians that are not finite
-            scene = fourdgs.read(data)
+            scene = fourdgs.read(data, recover_truncated=False)
     except (fourdgs.FourdgsError, ValueError, MemoryError, OSError) as error:
         raise DataError(f"{path}: fourdgs cannot read it: {one_line(str(error), 160)}") from None
-    g, seconds, cutoff = scene.gaussians, float(scene.header.duration_sec), float(scene.header.cutoff)
+    g, seconds = scene.gaussians, float(scene.header.duration_sec)
+
+    def parts(rows: np.ndarray | slice) -> dict[str, np.ndarray]:
+        colors = g.colors[rows]
+        sh = [(colors[:, None, :3] - 0.5) / SH_C0]
+        if g.sh is not None and g.sh_degree:
+            flat = g.sh[rows].astype(np.float32) * (2 * SH_SPAN / 255) - SH_SPAN
+            sh.append(flat.reshape(len(flat), 3, flat.shape[1] // 3).transpose(0, 2, 1))
+        quats, harmonics = g.rotations[rows][:, [3, 0, 1, 2]], np.concatenate(sh, axis=1)
+        return dict(zip(PARTS, (g.positions[rows], quats, g.scales[rows], colors[:, 3], harmonics), strict=True))
 
     def splats(t: float) -> Splats:
         with np.errstate(all="ignore"):
-            state = g.state_at(min(t, 1 - 1e-6) * seconds, cutoff)  # the end itself is no longer shown
-        rows = state["indices"]
-        sh = [(g.colors[rows, None, :3] - 0.5) / SH_C0]
-        if g.sh is not None and g.sh_degree:
-            flat = g.sh[rows].astype(np.float32) * (2 * SH_SPAN / 255) - SH_SPAN
-            sh.append(flat.reshape(len(rows), 3, flat.shape[1] // 3).transpose(0, 2, 1))
-        return checked(
-            f"{path} at {t:g}",
-            means=state["centers"],
-            quats=g.rotations[rows][:, [3, 0, 1, 2]],
-            scales=g.scales[rows],
-            opacities=state["opacity"],
-            sh=np.concatenate(sh, axis=1),
-        )
+            state = scene.state_at(min(t, 1 - 1e-6) * seconds)  # the end itself is no longer shown
+        quats = state["orientations"][:, [3, 0, 1, 2]]
+        moved = {"means": state["centers"], "quats": quats, "opacities": state["opacity"]}
+        return checked(f"{path} at {t:g}", **parts(state["indices"]) | moved)
 
+    if not scene.objects and 1e-6 < seconds < 1e6:
+        with np.errstate(all="ignore"):
+            bell, interval = np.stack([g.mu_t, g.sigma_t], axis=1), np.stack([g.win_lo, g.win_hi], axis=1)
+            paths = polynomials.read_lines(
+                str(path), parts(slice(None)), g.motions * seconds, bell / seconds, interval / seconds
+            )
+        if paths:
+            return replace(_moving(paths, seconds), splats=splats)
     return Teacher(splats, None, seconds, varies=True)
 
 

@@ -8,8 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from teachers import Deformable, FourD
+from teachers import Deformable, FourD, Nodes
 from test_kinds import splat_bytes
+from test_polynomials import checkpoint, splatv
+from test_sog import archive, made
 from test_splats import gsplat_state, make_splats
 
 from pd4dgs_codec.errors import DataError
@@ -70,6 +72,11 @@ def _run(path: Path) -> Splats:
         ("mlp.pt", _script, read_torch),
         ("run/point_cloud/iteration_7/deformation.pth", lambda path: FourD(SPLATS).save(path.parents[2], SPLATS), _run),
         ("run/deform/iteration_7/deform.pth", lambda path: Deformable(SPLATS).save(path.parents[2], SPLATS), _run),
+        ("nodes/deform/iteration_7/deform.pth", lambda path: Nodes(SPLATS, 4).save(path.parents[2], SPLATS), _run),
+        ("nodes/point_cloud/iteration_7/point_cloud.ply", lambda p: Nodes(SPLATS, 4).save(p.parents[2], SPLATS), _run),
+        ("chkpnt7.pth", lambda path: checkpoint(path, 9), _model),
+        ("a.splatv", lambda path: path.write_bytes(splatv(9)[0]), _model),
+        ("a.sog", lambda path: path.write_bytes(archive(*made(1)[:2])), read_splats),
         ("a.ply", lambda path: path.write_bytes(ply_bytes(SPLATS)), read_splats),
         ("a.splat", lambda path: path.write_bytes(splat_bytes(SPLATS)), read_splats),
         ("a.spz", lambda path: path.write_bytes(spz_bytes(SPLATS)), read_splats),

@@ -1,5 +1,5 @@
-"""Runs in the layouts of 4DGaussians and Deformable-3DGS, against the plain torch modules of `benchmarks/teachers.py`,
-which follow the published formulas."""
+"""Runs in the layouts of 4DGaussians, Deformable-3DGS and SC-GS, against the plain torch modules of
+`benchmarks/teachers.py`, which follow the published formulas."""
 
 import json
 from pathlib import Path
@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from teachers import Deformable, FourD, ball, fit
+from teachers import Deformable, FourD, Nodes, ball, fit
 from test_splats import make_splats
 from tiny import TINY
 from torch import nn
@@ -27,7 +27,7 @@ def _covariances(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
     return factor @ factor.transpose(0, 2, 1)
 
 
-def _same(place: Path, model: FourD | Deformable) -> None:
+def _same(place: Path, model: FourD | Deformable | Nodes) -> None:
     teacher = read_model(str(place), 30)
     assert teacher.times is None and teacher.seconds == 1
     moved = []
@@ -70,6 +70,24 @@ def test_deformable_3dgs_follows_the_published_formulas(tmp_path, is_blender, is
     model = Deformable(splats := make_splats(), is_blender, is_6dof)
     _same(model.save(tmp_path / "run", splats), model)
     _same(tmp_path / "run" / "point_cloud" / "iteration_7", model)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"is_blender": True},
+        {"local_frame": True, "gs_with_motion_mask": True},
+        {"K": 1, "coordinates": 0, "max_d_scale": 1.5},
+        {"K": 5, "is_blender": True, "coordinates": 8, "local_frame": True},
+    ],
+    ids=lambda options: ",".join(options),
+)
+def test_sc_gs_follows_the_published_formulas(tmp_path, options, monkeypatch):
+    monkeypatch.setattr(runs, "ROWS", 16)  # of 40
+    torch.manual_seed(3)
+    model = Nodes(splats := make_splats(), **options)
+    model.network.gaussian_warp.weight.data *= 4
+    _same(model.save(tmp_path / "run", splats), model)
 
 
 def test_the_last_iteration_and_the_background_of_the_run(tmp_path):
@@ -136,6 +154,18 @@ BROKEN = {
         ("branch_w.weight", torch.ones(3, 64), "has no tensor branch_w.bias"),
         ("gaussian_rotation.bias", torch.full((4,), np.inf), "gaussian_rotation.bias holds a NaN or"),
     ],
+    (Nodes, "deform/iteration_7/deform.pth"): [
+        ("nodes", torch.ones(5, 9), r"nodes .5, 9., 2 features in the PLY file, K=3, expected at most 4096, 3 and"),
+        ("nodes", torch.ones(5000, 5), r"nodes .5000, 5., 2 features"),
+        ("nodes", torch.ones(2, 5), r"nodes .2, 5., 2 features in the PLY file, K=3, expected .* 1 to 2"),
+        ("nodes", torch.full((20, 5), torch.nan), "nodes holds a NaN"),
+        ("_node_radius", torch.ones(7), r"_node_radius has shape \(7,\), expected \(20\)"),
+        ("_node_weight", None, "has no tensor _node_weight"),
+        ("network.gaussian_warp.weight", torch.ones(3, 9), r"gaussian_warp.weight has shape \(3, 9\)"),
+        ("network.linear.0.weight", None, "has no tensor network.linear.0.weight"),
+        ("network.hashgrid.encoding.params", torch.ones(3), "has network.hashgrid.encoding.params, which no published"),
+        ("network.gaussian_color.0.weight", torch.ones(3), "has network.gaussian_color.0.weight, which no published"),
+    ],
 }  # fmt: skip
 
 
@@ -173,6 +203,23 @@ def test_broken_runs_are_one_line(tmp_path, file, content, message):
         read_model(str(run), 30)
 
 
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        (b"K=many", "K is many, expected a number"),
+        (b"L=3", "K is missing, expected a number"),
+        (b"K=2.5", "K=2.5, expected at most 4096, 3 and the features, 1 to 16"),
+        (b"K=1e99", "K=1e.99, expected at most"),
+        (b"K=3, max_d_scale=all", "max_d_scale is all, expected a number"),
+    ],
+)
+def test_options_of_sc_gs_that_do_not_fit(tmp_path, options, message):
+    run = Nodes(make_splats()).save(tmp_path / "run", make_splats())
+    (run / "cfg_args").write_bytes(b"Namespace(" + options + b")")
+    with pytest.raises(DataError, match=message):
+        read_model(str(run), 30)
+
+
 def test_options_of_older_runs(tmp_path):
     """They have neither no_dx nor no_dshs, and a static_mlp that only their first stage uses."""
     model = FourD(splats := make_splats())
@@ -183,7 +230,7 @@ def test_options_of_older_runs(tmp_path):
     _same(run, model)
 
 
-@pytest.mark.parametrize("kind", [FourD, Deformable])
+@pytest.mark.parametrize("kind", [FourD, Deformable, Nodes])
 def test_import_says_how_to_learn_from_them(tmp_path, cli, kind):
     run = kind(make_splats()).save(tmp_path / "run", make_splats())
     result = cli("import_model", run, "-o", tmp_path / "model.pt")

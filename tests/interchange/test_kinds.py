@@ -177,9 +177,10 @@ def checkpoint(path: Path) -> bytes:
         lambda path: spz_bytes(SPLATS),
         lambda path: packed("compressed.ply"),
         checkpoint,
+        lambda path: packed("sog"),
         lambda path: fourdgs_bytes([(0.0, SPLATS, np.arange(60))], 1.0),
     ],
-    ids="spz compressed 4dgs gsplat".split(),
+    ids="spz compressed gsplat sog 4dgs".split(),
 )
 def test_the_content_of_other_kinds_counts_not_the_name(tmp_path, make: Callable[[Path], bytes]):
     pytest.importorskip("gaussforge")
@@ -211,12 +212,11 @@ POINTS = {name: COLUMNS[name] for name in "xyz"}
         (ply(head=("element vertex -1",)), "found 'element vertex -1', expected a name and a count"),
         (ply().replace(b"element vertex", b"element point"), "and no element vertex; expected ascii"),
         (ply(head=("comment " + "x" * 70_000,)), "has no line end_header, expected 'ply' and a header of 65,536 bytes"),
-        (packed("ksplat"), r"a\.bin: is a \.ksplat file, expected a PLY, SPZ, \.splat or .*: convert it to PLY first"),
-        (packed("sog"), r"is a \.sog file, expected a PLY, SPZ"),
+        (packed("ksplat"), r"a\.bin: is a \.ksplat file, expected a PLY, SPZ, SOG, .*: convert it to PLY first"),
         (glb_bytes(SPLATS), "is a glTF file, expected a PLY, SPZ"),
         (
             b"\0\1\0\0" + bytes(60),
-            r"begins with b'\\x00\\x01.*' and is of no known kind, expected a PLY, SPZ, .splat or",
+            r"begins with b'\\x00\\x01.*' and is of no known kind, expected a PLY, SPZ, SOG, .spl",
         ),
         (b"", "begins with b'' and is of no known kind"),
         (bytes(64), "is of no known kind"),

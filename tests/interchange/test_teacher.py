@@ -215,7 +215,7 @@ def test_an_instant_without_gaussians_is_one_line(tmp_path):
         ("teacher:{folder}?colour=red", "found 'colour=red', expected each of cameras, views"),
         ("teacher:{folder}?views=1", "views is '1'; expected for example views=200, 2 to 100000"),
         ("teacher:{folder}?size=9", "size is '9'"),
-        ("teacher:{empty}", "holds no file that ends in .ply, .spz, .splat"),
+        ("teacher:{empty}", "holds no file that ends in .ply, .spz, .sog, .splat"),
         ("teacher:{rest}", "has 10 properties f_rest_"),
         ("teacher:{plain}", "is a point cloud without f_dc_0"),
         ("teacher:{nan}", "none of 40 Gaussians is finite"),
