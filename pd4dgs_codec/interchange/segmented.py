@@ -258,9 +258,18 @@ class Continued(Ordered):
 
 
 class SegmentPacker(Packer):
-    """Packs what a segment's base lacks. behind: the Gaussians of the base before they were coded."""
+    """Packs what a segment's base lacks. behind: the Gaussians of the base before they were coded. theta: about that of
+    the scene, by which Gaussians are grouped."""
 
-    def __init__(self, source: Sampled, behind: Splats, base: SplatScene, cameras: Sequence[Camera], info: SceneInfo):
+    def __init__(
+        self,
+        source: Sampled,
+        behind: Splats,
+        base: SplatScene,
+        cameras: Sequence[Camera],
+        info: SceneInfo,
+        theta: float,
+    ):
         self.info, self.key, self.base = info, len(source.times) // 2, base
         self.source = source = _canonical(source, self.key)
         weights = sensitivity(Pictures(Backed(source, cameras, behind), info.background, info.near))
@@ -269,8 +278,9 @@ class SegmentPacker(Packer):
         size, own = base.info.voxel_size, {name: h[len(behind.means) :] for name, h in weights.items()}
         found = Ordered.of(source.frame(self.key), own, lambda at: (size, cells_of(at, size, base.anchor_q)))
         self.ordered: Continued = Continued(**vars(found), base=base)
-        self.changes = self._changes() if len(found.rows) else {}
-        self.grouping = None
+        self.changes, self.grouping = self._changes() if len(found.rows) else {}, None
+        if self.changes:
+            self.grouping = Grouping.of(self.changes, place(found.values["position"], info.box), theta)
 
     def on(self, base: SplatScene) -> SegmentPacker:
         """Returns the packer for the same base with other steps."""
@@ -279,9 +289,6 @@ class SegmentPacker(Packer):
         return found
 
     def _scene(self, theta: float, error: float) -> SplatScene:
-        if self.changes and not self.grouping:
-            places = place(self.ordered.values["position"], self.info.box)
-            self.grouping = Grouping.of(self.changes, places, theta)
         base = replace(self.base, info=replace(self.info, voxel_size=self.base.info.voxel_size))
         return joined(base, super()._scene(theta, error)) if len(self.ordered.rows) else base
 
@@ -492,15 +499,16 @@ class _Writer:
         precise = None if self.reach is None else PRECISE / int(np.diff(self.cuts).max())
         packer = BasePacker(still, views, len(self.cameras), self._info(a, b), precise)
         error = 10 ** (-self.psnr / 10)
-        scene, source = packer._scene(error / packer.scalars, error), self.samples(own[0], still)
-        first = SegmentPacker(source, still.mean, scene, self.cameras, self._info(a, self.cuts[own[0] + 1]))
+        guess, source = error / packer.scalars, self.samples(own[0], still)
+        info = self._info(a, self.cuts[own[0] + 1])
+        first = SegmentPacker(source, still.mean, packer._scene(guess, error), self.cameras, info, guess)
 
         def build(theta: float) -> tuple[tuple[float, SplatScene], float]:
             scene = packer._scene(theta, error)
             here = first.on(scene)
             return (theta, scene), here._error(here._scene(theta, error))
 
-        theta, scene = matched(build, self.psnr, error / packer.scalars)
+        theta, scene = matched(build, self.psnr, guess)
         data, _ = encode_with_report(scene)
         return with_metadata(data, self.about)[0], theta
 
@@ -521,7 +529,7 @@ class _Writer:
         if data is None:
             source = self.samples(k, still)
             if group and still:
-                packer: Packer = SegmentPacker(source, still.mean, group.scene, self.cameras, info)
+                packer: Packer = SegmentPacker(source, still.mean, group.scene, self.cameras, info, group.theta)
                 scene = packer._scene(group.theta, 10 ** (-self.psnr / 10))
             else:
                 packer = Packer(source, self.cameras, info, lambda: None)
