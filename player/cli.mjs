@@ -5,8 +5,10 @@ import { readFileSync } from "node:fs";
 
 import { DecodeError, hashes } from "./decode/index.js";
 
-const USAGE = `usage: node player/cli.mjs hashes FILE [BASE]    SHA-256 of each layer's integers and float32 tensors, as JSON
-FILE - reads stdin. BASE: the file that FILE names as its base. Exit: 0 ok, 1 bad data or I/O, 2 usage.
+const USAGE = `usage: node player/cli.mjs hashes FILE [BASE]
+
+SHA-256 of each layer's integers and float32 tensors, as JSON. BASE: the file that FILE names as its base.
+FILE - reads stdin. Exit: 0 ok, 1 bad data or I/O, 2 usage.
 `;
 
 /** @param {string[]} args @returns {number} the exit code */

@@ -25,8 +25,8 @@ export { Stream } from "./stream.js";
 /** @typedef {import("./errors.js").ErrorKind} ErrorKind */
 
 /** maxLayer: bytes behind the layers up to it are not looked at. allowPartial: a cut file, which raises Truncated, yields
- * its longest prefix of complete slices, at least one, or its base alone. base: of a file that names one (clause 5.6): the
- * bytes of that file, or what `readBase` made of them.
+ * its longest prefix of complete slices, at least one, or its base alone. base: of a file that names one (clause 5.6), the
+ * bytes, or what `readBase` made of them.
  * @typedef {{maxLayer?: number | null, allowPartial?: boolean, base?: import("./reader.js").GivenBase}} Options */
 
 /** @param {Uint8Array | ArrayBuffer} bytes */

@@ -58,8 +58,8 @@ export function readAll(bytes, { maxLayer = null, allowPartial = false, base = n
 
 /** The layer 0 of a file, decoded once for all files whose base it is (5.6). */
 export class Base {
-  /** Raises DecodeError, Malformed if the file cannot be a base. @param {Uint8Array} bytes of the file, at least up to the
-   * end of its layer 0 */
+  /** Raises DecodeError, Malformed if the file cannot be a base. @param {Uint8Array} bytes of the file, up to the end of
+   * its layer 0 or more */
   constructor(bytes) {
     const packed = readPreamble(bytes);
     if (readHeader(packed).base) throw malformed("the base names a base itself");
@@ -101,7 +101,7 @@ export class Base {
       throw new DecodeError("BaseMismatch", `${wanted}, the base given is another one, of scene ${header.sceneId}`);
     }
     if (named.rows !== base.rows || named.bytes !== base.bytes) {
-      throw malformed(`header: a base of ${named.rows} rows and ${named.bytes} bytes, it has ${base.rows} and ${base.bytes}`);
+      throw malformed(`header: a base of ${named.rows} rows and ${named.bytes} bytes, not ${base.rows} and ${base.bytes}`);
     }
     const same = [header.kind, header.rows, header.centres, header.info.voxelSize];
     if (JSON.stringify([kind, rows, centres, voxelSize]) !== JSON.stringify(same)) {
@@ -349,13 +349,15 @@ export class TensorReader {
     this._loose = [];
     for (let i = 0; i < voxels.length; i += 3) {
       const x = voxels[i], y = voxels[i + 1], z = voxels[i + 2];
-      if (this._taken.has(x, y, z) || this._base?.taken.has(x, y, z)) throw malformed(`voxel ${x} ${y} ${z} holds more than one anchor`);
+      if (!this._taken.has(x, y, z) && !this._base?.taken.has(x, y, z)) continue;
+      throw malformed(`voxel ${x} ${y} ${z} holds more than one anchor`);
     }
   }
 
   /**
-   * The tensors of the slices read so far, at least one, or of the base. Arrays of rows are views of those of later tensors, which leave
-   * these rows as they are; those of a layer that is not whole stand as they came, unless `sort` was called.
+   * The tensors of the slices read so far, at least one, or of the base. Arrays of rows are views of those of later
+   * tensors, which leave these rows as they are; those of a layer that is not whole stand as they came, unless `sort`
+   * was called.
    *
    * @returns {Tensors}
    */
