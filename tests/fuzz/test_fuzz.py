@@ -258,7 +258,7 @@ def test_a_process_that_ends_or_gets_stuck_while_the_run_goes_on(monkeypatch, tm
         return check.Answer("decoded", case.meaning)
 
     monkeypatch.setattr(fuzz, "check_package", examine)
-    monkeypatch.setattr(fuzz, "check_memory", lambda data: 0.0)
+    monkeypatch.setattr(fuzz, "check_memory", lambda data, base: 0.0)
     monkeypatch.setattr(fuzz, "seeds", lambda paths: seeds())
     monkeypatch.setattr(fuzz, "STUCK_SECONDS", 3.0 if kind == "stuck" else 300.0)
     command = ["--inputs", "30", "--seed", "5", "--decoders", "python", "--out", str(tmp_path)]
