@@ -6,6 +6,7 @@
     data = encode(scene)                    # a Scene or SplatScene -> bytes of a .pd4 file
     stream = open_stream()                  # stream.feed(bytes) -> a scene per layer it adds to
     decode_tensors("scene.pd4")             # arrays by layer, form and id, whatever the kind of the scene
+    decode(segment, base=read_base(file))   # a file that adds to layer 0 of another one
     show(scene)                             # in a notebook: the player
     sample()                                # the path of a scene that comes with the package
 
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
     from pd4dgs_codec.format.decoder import decode, open_stream
     from pd4dgs_codec.format.encoder import encode
     from pd4dgs_codec.format.info import FORMAT_VERSION
-    from pd4dgs_codec.format.reader import decode_tensors
+    from pd4dgs_codec.format.reader import decode_tensors, read_base
     from pd4dgs_codec.kinds.splats import SplatScene
     from pd4dgs_codec.scene import Camera, Scene
     from pd4dgs_codec.web.page import show
@@ -35,6 +36,7 @@ __all__ = [
     "decode_tensors",
     "encode",
     "open_stream",
+    "read_base",
     "render",
     "sample",
     "show",
@@ -49,6 +51,7 @@ _HOMES = {
     "decode_tensors": "pd4dgs_codec.format.reader",
     "encode": "pd4dgs_codec.format.encoder",
     "open_stream": "pd4dgs_codec.format.decoder",
+    "read_base": "pd4dgs_codec.format.reader",
     "render": "pd4dgs_codec.draw",
     "show": "pd4dgs_codec.web.page",
 }

@@ -111,6 +111,14 @@ class Malformed(DecodeError):
     """A rule of the format is broken."""
 
 
+class BaseMissing(DecodeError):
+    """The file holds only what it adds to its base, the layer 0 of another file, and no base was given."""
+
+
+class BaseMismatch(DecodeError):
+    """The base that was given is not the one that the file names."""
+
+
 class LimitExceeded(DecodeError):
     """A declared count or size is over the format's limits; nothing was allocated for it."""
 

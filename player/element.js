@@ -146,6 +146,8 @@ export class Pd4Player extends HTMLElement {
     /** @type {Orbit | null} */
     this._orbit = null;
     this._timer = 0;
+    /** Of a segment, that is told. */
+    this._problem = "";
 
     this._play.addEventListener("click", () => this.toggle());
     this._slider.addEventListener("input", () => this.seek(Number(this._slider.value)));
@@ -296,7 +298,7 @@ export class Pd4Player extends HTMLElement {
 
   /** @param {string} name @param {any} detail */
   _react(name, detail) {
-    if (name === "error") this._say(detail.message);
+    if (name === "error" && detail.segment === undefined) this._say(detail.message); // else when its time comes
     if (name === "firstpicture") this._showPoster();
     if (name === "statechange" || name === "timeupdate") this._showState();
     if (name !== "timeupdate") this._showStatus();
@@ -349,12 +351,15 @@ export class Pd4Player extends HTMLElement {
   _showStatus() {
     const player = this._player;
     if (!player) return;
-    const { bytes, total, ends, level, levels, fps, scale, software, lost } = player.status;
+    const { bytes, total, ends, level, levels, fps, scale, software, lost, problem, awaited } = player.status;
     if (lost !== (this._error.textContent === LOST)) this._say(lost ? LOST : "");
+    if (problem !== this._problem) this._say(problem);
+    this._problem = problem;
     if (this._bar.hidden) return;
     const drawn = level !== null;
     const { layer: last, end } = ends[ends.length - 1] ?? { layer: levels[levels.length - 1], end: total };
     const parts = bytes ? [`${drawn ? `level ${level} of ${last}, ` : ""}${sizes(bytes, end)}`] : [];
+    if (awaited) parts.push(`waiting for ${awaited[0].toFixed(1)} to ${awaited[1].toFixed(1)} s`);
     if (fps) parts.push(`${fps.toFixed(fps < 9.5 ? 1 : 0)} fps`);
     const fewer = scale < 1 ? `${SIZE_NAMES[SCALES.indexOf(scale)]} size: ` : "";
     if (drawn && (software || fewer)) parts.push(fewer + (software ? "no GPU found" : "drawing is slow"));

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
 """The reference decoder of the `.pd4` format 4.0-draft, written from spec/format.md with the standard library alone.
 
-    python -I -S spec/refdec.py FILE
+    python -I -S spec/refdec.py FILE [BASE]
 
-prints the hashes of clause 12.4 as JSON. Faults give one line, `name: what`, and exit code 1. Above the functions
-stand the clauses they follow, in the specification's words. It is meant to be read, not to be fast. One file, so that
-it can be carried alone. It yields tensors and knows no kinds (clause 13).
+prints the hashes of clause 12.4 as JSON. BASE is the base of FILE (5.6), if it has one. Faults give one line, `name:
+what`, and exit code 1. Above the functions stand the clauses they follow, in the specification's words. It is meant to
+be read, not to be fast. One file, so that it can be carried alone. It yields tensors and knows no kinds (clause 13).
 """
 # ruff: noqa: B905  (lengths agree by construction; strict= would only lengthen the lines)
 
@@ -213,13 +213,14 @@ def read_preamble(data):
     reader.take({0xDE: 3, 0xDF: 5}.get(header[0], 1))  # the head of the map
     for _ in ("key 1", "the chunk list"):
         msgpack(reader, 1)
-    return fields_of, hashlib.sha256(reader.take(reader.left)).digest()[:8], 20 + size
+    fields_of["identity"] = reader.take(reader.left)
+    return fields_of, hashlib.sha256(fields_of["identity"]).digest()[:8], 20 + size
 
 
 # 5.1 Header map: "The time at 1 MUST NOT precede the time at 0, the background MUST lie in 0..1"
 # 5.5 Digest: "The first 16 bytes of the SHA-256 of the payloads of all critical chunks that were encoded together"
 def read_header(data):
-    header = fields(unpack(data), range(1, 15), (1, 2, 3, 4, *range(6, 13), 14), "header")
+    header = fields(unpack(data), range(1, 16), (1, 2, 3, 4, *range(6, 13), 14), "header")
     read_chunk_list(header[1], registered(header[2], "the coding mode"))
     read_kind(header[3])
     read_scalars(header)
@@ -235,7 +236,17 @@ def read_header(data):
     if 13 in header:
         read_camera(header[13])
     need(type(header[14]) is bytes and len(header[14]) == 16, "the digest of the layers is not 16 bytes")
+    if 15 in header:
+        read_reference(header[15])
     return header
+
+
+# 5.6 Base: "The key holds the base's scene id (3.3), its digest, the number b of its rows, 0..2^24, and the number P"
+def read_reference(value):
+    *names, rows, size = a_list(value, "the base", 4)
+    need([type(v) is bytes and len(v) for v in names] == [8, 32], "not a scene id of 8 and a digest of 32 bytes")
+    limited(rows, 1 << 24, "the base's rows")
+    limited(size, MAX_LENGTH, "the base's bytes", 1)
 
 
 # 5.2 Chunk list: "The first type MUST be 0; the types of layers among all entries MUST NOT descend."
@@ -339,6 +350,7 @@ class Layer:
         return self.symbols["class"][0] if self.header["graded"] else [0] * self.rows
 
     # 6.2 Layer parameters: "Later slices have none of keys 4 to 7, else Malformed."
+    # 5.6 Base: "Layer 0 of a file with a base has none of layer keys 4 to 7, else Malformed"
     def read_parameters(self, data, rows_before):
         """The length of the codes."""
         parameters = fields(unpack(data), range(1, 8), (1, 2), "layer parameters")
@@ -346,7 +358,8 @@ class Layer:
         length = limited(parameters[2], MAX_LENGTH, "the length of the codes")
         if 3 in parameters:
             integers(a_list(parameters[3], "the fill", 3), 255, "a colour of the fill")
-        need(not (self.later and {4, 5, 6, 7} & set(parameters)), "tables or a kind in a later slice")
+        bare = self.later or (self.number == 0 and 15 in self.header)
+        need(not (bare and {4, 5, 6, 7} & set(parameters)), "tables or a kind in a later slice, or over a base")
         if 4 in parameters:
             self.read_grids(parameters[4])
         if 5 in parameters:
@@ -394,6 +407,7 @@ class Layer:
 
     # 6.4 Channels: "In mode ans a slice codes the channels in this order:"
     # 8 Coded channels: "one for item 1 of 6.4, one for items 2 to 6, one for items 7 and 8"
+    # 8.5 Rows by step class: "the base's rows come first, by class, then all others"
     # 11.2 Rows: "A step class MUST lie in 0..6, else Malformed."
     def decode_ans(self, codes, stream):
         """The voxels and the channels of items 2 to 8, none split."""
@@ -404,8 +418,10 @@ class Layer:
         coder.priors = self.priors[1]
         channels = [coder.channel(size) for size in (len(self.earlier), n, *[n] * graded)]
         classes = ranged(channels[2], 0, 6, "a step class") if graded else [0] * n
-        for rows, width in ((classes, len(self.header["centres"])), (self.earlier + classes, self.layer_rows[1])):
-            channels += [coder.split(rows, 7) if graded else coder.channel(len(rows)) for _ in range(width)]
+        base_rows = self.header[15][2] if 15 in self.header and not self.later else 0
+        groups = [c + 7 * (row >= base_rows) for row, c in enumerate(self.earlier + classes)]
+        for rows, width in ((classes, len(self.header["centres"])), (groups, self.layer_rows[1])):
+            channels += [coder.split(rows, 14) for _ in range(width)]
         coder.priors = []
         channels += coder.decode_grids([shape for _, _, shape in self.planes])
         channels += [coder.channel(size) for _, size in self.weights]
@@ -432,10 +448,12 @@ class Layer:
         return voxels_in_order(zip(*channels[:3])), channels[3:]
 
     # 11.1 Masks: "Layer ℓ codes a rise 0..255 for each earlier row and a code 3..255 for each own row."
+    # 5.6 Base: "in layer 0 of such a file a rise MUST be 0 or 1, else Malformed"
     # 11.2 Rows: "Symbols of rows and layer rows, plane samples (11.3), weights and biases MUST lie in −2^23..2^23"
     def name_channels(self, channels):
         """The symbols: of rows their v (11.2), of planes their samples (11.3)."""
-        self.symbols = {name: [ranged(next(channels), low, 255, name)] for name, low in (("rise", 0), ("own", 3))}
+        ranges = (("rise", 0, 255 if self.number else 1), ("own", 3, 255))
+        self.symbols = {name: [ranged(next(channels), low, high, name)] for name, low, high in ranges}
         if self.header["graded"]:
             self.symbols["class"] = [next(channels)]
         centres = iter(self.header["centres"])
@@ -889,24 +907,56 @@ def dequantise(symbols, step):
     return list(struct.unpack(f"<{len(products)}f", struct.pack(f"<{len(products)}f", *products)))
 
 
-# 11.1 Masks: "its code in the layer before in the file plus its rise, and MUST NOT exceed 255"
+# 11.1 Masks: "its code in the layer before in the file plus its rise, and MUST NOT exceed 255 nor be 1 or 2"
+# 5.6 Base: "1 makes the code 0, which hides the row until a layer above raises it again"
 # 12.1 Order: "each voxel at most once over all slices of all layers so far, and dequantisation"
 def finish_last(layers):
     codes = []
     for layer in layers:
-        codes = [code + rise for code, rise in zip(codes, layer.symbols["rise"][0])] + layer.symbols["own"][0]
+        pairs = zip(codes, layer.symbols["rise"][0])
+        codes = [code + rise if layer.number else code * (1 - rise) for code, rise in pairs] + layer.symbols["own"][0]
         need(not codes or max(codes) <= 255, "a mask code over 255")
+    need(not {1, 2} & set(codes), "a mask code of 1 or 2")
     need(len({cell for layer in layers for cell in layer.cells}) == len(codes), "a voxel holds more than one anchor")
     layers[-1].dequantise()
 
 
+# 5.6 Base: "The digest is the SHA-256 of the SHA-256s, one behind the other, of the header from the end of its chunk
+# list and of each chunk of layer 0." "It is Malformed if the other file has key 15 too or layer rows in layer 0"
+# 15 Errors and security: "the file has a base (5.6), and none or another one is given"
+def read_base(data, header):
+    """The layer 0 of the base, as a layer before layer 0."""
+    need(data is not None, "the file has a base", "BaseMissing")
+    try:
+        base, scene_id, at = read_preamble(data)
+        need(15 not in base, "a base that has a base")
+        (layer,) = decode(data, 0)
+    except Fault as fault:
+        raise Fault("BaseMismatch" if fault.name == "Truncated" else fault.name, fault) from None
+    need(not layer.layer_rows[0], "a base with layer rows")
+    parts = [base["identity"]]
+    for kind, size in base[1]:
+        at += 20 + size
+        parts += [data[at - 20 - size : at]] * (kind == 0)
+    digest = hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).digest()
+    need([scene_id, digest] == header[15][:2], "another base", "BaseMismatch")
+    need([layer.rows, sum(map(len, parts))] == header[15][2:], "other rows or bytes than the base's")
+    need(all(base.get(key) == header.get(key) for key in (3, 4, 5, 6)), "another kind, rows or voxel size")
+    layer.number = -1
+    return layer
+
+
 # 3.2 Chunks: "Bytes after the last chunk make the file Malformed."
+# 5.6 Base: "N from b, S from (W + 4)·b, with header key 5 (W + 5)·b, and B from P"
 # 3.6 Slices: "Bit 1 MUST be 1 if the next layer chunk in the list is of the same layer, and 0 if it is of another one."
 # 12.1 Order: "A decoder of prefix ℓ stops after the last chunk of a layer ≤ ℓ in the list and reads no further."
-def decode(data, max_layer=None):
-    """The layers of a file's bytes, or of prefix max_layer, with cells, symbols and tensors."""
+def decode(data, max_layer=None, base=None):
+    """The layers of a file's bytes, or of prefix max_layer, with cells, symbols and tensors. base: its base's bytes."""
     header, scene_id, at = read_preamble(data)
     layers, declared, chunks = [], (0, 0, 0), header[1]
+    if 15 in header:
+        layers, (_, _, rows, size) = [read_base(base, header)], header[15]
+        declared = (rows, (len(header["centres"]) + 4 + header["graded"]) * rows, size)
     stop = len(chunks)
     if max_layer is not None:
         stop = 1 + max(i for i, (kind, _) in enumerate(chunks) if kind <= min(max_layer, 2))
@@ -926,13 +976,13 @@ def decode(data, max_layer=None):
             finish_last(layers)
             declared = read.declared
     need(max_layer is not None or at == len(data), "bytes follow the last chunk")
-    return layers
+    return [layer for layer in layers if layer.number >= 0]
 
 
 # 12.4 Hashes: "two SHA-256 digests per layer, of its decoded slices with the rows of 12.2"
-def hashes(data, max_layer=None):
+def hashes(data, max_layer=None, base=None):
     rows = []
-    for layer in decode(data, max_layer):
+    for layer in decode(data, max_layer, base):
         symbols, tensors = hashlib.sha256(), hashlib.sha256()
         for values in (*layer.cells, *(channel for own in layer.symbols.values() for channel in own)):
             symbols.update(struct.pack(f"<{len(values)}i", *values))
@@ -943,12 +993,14 @@ def hashes(data, max_layer=None):
 
 
 def main(arguments):
-    if len(arguments) != 1:
-        return "usage: refdec.py FILE"
+    if len(arguments) not in (1, 2):
+        return "usage: refdec.py FILE [BASE]"
     try:
-        with open(arguments[0], "rb") as stream:
-            data = stream.read()
-        print(json.dumps(hashes(data)))
+        files = []
+        for path in arguments:
+            with open(path, "rb") as stream:
+                files.append(stream.read())
+        print(json.dumps(hashes(files[0], base=files[1] if files[1:] else None)))
     except (Fault, OSError) as error:
         return f"refdec: {arguments[0]}: {error}"
 

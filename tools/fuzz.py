@@ -92,12 +92,14 @@ def examine(files: Sequence[Seed], run: int, index: int, decoders: dict[str, Dec
         own = check_package(case, random.Random(~index))
         figures.outcomes[own.name if own.scene in ("", DECODED) else f"{own.name}, the scene {own.scene}"] += 1
         answers = {"the writer": Answer(DECODED, case.meaning)} if legal else {}
-        answers |= {"python": own} | {n: answer for n, d in asked.items() if (answer := d(case.data)) is not None}
+        answers |= {"python": own} | {
+            n: answer for n, d in asked.items() if (answer := d(case.data, case.base)) is not None
+        }
         figures.compared.update(set(answers) & set(asked))
         if difference := compare(answers):
             figures.differences[difference] += 1
         if index % MEASURED == 0:
-            figures.memory = check_memory(case.data)
+            figures.memory = check_memory(case.data, case.base)
     except Finding as finding:
         figures.findings.append(_row(index, finding.kind, str(finding), case.recipe))
     return figures
@@ -169,8 +171,10 @@ def main(argv: Sequence[str] | None = None) -> int:
             figures.add(part)
             for row in part.findings:  # at once, since a long run may be killed
                 args.out.mkdir(parents=True, exist_ok=True)
-                path = args.out / f"{args.seed}-{row['input']}-{row['kind']}.pd4"
-                path.write_bytes(make_case(files, args.seed, row["input"]).data)
+                case = make_case(files, args.seed, row["input"])
+                for data, name in ((case.data, ""), (case.base, "-base")):
+                    if data is not None:
+                        (args.out / f"{args.seed}-{row['input']}-{row['kind']}{name}.pd4").write_bytes(data)
     print(figures.text())
     return 1 if figures.findings else 0
 

@@ -50,10 +50,11 @@ def _decode(args: argparse.Namespace, console: Console) -> int:
         common.check_output(args.output, args.overwrite)
     data, _ = common.read_prefix(args.input, console, args.level, args.max_bytes, args.allow_partial)
     from pd4dgs_codec.format.decoder import decode_partial
+    from pd4dgs_codec.segments import base_beside
 
-    start = time.perf_counter()
+    start, base = time.perf_counter(), base_beside(args.input)
     scene, complete = decode_partial(
-        data, max_layer=args.level, max_bytes=args.max_bytes, allow_partial=args.allow_partial
+        data, max_layer=args.level, max_bytes=args.max_bytes, allow_partial=args.allow_partial, base=base
     )
     seconds = time.perf_counter() - start
     console.detail(f"steps {scene.steps}")

@@ -54,7 +54,7 @@ SCALE = options.checked(float, lambda x: 1e-6 <= x <= 1e6, "a number from 1e-6 t
 
 def parser() -> options.Parser:
     p = options.Parser("export", "FILE -o OUT", "Export a scene as Gaussians for other viewers.", DETAILS)
-    p.add_argument("input", metavar="FILE", help=".pd4 file; - reads stdin")
+    p.add_argument("input", metavar="FILE", help=".pd4 file or a folder of segments; - reads stdin")
     what = "output file; a folder for ply-seq"
     p.add_argument("-o", "--output", required=True, type=options.named, metavar="OUT", help=what)
     p.add_argument("--to", choices=KINDS, help="file format, see below (default: by the suffix of OUT)")
@@ -82,14 +82,12 @@ def _export(args: argparse.Namespace, console: Console) -> int:
         _check_folder(args.output, args.overwrite)
     else:
         common.check_output(args.output, args.overwrite)
-    from pd4dgs_codec.draw.player import drawer
-    from pd4dgs_codec.format.decoder import decode
     from pd4dgs_codec.interchange.export import cost
     from pd4dgs_codec.interchange.splats import EXTRA
 
     if args.to in LIBRARIES:
         required(LIBRARIES[args.to], EXTRA, f"{args.to} files")
-    player = drawer(decode(common.read_bytes(args.input), max_layer=args.level))
+    player = _player(args)
     views, eyes = _compared(args, player), _eyes(args, player)
     start = time.perf_counter()
     result = {"input": args.input, "output": args.output, "to": args.to, "level": player.level, "sh": args.sh}
@@ -128,11 +126,23 @@ def _check_folder(path: str, overwrite: bool) -> None:
         raise DataError(f"{path}: contains PLY files already; --overwrite removes them")
 
 
+def _player(args: argparse.Namespace) -> Drawer:
+    from pd4dgs_codec.draw.player import drawer
+    from pd4dgs_codec.format.decoder import decode
+    from pd4dgs_codec.quality.timeline import Timeline
+    from pd4dgs_codec.segments import base_beside, is_folder
+
+    if is_folder(args.input):
+        return Timeline(args.input, args.level)
+    return drawer(decode(common.read_bytes(args.input), max_layer=args.level, base=base_beside(args.input)))
+
+
 def _eyes(args: argparse.Namespace, player: Drawer) -> Eyes | None:
     """The viewpoints from which a scaffold is baked, None for splats, of which the degree of --sh is the highest."""
     from pd4dgs_codec.draw.player import Player
     from pd4dgs_codec.interchange.export import eyes_of_cameras, eyes_of_scene
 
+    player, _ = player.at(0.0)
     if not isinstance(player, Player):
         if args.data is not None:
             raise UsageError(f"--data has no effect: {args.input} holds splats, which are exported as they are")

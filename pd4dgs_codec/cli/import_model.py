@@ -27,12 +27,16 @@ scene from its renderings instead: fewer bytes at low quality, in minutes. Code 
 --psnr D asks for D dB against the source's renderings; --quality Q means 32 + Q / 5 dB. Quality is measured from the
 cameras of a cameras.json beside the source, else from cameras on a dome around it.
 
+--segments 2s makes a folder: a file for every two seconds or so, and one for the Gaussians that stand still over all of
+them. Memory does not grow with the length. Called again after an interruption, the command goes on.
+
 -o model.pt imports a run of Scaffold-GS as a checkpoint: layer 0 without loss, which pd4dgs-encode packs.
 
 examples:
   pd4dgs-import capture.ply -o scene.pd4
   pd4dgs-import frames/ -o scene.pd4 --fps 30 --target-size 400k --slices 50k
   pd4dgs-import output/lego -o lego.pd4 --psnr 42
+  pd4dgs-import hour/ -o hour.pd4s --segments 2s --fps 30
   pd4dgs-import output/garden -o garden.pt --appearance 0"""
 
 #: dB of quality 0, and of each further point.
@@ -40,7 +44,8 @@ LOWEST_DB, POINT_DB = 32.0, 0.2
 QUALITY = 50.0
 #: Options of .pd4 files, and of checkpoints.
 PACKING = (
-    "psnr", "quality", "target_size", "slices", "fps", "seconds", "background", "up", "title", "source", "licence"
+    "psnr", "quality", "target_size", "slices", "segments", "fps", "seconds", "background", "up", "title", "source",
+    "licence",
 )  # fmt: skip
 SCAFFOLD = ("appearance", "voxel_size")
 
@@ -60,6 +65,8 @@ def parser() -> options.Parser:
     add("--psnr", type=db, metavar="D", help="dB against the source's renderings")
     add = p.add_argument
     add("--slices", type=options.size, metavar="SIZE", help="cut layers into slices, the first of at most SIZE bytes")
+    what = "write a folder of segments of about this length, such as 2s"
+    add("--segments", type=options.duration, metavar="T", help=what)
     rate = p.add_mutually_exclusive_group()
     rate.add_argument("--fps", type=options.fps, metavar="F", help="frames per second of a folder (default: 30)")
     what = "duration, from the first instant to the last"
@@ -95,6 +102,9 @@ def _import(args: argparse.Namespace, console: Console) -> int:
             needed = "a .pd4 file" if to_checkpoint else "-o model.pt"
             raise UsageError(f"--{name.replace('_', '-')} needs {needed}")
     common.check_other_file(args.input, args.output)
+    if args.segments is not None:
+        options.conditional(args, False, "makes one file, without --segments", target_size=None, slices=None)
+        return _segments(args, console)
     common.check_output(args.output, args.overwrite)
     return _checkpoint(args, console) if to_checkpoint else _pack(args, console)
 
@@ -122,27 +132,54 @@ def _checkpoint(args: argparse.Namespace, console: Console) -> int:
 
 def _pack(args: argparse.Namespace, console: Console) -> int:
     """Packs explicit Gaussians."""
-    from pd4dgs_codec.format.metadata import Metadata
     from pd4dgs_codec.interchange.imported import import_model
 
-    quality = QUALITY if args.quality is None else args.quality
-    made = import_model(
-        args.input,
-        psnr=args.psnr or LOWEST_DB + POINT_DB * quality,
-        most_bytes=args.target_size,
-        slices=args.slices,
-        fps=args.fps or 30.0,
-        seconds=args.seconds,
-        background=args.background,
-        up=args.up,
-        metadata=Metadata(**options.given(args, "title", "source", "licence")),
-        tell=lambda text: None if args.json else say(text),
-        progress=lambda what, total: progress_bar(total, "steps", what),
-    )
+    made = import_model(args.input, most_bytes=args.target_size, slices=args.slices, **_asked(args))
     common.write_bytes(args.output, made.data, args.overwrite)
     result = {"input": args.input, "output": args.output, **made.json()}
     console.result(result, _text(args.output, made))
     return OK
+
+
+def _segments(args: argparse.Namespace, console: Console) -> int:
+    """Packs explicit Gaussians as a folder of segments."""
+    from pd4dgs_codec.interchange.segmented import import_segments
+
+    made = import_segments(args.input, args.output, length=args.segments, overwrite=args.overwrite, **_asked(args))
+    sizes = [sum(file.bytes for file in files) for files in (made.index.bases, made.index.segments)]
+    seconds = made.index.time_range[1] - made.index.time_range[0]
+    result = {
+        "input": args.input,
+        "output": args.output,
+        "segments": len(made.index.segments),
+        "kept": made.kept,
+        "bytes": sum(sizes),
+        "base_bytes": sizes[0],
+        "seconds": seconds,
+        "psnr": made.psnr,
+        "gaussians": made.gaussians,
+        "still": made.still,
+    }
+    text = f"{args.output}: {len(made.index.segments)} segments, {made.kept} of them kept, {number(made.psnr)} dB; "
+    text += f"{sizes[0]:,} bytes of what stands still, {sizes[1] / seconds:,.0f} a second of the rest"
+    console.result(result, text)
+    return OK
+
+
+def _asked(args: argparse.Namespace) -> dict[str, Any]:
+    """What one file and segments are made with."""
+    from pd4dgs_codec.format.metadata import Metadata
+
+    return {
+        "psnr": args.psnr or LOWEST_DB + POINT_DB * (QUALITY if args.quality is None else args.quality),
+        "fps": args.fps or 30.0,
+        "seconds": args.seconds,
+        "background": args.background,
+        "up": args.up,
+        "metadata": Metadata(**options.given(args, "title", "source", "licence")),
+        "tell": lambda text: None if args.json else say(text),
+        "progress": lambda what, total: progress_bar(total, "steps", what),
+    }
 
 
 def _text(name: str, made: Imported) -> str:

@@ -10,6 +10,7 @@ from pd4dgs_codec.cli.common import OK, Console, color, command, number, read_pr
 DETAILS = """\
 The time to the first frame is 8 * (bytes to the end of the first slice) / rate, without latency.
 From a URL (http, https), only the header is fetched, unless --check, --bytes or --hashes needs the whole file.
+Of a folder of segments the files are listed; --check reads and decodes all of them.
 
 examples:
   pd4dgs-info scene.pd4
@@ -23,10 +24,12 @@ examples:
 DETAIL_KEYS = ("steps", "planes", "networks", "key_instant", "instants", "heads", "groups", "kind", "grid_step",
                "grids", "chain_step", "chains")  # fmt: skip
 
+SHOWN = 12  #: segments that are listed
+
 
 def parser() -> options.Parser:
     p = options.Parser("info", "FILE", "Show the header and layers of a .pd4 file.", DETAILS)
-    options.add_file(p, "FILE", ".pd4 file or URL; - reads stdin")
+    options.add_file(p, "FILE", ".pd4 file or URL, or a folder of segments; - reads stdin")
     p.add_argument("--check", action="store_true", help="decode the whole file and check every checksum and rule")
     p.add_argument("--bytes", action="store_true", help="show the bytes of each part of each layer")
     what = "show SHA-256 of the integers and float32 tensors of each layer"
@@ -39,6 +42,11 @@ def parser() -> options.Parser:
 
 def _info(args: argparse.Namespace, console: Console) -> int:
     options.choose_file(args, "FILE")
+    from pd4dgs_codec.segments import base_beside, is_folder
+
+    if is_folder(args.input):
+        options.conditional(args, False, "needs a .pd4 file, not a folder", bytes=False, hashes=False)
+        return _segments(args, console)
     whole = args.check or args.bytes or args.hashes
     data, total = read_prefix(args.input, console, max_bytes=None if whole else 0)
     from pd4dgs_codec.format.info import hashes, info
@@ -49,13 +57,14 @@ def _info(args: argparse.Namespace, console: Console) -> int:
     result["first_frame_seconds"] = {name: 8 * end / rate for name, rate in args.at.items()}
     result["left_out"] = _left_out(result["layers"])
     if args.bytes or args.check:
-        _, layers = read_layers(data)
+        base = base_beside(args.input)
+        _, layers = read_layers(data, base=base)
     if args.bytes:
         result["parts"] = _parts(result, [layer.bits for layer in layers])
     if args.check:
         result["checked"] = True
     if args.hashes:
-        result["hashes"] = hashes(data)
+        result["hashes"] = hashes(data, base=base_beside(args.input))
     for row in result["layers"]:
         found = [f"{key} {row[key]}" for key in DETAIL_KEYS if key in row]
         console.detail(f"layer {row['layer']}: {', '.join(found) or 'incomplete'}")
@@ -64,6 +73,38 @@ def _info(args: argparse.Namespace, console: Console) -> int:
 
 
 main = command(parser, _info)
+
+
+def _segments(args: argparse.Namespace, console: Console) -> int:
+    """Lists a folder of segments; with --check, reads all of them."""
+    from pd4dgs_codec.segments import read_index
+
+    folder, index = read_index(args.input)
+    low, high = index.time_range
+    sizes = [sum(file.bytes for file in files) for files in (index.bases, index.segments)]
+    result = {"input": args.input, **index.json(), "time_range": [low, high], "bytes": sum(sizes)}
+    if args.check:
+        from pd4dgs_codec.quality.timeline import Timeline
+
+        timeline = Timeline(folder)
+        for segment in index.segments:
+            timeline.at((segment.time_range[0] - low) / (high - low))
+        result["checked"] = True
+    first = index.bases[index.segments[0].base].bytes if index.segments[0].base is not None else 0
+    result["first_frame_seconds"] = {
+        name: 8 * (first or index.segments[0].bytes) / rate for name, rate in args.at.items()
+    }
+    head = f"{args.input}: {len(index.segments):,} segments, {low:g} to {high:g} s, {sum(sizes):,} bytes: "
+    lines = [head + f"{sizes[0]:,} of what segments share, {sizes[1] / (high - low):,.0f} a second"]
+    rows = [
+        (s.file, *s.time_range, "-" if s.base is None else index.bases[s.base].file, number(s.bytes, 0))
+        for s in index.segments
+    ]
+    lines.append(table(("segment", "from s", "to s", "base", "bytes"), rows if console.verbose else rows[:SHOWN]))
+    lines += [f"and {len(rows) - SHOWN:,} more (-v lists all)"] if len(rows) > SHOWN and not console.verbose else []
+    lines += ["checked: every segment decodes"] if args.check else []
+    console.result(result, "\n".join(lines), on_stdout=True)
+    return OK
 
 
 def _parts(result: dict[str, Any], bits: Sequence[Mapping[str, int]]) -> list[dict[str, Any]]:

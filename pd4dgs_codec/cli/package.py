@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from pd4dgs_codec.cli import options
 from pd4dgs_codec.cli.common import OK, STDIO, Console, command, number, progress_bar, read_bytes, same_file, say, table
 from pd4dgs_codec.errors import DeliveryError, RenderError
-from pd4dgs_codec.io import check_new, temporary_folder, whole_files
+from pd4dgs_codec.io import check_new, temporary_folder, whole_files, write_bytes
+from pd4dgs_codec.segments import is_folder
 
 if TYPE_CHECKING:
     import numpy as np
@@ -36,6 +37,9 @@ at most 3 kB, lies in the page and is shown until the player has drawn one.
 index.json lists the Cache-Control header of each file. For a folder of packages, pd4dgs-package writes library.json and
 index.html beside them, with the poster, size and time to the first frame of each.
 
+Of a folder of segments, DASH gets a period for each, which share the AdaptationSets of their base, and the HLS playlist
+of the 2D video a discontinuity between two. The page fetches the segment at hand and the next one.
+
 examples:
   pd4dgs-package scene.pd4 -o out/scene
   pd4dgs-package scene.pd4 -o out/scene --immutable
@@ -43,6 +47,7 @@ examples:
   pd4dgs-package scene.pd4 -o out/scene --no-video --json"""
 
 MAX_FRAMES = 3000
+SHOWN = 20  #: files that are listed
 FRAGMENT_SECONDS = 2
 #: The page's picture: pixels of the camera's longer side, how much wider and higher than the camera's picture it is,
 #: and bytes, so that it arrives within 0.2 s at 200 kbps.
@@ -53,7 +58,7 @@ def parser() -> options.Parser:
     summary = "Make a folder for web servers, with a player page, DASH and HLS."
     p = options.Parser("package", "scene.pd4 -o DIR", summary, DETAILS)
     add = p.add_argument
-    add("input", metavar="scene.pd4", help=".pd4 file (- reads stdin), or a folder of packages")
+    add("input", metavar="scene.pd4", help=".pd4 file (- reads stdin), or a folder of segments or of packages")
     what = "output folder, created if missing"
     add("-o", "--output", required=True, type=options.named, metavar="DIR", help=what)
     add("--immutable", action="store_true", help="put checksums into file names, for long-lived caches")
@@ -70,13 +75,13 @@ def check_usage(args: argparse.Namespace) -> None:
 
 
 def _package(args: argparse.Namespace, console: Console) -> int:
-    if args.input != STDIO and Path(args.input).is_dir():
+    whole = args.input == STDIO or not is_folder(args.input)
+    if whole and args.input != STDIO and Path(args.input).is_dir():
         return _library(args, console)
     check_usage(args)
-    from pd4dgs_codec.web.package import INDEX, package
+    from pd4dgs_codec.web.package import INDEX, package, package_segments
 
     check_new([str(Path(args.output) / INDEX)], args.overwrite)  # before a video is rendered
-    data = read_bytes(args.input)
     missing = {"2D video": "--no-video"} if args.no_video else {}
 
     def made(what: str, make: Callable[[], T]) -> T | None:
@@ -92,14 +97,18 @@ def _package(args: argparse.Namespace, console: Console) -> int:
         say(f"pd4dgs-package: no {what}: {missing[what]}")
         return None
 
-    files = package(
-        data,
-        lambda scene: None if args.no_video else made("2D video", lambda: _render(scene, args.fps)),
-        lambda scene: made("picture in the page", lambda: _still(scene)),
-        immutable=args.immutable,
-    )
+    def render(scene: AnyScene) -> Video | None:
+        return None if "2D video" in missing else made("2D video", lambda: _render(scene, args.fps))
+
+    def draw(scene: AnyScene) -> Still | None:
+        return made("picture in the page", lambda: _still(scene))
+
+    if whole:
+        files = _write(args, package(read_bytes(args.input), render, draw, immutable=args.immutable))
+    else:
+        files = _write_each(args, package_segments(Path(args.input), render, draw, immutable=args.immutable))
     why = missing.get("2D video")
-    result = {"input": args.input, "output": args.output, "files": _write(args, files), "video": why is None}
+    result = {"input": args.input, "output": args.output, "files": files, "video": why is None}
     console.result(result | {"why_no_video": why}, _text(result))
     return OK
 
@@ -125,6 +134,18 @@ def _write(args: argparse.Namespace, files: dict[str, bytes]) -> list[dict[str, 
         for temporary, content in zip(temporaries, files.values(), strict=True):
             temporary.write_bytes(content)
     return [{"name": name, "bytes": len(content)} for name, content in files.items()]
+
+
+def _write_each(args: argparse.Namespace, files: Iterable[tuple[str, bytes]]) -> list[dict[str, Any]]:
+    """Writes files one by one, so that memory does not grow with their number; returns their names and sizes."""
+    folder, found = Path(args.output), list[dict[str, Any]]()
+    if args.input != STDIO and same_file(args.input, args.output):
+        raise DeliveryError(f"found -o {args.output}, the folder of the segments, expected another one")
+    for name, content in files:
+        folder.mkdir(parents=True, exist_ok=True)
+        write_bytes(folder / name, content, args.overwrite)
+        found.append({"name": name, "bytes": len(content)})
+    return found
 
 
 def _render(scene: AnyScene, fps: float) -> Video:
@@ -190,4 +211,5 @@ def _still(scene: AnyScene) -> Still:
 
 def _text(result: dict[str, Any]) -> str:
     rows = [(row["name"], number(row["bytes"], 0)) for row in result["files"]]
-    return f"{result['output']}: {len(rows)} files\n{table(('file', 'bytes'), rows)}"
+    more = f"\nand {len(rows) - SHOWN:,} before them" if len(rows) > SHOWN else ""
+    return f"{result['output']}: {len(rows)} files\n{table(('file', 'bytes'), rows[-SHOWN:])}{more}"

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import os
+import shutil
 from pathlib import Path
 
 from pd4dgs_codec.cli import common, options
@@ -12,8 +13,8 @@ from pd4dgs_codec.errors import DataError, DecodeError
 from pd4dgs_codec.io import check_output, temporary_folder, write_bytes
 
 DETAILS = """\
-SCENE is a .pd4 file, the URL of one, a folder of .pd4 files, from which the page lets you choose, or a checkpoint,
-which is encoded first. --sample shows the scene that comes with the package.
+SCENE is a .pd4 file, the URL of one, a folder of segments, a folder of .pd4 files, from which the page lets you choose,
+or a checkpoint, which is encoded first. --sample shows the scene that comes with the package.
 The first line on stdout is the address of the page, printed when it is ready; the default browser opens it. Ctrl-C or
 SIGTERM stops the server. The server of a URL must allow cross-origin requests, as pd4dgs-serve does.
 
@@ -44,6 +45,7 @@ def parser() -> options.Parser:
 
 
 def _view(args: argparse.Namespace, console: Console) -> int:
+    from pd4dgs_codec.segments import INDEX, is_folder, read_index
     from pd4dgs_codec.web import PAGE, is_url
     from pd4dgs_codec.web.package import player_of
     from pd4dgs_codec.web.page import page
@@ -55,18 +57,27 @@ def _view(args: argparse.Namespace, console: Console) -> int:
         if Path(args.output).suffix.lower() not in (".html", ".htm"):
             raise UsageError(f"found -o {args.output}, expected a name that ends in .html")
         check_output(args.output, args.overwrite)
+        if is_folder(args.input):
+            raise UsageError(f"{args.input} is a folder of segments, which one page cannot hold: see pd4dgs-package")
         content = args.input if is_url(args.input) else _packed(args.input)
         write_bytes(args.output, page(content).encode(), args.overwrite)
         console.result({"output": args.output, "input": args.input}, args.output)
         return OK
     with temporary_folder() as folder:
-        data = None if os.path.isdir(args.input) or is_url(args.input) else _packed(args.input)
+        several = os.path.isdir(args.input) or is_url(args.input) or is_folder(args.input)
+        data = None if several else _packed(args.input)
         (folder / PAGE).write_bytes(page(about=data).encode())
         if data is not None:
             (folder / SCENE).write_bytes(data)
             shown = player_of(SCENE)
         elif is_url(args.input):
             shown = player_of(args.input)
+        elif is_folder(args.input):
+            place, index = read_index(args.input)
+            for name in (INDEX, *(file.file for file in index.files)):
+                with contextlib.suppress(FileNotFoundError):  # the player says what is missing
+                    shutil.copyfile(place / name, folder / name)
+            shown = player_of(INDEX)
         else:
             shown = _copied(args.input, folder)
         with serving(folder, args, console, port=args.port, private=True) as server:

@@ -3,6 +3,8 @@
 Pictures of the two agree up to rounding: activations differ in the last bit.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 
 import numpy as np
@@ -49,6 +51,10 @@ class Drawer:
         self.info, self.level, self.background = scene.info, scene.level, scene.background()
         self.active = scene.active  #: int64 [n]: the anchors active at this level, ascending
         self.still = scene.still  #: whether all times look alike
+
+    def at(self, t: float) -> tuple[Drawer, float]:
+        """Returns (what draws normalised time t, the time in its own range): of a scene in parts, the part."""
+        return self, t
 
     def gaussians(self, camera: Camera, t: float) -> Gaussians:
         """Returns the Gaussians that the camera may see at normalised time t in 0..1."""

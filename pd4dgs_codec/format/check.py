@@ -216,7 +216,7 @@ def _pairs(
     given: AnyScene, symbols: SceneSymbols
 ) -> Iterator[tuple[str, float, np.ndarray, np.ndarray, np.ndarray | float]]:
     """Yields (what has the step, the step, values given, values dequantised, 2^(step class) of each)."""
-    first = 0
+    first = symbols.base_rows
     for part in symbols.layers:
         for at in row_blocks(len(part.codes)):
             own, classes = slice(first + at.start, first + at.stop), part.classes[at]
@@ -226,6 +226,8 @@ def _pairs(
                 yield name, tensor.step, x[own].reshape(y.shape), y, spacing
         first += len(part.codes)
         layer, tensors = part.layer, kinds.tensors_of(given, part.layer)
+        if symbols.base and not layer:
+            continue  # its tensors are those of the base
         names = kinds.step_names(layer) if isinstance(given, Scene) else (kinds.layer_name(given, layer),)
         fields = [names[0]] * len(tensors.planes) + [names[-1]] * len(tensors.weights)
         for what, step, x, k in zip(fields, tensors.tables.steps, tensors.arrays, part.tensors.arrays, strict=True):

@@ -1,21 +1,21 @@
 """Decodes a `.pd4` file to a scene, at once or as its bytes arrive."""
 
 from collections.abc import Iterator
-from os import PathLike
 
 from pd4dgs_codec import kinds
 from pd4dgs_codec.errors import DecodeError, Truncated
-from pd4dgs_codec.format.reader import LayerReader, bytes_of
+from pd4dgs_codec.format.reader import Base, LayerReader, Source, bytes_of
 from pd4dgs_codec.kinds import AnyScene
 from pd4dgs_codec.tensors.symbols import LayerSymbols
 
 
 def decode(
-    data: bytes | bytearray | memoryview | str | PathLike[str],
+    data: Source,
     *,
     max_layer: int | None = None,
     max_bytes: int | None = None,
     allow_partial: bool = False,
+    base: Source | Base | None = None,
 ) -> AnyScene:
     """Decodes a file, its layers <= max_layer, or the slices within its first max_bytes bytes, at least one. Later
     bytes are ignored.
@@ -24,22 +24,31 @@ def decode(
     unless allow_partial is set and the file holds at least one slice: then its longest valid prefix of slices is
     decoded. Other faults raise other DecodeErrors; a scene or deformation of an unknown kind is an UnsupportedFeature,
     see `decode_tensors`. max_layer < 0 raises ValueError.
+
+    base: for a file that names one (BaseMissing without, BaseMismatch for another), in the same forms or, for many
+    files, from `read_base`. Its anchors come first, and alone where no slice of the file is there.
     """
-    return decode_partial(bytes_of(data), max_layer=max_layer, max_bytes=max_bytes, allow_partial=allow_partial)[0]
+    options = {"max_layer": max_layer, "max_bytes": max_bytes}
+    return decode_partial(bytes_of(data), allow_partial=allow_partial, base=base, **options)[0]
 
 
 def decode_partial(
-    data: bytes, *, max_layer: int | None = None, max_bytes: int | None = None, allow_partial: bool = True
+    data: bytes,
+    *,
+    max_layer: int | None = None,
+    max_bytes: int | None = None,
+    allow_partial: bool = True,
+    base: Source | Base | None = None,
 ) -> tuple[AnyScene, bool]:
     """Returns (scene as from `decode`, whether every requested slice was there)."""
-    reader, complete = LayerReader(kinds.check), True
+    reader, complete = LayerReader(kinds.check, base), True
     try:
         while reader.next_slice(data, max_layer, max_bytes) is not None:
             pass
-        if not reader.count:
+        if not reader.showable:
             raise Truncated(f"{max_bytes} bytes end before the first slice is complete", offset=max_bytes)
     except Truncated:
-        if not (allow_partial and reader.count):
+        if not (allow_partial and reader.showable):
             raise
         complete = False
     reader.grown.sort()
@@ -57,10 +66,10 @@ def _scene(reader: LayerReader, writeable: bool = True) -> AnyScene:
 
 class Stream:
     """Decodes a file that arrives in pieces of any size, in about the time of `decode`. The scenes do not depend on
-    where the pieces are cut."""
+    where the pieces are cut. base: as in `decode`."""
 
-    def __init__(self) -> None:
-        self._reader = LayerReader(kinds.check)
+    def __init__(self, base: Source | Base | None = None) -> None:
+        self._reader = LayerReader(kinds.check, base)
         self._buffer = bytearray()  # from byte `consumed` of the file on
         self._needs = 0  # bytes of the file that the next step requires
         self._error: DecodeError | None = None
@@ -128,13 +137,14 @@ class Stream:
             del self._buffer[: self.consumed - start]
 
 
-def every_prefix(data: bytes) -> Iterator[AnyScene]:
-    """Yields the scene after each slice of a complete file, in the row order of `Stream.feed`. Raises DecodeError."""
-    reader = LayerReader(kinds.check)
+def every_prefix(data: bytes, base: Source | Base | None = None) -> Iterator[AnyScene]:
+    """Yields the scene after each slice of a complete file, in the row order of `Stream.feed`. base: as in `decode`.
+    Raises DecodeError."""
+    reader = LayerReader(kinds.check, base)
     while reader.next_slice(data) is not None:
         yield _scene(reader, writeable=False)
 
 
-def open_stream() -> Stream:
-    """Returns an empty stream, ready to be fed."""
-    return Stream()
+def open_stream(base: Source | Base | None = None) -> Stream:
+    """Returns an empty stream, ready to be fed. base: as in `decode`."""
+    return Stream(base)

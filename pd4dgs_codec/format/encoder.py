@@ -29,7 +29,7 @@ from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.parameters import with_fill
 from pd4dgs_codec.format.payload import Past, StreamReport, write_slice
 from pd4dgs_codec.format.plan import LeftOut, SceneSymbols, plan
-from pd4dgs_codec.format.reader import read_layers
+from pd4dgs_codec.format.reader import Base, Source, read_base, read_layers
 from pd4dgs_codec.format.registry import MAX_CHUNKS
 from pd4dgs_codec.kinds import AnyScene, utility_of
 from pd4dgs_codec.tensors.symbols import LayerSymbols, sliced
@@ -121,6 +121,7 @@ def encode_with_report(
     metadata: Metadata | None = None,
     utility: Callable[[AnyScene], np.ndarray] | None = None,
     fill: Callable[[AnyScene], Fill | None] | None = None,
+    base: Source | Base | None = None,
     **changes: Any,
 ) -> tuple[bytes, Report]:
     """Encodes a scene; returns (bytes of the file, report).
@@ -128,13 +129,16 @@ def encode_with_report(
     left_out: parts that the caller has removed from the scene, added to the report. metadata: stored in the file.
     utility: function of the decoded scene, float [N], the gain in image quality by each anchor. It orders the anchors
     of sliced layers; `kinds.utility_of` if None. fill: function of the scene that ends with a slice, its fill; called
-    for each slice but the last. If None, each slice has the fill of its layer. changes: fields of EncodeOptions that
-    replace those of `options`. Raises EncodeError.
+    for each slice but the last. If None, each slice has the fill of its layer. base: a file, or what `read_base` made
+    of it, whose layer 0 the file names and does not hold: the scene's first rows and its networks of layer 0 are those
+    of the base, whose mask codes in layer 0 may be 0 instead. changes: fields of EncodeOptions that replace those of
+    `options`. Raises EncodeError, and for a base what `read_base` raises.
     """
     started = time.perf_counter()
     scene, options = replace(options, **changes).apply_scale(scene)
     check_scene(scene)
-    planned = plan(scene, options)
+    base = None if base is None else read_base(base)
+    planned = plan(scene, options, base)
     symbols, omitted = planned.symbols, planned.left_out
     errors = verify_errors(planned.scene, symbols) if options.verify else []
     del planned  # as large as the scene
@@ -148,7 +152,7 @@ def encode_with_report(
     pairs = zip(symbols.layers, written, strict=True)
     fingerprints = [_fingerprint(layer, slices[-1].fill) for layer, slices in pairs] if options.verify else []
     del symbols, written, pairs  # as large as what is decoded
-    _check_file(data, fingerprints)
+    _check_file(data, fingerprints, base)
     kept = sum(r.anchors for r in reports)
     kept_bits = sum(r.position_bits + s.payload_bits for r in reports for s in r.streams if s.name == "attributes")
     rows = [item.row(options, kept, kept_bits) for item in (*left_out, *omitted)]
@@ -170,8 +174,12 @@ def with_metadata(data: bytes, metadata: Metadata) -> tuple[bytes, int]:
 
 def header_size(symbols: SceneSymbols, mode: str, chunks: int, most: int) -> int:
     """Returns the bytes of preamble and header of a file with at most so many chunks of at most `most` bytes."""
-    header = Header(((0, most),) * chunks, mode, symbols.kind, symbols.table, symbols.info, bytes(DIGEST_SIZE))
-    return PREAMBLE_SIZE + len(pack_header(header))
+    return PREAMBLE_SIZE + len(pack_header(_header(symbols, ((0, most),) * chunks, mode, bytes(DIGEST_SIZE))))
+
+
+def _header(symbols: SceneSymbols, chunks: tuple[tuple[int, int], ...], mode: str, digest: bytes) -> Header:
+    base = symbols.base.reference if symbols.base else None
+    return Header(chunks, mode, symbols.kind, symbols.table, symbols.info, digest, base)
 
 
 def _write_layers(
@@ -183,7 +191,7 @@ def _write_layers(
     if not options.slices:
         return [[_Slice(len(layer.anchor_q), *write_slice(layer, options), layer.fill)] for layer in layers]
     ends = np.cumsum([len(layer.anchor_q) for layer in symbols.layers])[:-1]
-    values = np.split(utility(symbols.scene()), ends)
+    values = np.split(utility(symbols.scene())[symbols.base_rows :], ends)
     bits = sum(float(layer.bits_per_row().sum()) for layer in symbols.layers)
     most = len(values) + math.ceil(bits / 8 / (LATER * SLACK * options.slices))  # more than there will be
     header = header_size(symbols, options.mode, most, options.slices)
@@ -241,8 +249,8 @@ def _filled(
 ) -> list[list[_Slice]]:
     """Gives the last slice of the file the fill of its layer, every other one that of the prefix that ends with it."""
     data, last = _container(symbols, options.mode, written), written[-1][-1]
-    _check_file(data, [])  # limits of the format
-    prefixes = every_prefix(data)
+    _check_file(data, [], symbols.base)  # limits of the format
+    prefixes = every_prefix(data, symbols.base)
 
     def filled(part: _Slice) -> _Slice:
         own = symbols.layers[-1].fill if part is last else fill(next(prefixes))
@@ -260,19 +268,19 @@ def _container(symbols: SceneSymbols, mode: str, written: list[list[_Slice]]) ->
     ]
     digest = payload_digest(payload for *_, payload in parts)
     chunks = tuple((kind, len(payload)) for kind, _, payload in parts)
-    packed = pack_header(Header(chunks, mode, symbols.kind, symbols.table, symbols.info, digest))
+    packed = pack_header(_header(symbols, chunks, mode, digest))
     scene_id = scene_id_of(packed)
     return b"".join([write_preamble(packed), *(write_chunk(kind, flags, scene_id, p) for kind, flags, p in parts)])
 
 
-def _check_file(data: bytes, fingerprints: list[bytes]) -> None:
+def _check_file(data: bytes, fingerprints: list[bytes], base: Base | None) -> None:
     """Decodes `data`, checks its header and compares its layers with the fingerprints. Without fingerprints, reads only
     the header and the parameters of all slices, to check the format's limits. Raises EncodeError."""
     try:
         if not fingerprints:
             info(data)
             return
-        header, found = read_layers(data)
+        header, found = read_layers(data, base=base)
     except LimitExceeded as error:
         raise EncodeError(f"the scene is over a limit of the format: {error}") from None
     except DecodeError as error:

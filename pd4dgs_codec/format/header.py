@@ -13,27 +13,40 @@ from pd4dgs_codec.format import canonical
 from pd4dgs_codec.format.canonical import Fields, as_integer, as_list, as_long
 from pd4dgs_codec.format.container import PREAMBLE_SIZE, SCENE_ID_SIZE
 from pd4dgs_codec.format.options import MODES
-from pd4dgs_codec.format.parameters import as_step, pack_rows, unpack_kind, unpack_rows
-from pd4dgs_codec.format.registry import LAYERS, MAX_CHUNKS, MAX_PAYLOAD
+from pd4dgs_codec.format.parameters import Declared, as_step, pack_rows, unpack_kind, unpack_rows
+from pd4dgs_codec.format.registry import LAYERS, MAX_ANCHORS, MAX_CHUNKS, MAX_PAYLOAD
 from pd4dgs_codec.scene import Camera, SceneInfo
 from pd4dgs_codec.tensors.quantise import MAX_SYMBOL, RowTable
 from pd4dgs_codec.tensors.tables import Kind
 
 # Keys of the header map.
 CHUNKS, MODE, KIND, ROWS, CENTRE, VOXEL_SIZE, BOX, TIME_RANGE = range(1, 9)
-BACKGROUND, NEAR_FAR, UP, UNIT, CAMERA, DIGEST = range(9, 15)
-KEYS = set(range(CHUNKS, DIGEST + 1))
+BACKGROUND, NEAR_FAR, UP, UNIT, CAMERA, DIGEST, BASE = range(9, 16)
+KEYS = set(range(CHUNKS, BASE + 1))
 # Keys of the camera map.
 VIEWMAT, INTRINSICS, WIDTH, HEIGHT = range(1, 5)
 
 MAX_CAMERA_SIDE = 65535
 DIGEST_SIZE = 16  #: bytes
+BASE_DIGEST_SIZE = 32
+
+
+@dataclass(frozen=True)
+class Reference:
+    """What a file says of its base, the layer 0 of another file (clause 5.6). scene_id: of that file. digest: SHA-256
+    of the layer. rows: its anchors. bytes: that the digest covers."""
+
+    scene_id: bytes
+    digest: bytes
+    rows: int
+    bytes: int
 
 
 @dataclass(frozen=True, eq=False)
 class Header:
     """The file header. chunks: (type, payload length in bytes) in file order. kind: of the scene. table: of the rows.
-    digest: payload_digest of the layers that were encoded together."""
+    digest: payload_digest of the layers that were encoded together. base: None for a file that holds its scene whole.
+    """
 
     chunks: tuple[tuple[int, int], ...]
     mode: str
@@ -41,6 +54,21 @@ class Header:
     table: RowTable
     info: SceneInfo
     digest: bytes
+    base: Reference | None = None
+
+    @property
+    def of_rows(self) -> object:
+        """What rows mean and how they are coded, which a file shares with its base."""
+        table = self.table
+        return self.kind, table.tensors, table.graded, table.centre_values.tolist(), self.info.voxel_size
+
+    @property
+    def declared(self) -> Declared:
+        """The sums before the first slice, which are those of the base."""
+        if self.base is None:
+            return Declared()
+        width = self.table.channels + 4 + self.table.graded
+        return Declared(self.base.rows, width * self.base.rows, self.base.bytes)
 
 
 def _f32(values: ArrayLike) -> list[float]:
@@ -66,6 +94,8 @@ def pack_header(header: Header) -> bytes:
     }
     if table.centre is not None:
         fields[CENTRE] = table.centre.tolist()
+    if header.base is not None:
+        fields[BASE] = list(vars(header.base).values())
     if info.camera is not None:
         camera = info.camera
         fields[CAMERA] = {
@@ -104,7 +134,8 @@ def unpack_header(data: bytes) -> Header:
     if mode == "lzma" and len(set(layers)) < len(layers):
         raise Malformed(f"header: layer chunks {layers} in mode lzma, expected each layer in one slice")
     kind, table = unpack_kind(fields.get(KIND), "header: kind"), _unpack_table(fields)
-    return Header(chunks, mode, kind, table, info, _unpack_digest(fields.get(DIGEST)))
+    digest = _unpack_bytes(fields.get(DIGEST), DIGEST_SIZE, "digest of the layers")
+    return Header(chunks, mode, kind, table, info, digest, _unpack_base(fields))
 
 
 def info_fault(info: SceneInfo) -> str | None:
@@ -134,16 +165,33 @@ def scene_id_of(header: bytes) -> bytes:
     """Returns the scene id in every chunk of a file: the first 8 bytes of the SHA-256 of the header's bytes after its
     chunk list. So adding or removing chunks keeps the id. header: canonical, with a chunk list.
     """
+    return hashlib.sha256(identity_of(header)).digest()[:SCENE_ID_SIZE]
+
+
+def identity_of(header: bytes) -> bytes:
+    """Returns the header's bytes after its chunk list."""
     fields = canonical.unpack(header)
     map_head = 1 if len(fields) < 16 else 3
     chunk_list = len(canonical.pack(CHUNKS)) + len(canonical.pack(fields[CHUNKS]))
-    return hashlib.sha256(header[map_head + chunk_list :]).digest()[:SCENE_ID_SIZE]
+    return header[map_head + chunk_list :]
 
 
-def _unpack_digest(value: object) -> bytes:
-    if not isinstance(value, bytes) or len(value) != DIGEST_SIZE:
-        raise Malformed(f"header: digest of the layers, expected {DIGEST_SIZE} bytes")
+def _unpack_bytes(value: object, size: int, what: str) -> bytes:
+    if not isinstance(value, bytes) or len(value) != size:
+        raise Malformed(f"header: {what}, expected {size} bytes")
     return value
+
+
+def _unpack_base(header: Fields) -> Reference | None:
+    if BASE not in header:
+        return None
+    scene_id, digest, rows, size = header.sequence(BASE, 4)
+    return Reference(
+        _unpack_bytes(scene_id, SCENE_ID_SIZE, "scene id of the base"),
+        _unpack_bytes(digest, BASE_DIGEST_SIZE, "digest of the base"),
+        as_integer(rows, MAX_ANCHORS, "header: rows of the base"),
+        as_integer(size, MAX_PAYLOAD, "header: bytes of the base", 1),
+    )
 
 
 def _unpack_chunks(value: object) -> tuple[tuple[int, int], ...]:

@@ -10,8 +10,8 @@ from pd4dgs_codec.errors import DecodeError
 from pd4dgs_codec.format.container import CHUNK_OVERHEAD, MAJOR, MINOR, read_chunk, read_preamble
 from pd4dgs_codec.format.header import unpack_header
 from pd4dgs_codec.format.metadata import CHUNK_TYPE, TEXTS, Metadata, read_metadata
-from pd4dgs_codec.format.parameters import Declared, read_parameters
-from pd4dgs_codec.format.reader import read_layers
+from pd4dgs_codec.format.parameters import read_parameters
+from pd4dgs_codec.format.reader import Base, Source, read_layers
 from pd4dgs_codec.format.registry import LAYERS
 from pd4dgs_codec.kinds import AnyScene
 from pd4dgs_codec.kinds.splats import SplatScene
@@ -30,12 +30,13 @@ def info(data: bytes) -> dict[str, Any]:
     in `kinds` says, else grids, chains, layer rows, their steps and kind, see `Tables.json`. slices: {offset, bytes,
     end}, and anchors and fill if `data` holds the slice whole. kind, rows: of the header; of a known kind also what its
     `json` says.
+    base: {scene, digest, rows, bytes} of the base, the first two in hexadecimal, None without one. anchors: its own.
     metadata: {title, source, licence, command, quality, slices, still_bytes} as far as given, {"fault"} if it cannot be
     read, None if `data` holds no metadata chunk. Raises DecodeError.
     """
     preamble = read_preamble(data)
     header = unpack_header(preamble.header)
-    others, offset, declared = [], preamble.size, Declared()
+    others, offset, base, declared = [], preamble.size, header.base, header.declared
     layers, tables = list[dict[str, Any]](), dict[int, Tables]()
     metadata: dict[str, Any] | None = None
     for index, (chunk_type, length) in enumerate(header.chunks):
@@ -73,7 +74,9 @@ def info(data: bytes) -> dict[str, Any]:
         "voxel_size": header.info.voxel_size,
         **kinds.json(header.kind, header.table),
         "graded": header.table.graded,
-        "anchors": declared.rows if all("anchors" in row for row in layers) else None,
+        "anchors": declared.rows - header.declared.rows if all("anchors" in row for row in layers) else None,
+        "base": base
+        and {"scene": base.scene_id.hex(), "digest": base.digest.hex(), "rows": base.rows, "bytes": base.bytes},
         "time_range": list(header.info.time_range),
         "camera": header.info.camera is not None,
         "metadata": metadata,
@@ -105,7 +108,7 @@ def _about(payload: bytes) -> dict[str, Any]:
     return {**texts, **quality, **slices, **({"still_bytes": len(found.still)} if found.still else {})}
 
 
-def hashes(data: bytes, max_layer: int | None = None) -> list[dict[str, Any]]:
+def hashes(data: bytes, max_layer: int | None = None, base: Source | Base | None = None) -> list[dict[str, Any]]:
     """Returns {layer, symbols, tensors} per layer: SHA-256 in hex of the integers and of the float32 values in a
     complete file, or in its layers <= max_layer (later bytes are ignored). Clause 12.4.
 
@@ -114,7 +117,7 @@ def hashes(data: bytes, max_layer: int | None = None) -> list[dict[str, Any]]:
     grid, then weight and bias per linear layer, chain by chain. tensors: float32 little-endian of the own positions [n,
     3], the rows and layer rows (per tensor [n, C]), then planes, weights and biases as above.
     """
-    header, layers = read_layers(data, max_layer=max_layer)
+    header, layers = read_layers(data, max_layer=max_layer, base=base)
     found = []
     for part in layers:
         values = [dequantise(part.anchor_q, header.info.voxel_size), *header.table.dequantise(part.rows)]

@@ -50,7 +50,7 @@ ROWS_PER_BYTE = 2
 
 @dataclass(frozen=True)
 class Declared:
-    """Sums over the slices of a file so far: rows, symbols and bytes of payloads."""
+    """Sums over the slices of a file so far, and of its base: rows, symbols and bytes of payloads."""
 
     rows: int = 0
     symbols: int = 0
@@ -117,9 +117,11 @@ def read_parameters(
     if start > len(payload):
         raise Malformed(f"{where}: parameters of {length} bytes, expected at most {len(payload) - 4}")
     fields = Fields(canonical.unpack(payload[4:start]), where, set(KEYS))
-    misplaced = [key for key in (GRIDS, CHAINS, KIND, LAYER_ROWS) if later and key in fields]
+    based = layer == 0 and before.payload_bytes > 0 and not later
+    misplaced = [key for key in (GRIDS, CHAINS, KIND, LAYER_ROWS) if (later or based) and key in fields]
     if misplaced:
-        raise Malformed(f"{where}: key {misplaced[0]} in a later slice, expected it in the first one only")
+        place = "a file with a base, expected none" if based else "a later slice, expected it in the first one only"
+        raise Malformed(f"{where}: key {misplaced[0]} in {place}")
     rows, codes = fields.integer(OWN_ROWS, MAX_ANCHORS - before.rows), fields.integer(CODES, MAX_PAYLOAD)
     if codes > len(payload) - start:
         raise Malformed(f"{where}: codes of {codes} bytes, expected at most {len(payload) - start}")

@@ -32,6 +32,7 @@ from pd4dgs_codec.tensors.tables import Tables, Tensors
 #: Groups of channels in reports, in coding order, and the one of mode lzma.
 GROUPS = ("positions", "masks", "attributes", "planes", "weights")
 LZMA_GROUP = "symbols"
+GROUPS_OF_ROWS = 2 * (MAX_CLASS + 1)  #: step classes, of the base's rows and of others
 
 Known = TypeVar("Known", Prior, Fitted)
 
@@ -127,9 +128,21 @@ def _row_symbols(symbols: LayerSymbols) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _row_channels(symbols: LayerSymbols) -> Iterator[np.ndarray]:
-    """Yields the coded channels of rows and layer rows, int [any]: of each class 0 .. MAX_CLASS, if there are any."""
-    for k, classes in zip(_row_symbols(symbols), (symbols.classes, symbols.all_classes), strict=True):
-        yield from Places.by(classes, MAX_CLASS + 1).parts(k) if classes.size else k
+    """Yields the coded channels of rows and layer rows, int [any]: of each group, if there are any."""
+    own, layer_rows = _row_symbols(symbols)
+    groups = _groups(symbols.all_classes, symbols.base_rows, layer_rows.shape[1])
+    for k, classes in ((own, symbols.classes), (layer_rows, groups)):
+        yield from Places.by(classes, GROUPS_OF_ROWS).parts(k) if classes.size else k
+
+
+def _groups(classes: np.ndarray, base_rows: int, n: int) -> np.ndarray:
+    """Returns the group of each of n layer rows, each of which is a coded channel: by step class int32 [n], those of
+    the base apart; NO_CLASSES for one group. classes: int32 [n] or NO_CLASSES."""
+    if not base_rows:
+        return classes
+    groups: np.ndarray = (classes if classes.size else np.zeros(n, np.int32)) + GROUPS_OF_ROWS // 2
+    groups[:base_rows] -= GROUPS_OF_ROWS // 2
+    return groups
 
 
 def _write_lzma(
@@ -160,34 +173,36 @@ def read_slice(
     of: Tables | None = None,
     earlier: np.ndarray = NO_CLASSES,
     past: Past[Prior] | None = None,
+    base_rows: int = 0,
 ) -> tuple[LayerSymbols, Declared]:
     """Returns (symbols, sums with this slice) of a payload. Arguments as in read_parameters.
 
     earlier: int32 [rows before], the step classes of the rows of all layers before; NO_CLASSES without any. past: of
-    the layer's earlier slices; it grows. Raises subclasses of DecodeError; nothing is allocated for a count beyond the
-    limits or the payload.
+    the layer's earlier slices; it grows. base_rows: of the file's base. Raises subclasses of DecodeError; nothing is
+    allocated for a count beyond the limits or the payload.
     """
     parameters, start, declared = read_parameters(payload, layer, table, before, of)
     if of:
-        earlier = NO_CLASSES
+        earlier, base_rows = NO_CLASSES, 0
     codes, stream = payload[start : start + parameters.codes], bytes(payload[start + parameters.codes :])
     if mode == "lzma":
         coded = _read_lzma(codes, stream, table, parameters)
     else:
         reader = ChannelReader(codes, stream, parameters.symbols, of is not None)
-        coded = _read_ans(reader, table, parameters, earlier, past or Past())
+        coded = _read_ans(reader, table, parameters, earlier, past or Past(), base_rows)
     voxels, rises, own, classes, k, layer_k, residuals, weights, bits = coded
     where, tables = f"layer {layer}", parameters.tables
-    for name, found, low in (("rise of a mask code", rises, 0), ("mask code", own, MASK_MIN_CODE)):
-        if found.size and not (low <= found.min() and found.max() <= 255):
-            raise Malformed(f"{where}: {name} in {int(found.min())}..{int(found.max())}, expected {low}..255")
+    rise = ("rise of a mask code", rises, 0, 255 if layer else 1)
+    for name, found, low, high in (rise, ("mask code", own, MASK_MIN_CODE, 255)):
+        if found.size and not (low <= found.min() and found.max() <= high):
+            raise Malformed(f"{where}: {name} in {int(found.min())}..{int(found.max())}, expected {low}..{high}")
     if any(magnitude(array) > MAX_SYMBOL for array in weights):
         raise Malformed(f"{where}: a symbol of a chain over {MAX_SYMBOL} in magnitude")
     predictors = [predictor for grid in tables.grids for predictor in grid.predictors]
     samples = restore(list(zip(predictors, residuals, strict=True)))
     arrays = [array.reshape(shape) for array, shape in zip(weights, tables.weights, strict=True)]
     tensors, fill = Tensors(tables, samples, arrays), parameters.fill
-    part = LayerSymbols(layer, table, voxels, rises, own, classes, k, tensors, fill, earlier, layer_k, bits)
+    part = LayerSymbols(layer, table, voxels, rises, own, classes, k, tensors, fill, earlier, layer_k, bits, base_rows)
     try:
         rows, layer_rows = table.values(k, classes), part.layer_table.values(layer_k, part.all_classes)
     except Malformed as error:
@@ -202,7 +217,7 @@ Coded = tuple[Array, Array, Array, Array, Array, Array, list[Array], list[Array]
 
 
 def _read_ans(
-    reader: ChannelReader, table: RowTable, parameters: Parameters, earlier: Array, past: Past[Prior]
+    reader: ChannelReader, table: RowTable, parameters: Parameters, earlier: Array, past: Past[Prior], base_rows: int
 ) -> Coded:
     n, tables, marks = parameters.rows, parameters.tables, [reader.bits]
     voxels = decode_positions(reader, n, past.positions)
@@ -212,8 +227,9 @@ def _read_ans(
     classes, width = reader.read([n] * table.graded, past.rows), RowTable(tables.rows).channels
     _check_classes(classes)
     rows = _read_rows(reader, table.channels, n, classes, past.rows)
-    everyone = np.concatenate([earlier, classes])
-    layer_rows = _read_rows(reader, width, parameters.rises + n, everyone, past.rows) if width else NO_LAYER_ROWS
+    count = parameters.rises + n
+    groups = _groups(np.concatenate([earlier, classes]), base_rows, count)
+    layer_rows = _read_rows(reader, width, count, groups, past.rows) if width else NO_LAYER_ROWS
     marks.append(reader.bits)
     known, sizes = list[Prior](), [math.prod(shape) for shape in tables.weights]
     residuals = read_planes(reader, tables.planes, known)
@@ -225,11 +241,11 @@ def _read_ans(
     return voxels, rises, own, classes, rows, layer_rows, residuals, weights, bits
 
 
-def _read_rows(reader: ChannelReader, channels: int, n: int, classes: np.ndarray, known: list[Prior]) -> np.ndarray:
-    """Decodes the symbols int32 [channels, n] of rows of these step classes, int32 [n] or NO_CLASSES."""
-    if not classes.size:
+def _read_rows(reader: ChannelReader, channels: int, n: int, groups: np.ndarray, known: list[Prior]) -> np.ndarray:
+    """Decodes the symbols int32 [channels, n] of rows of these groups, int32 [n] or NO_CLASSES."""
+    if not groups.size:
         return reader.read([n] * channels, known).reshape(channels, n)
-    places = Places.by(classes, MAX_CLASS + 1)
+    places = Places.by(groups, GROUPS_OF_ROWS)
     rows = reader.read(places.sizes * channels, known).reshape(channels, n)
     places.put(rows, rows)
     return rows

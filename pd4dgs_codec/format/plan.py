@@ -17,6 +17,7 @@ from pd4dgs_codec.entropy.fitting import entropy_bits
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.payload import write_slice
+from pd4dgs_codec.format.reader import Base
 from pd4dgs_codec.kinds import AnyScene, hexplane
 from pd4dgs_codec.kinds.splats import SplatScene
 from pd4dgs_codec.morton import morton_order
@@ -58,16 +59,23 @@ def tensor_bytes(symbols: Tensors, options: EncodeOptions) -> int:
 
 @dataclass(frozen=True, eq=False)
 class SceneSymbols:
-    """A scene, or a prefix of its layers, as a file stores it. kind: of the scene. table: of the rows."""
+    """A scene, or a prefix of its layers, as a file stores it. kind: of the scene. table: of the rows. base: whose rows
+    come before those of the layers."""
 
     info: SceneInfo
     kind: Kind
     table: RowTable
     layers: Sequence[LayerSymbols]
+    base: Base | None = None
+
+    @property
+    def base_rows(self) -> int:
+        """Number of the base's rows, 0 without one."""
+        return self.base.reference.rows if self.base else 0
 
     def scene(self) -> AnyScene:
         """Returns the dequantised scene (clause 11.5)."""
-        grown = Growing(self.table, self.info.voxel_size)
+        grown = Growing(self.table, self.info.voxel_size, self.base.grown if self.base else None)
         for layer in self.layers:
             grown.add(layer)
         return kinds.scene_of(self.kind, self.table, self.info, grown)
@@ -83,34 +91,64 @@ class Plan:
     left_out: list[LeftOut]
 
 
-def plan(scene: AnyScene, options: EncodeOptions = DEFAULTS) -> Plan:
+def plan(scene: AnyScene, options: EncodeOptions = DEFAULTS, base: Base | None = None) -> Plan:
     """Plans a file of `scene` by options.layers and options.omit; options.step_scale is not applied.
 
-    Steps are rounded to binary32, and rows sorted by (layer, Morton order). Raises EncodeError for a value that has no
-    symbol, and for voxels with two anchors.
+    Steps are rounded to binary32, and rows sorted by (layer, Morton order). base: its layer 0 is not written, and its
+    rows, the first ones of the scene, stay where they are. Raises EncodeError for a value that has no symbol, for
+    voxels with two anchors, and for a scene that differs from its base in what the file does not hold.
     """
     left_out: list[LeftOut] = []
     scene = scene.scaled(1.0)
     auto = options.layers == "auto"
     if not auto:
         scene, left_out = _cut(scene, int(options.layers))
-    tensors = {layer: symbols_of(scene, layer) for layer in scene.layers}
+    base_rows = 0
+    if base is not None:
+        _check_over(scene, base)
+        base_rows = base.reference.rows
+    tensors = {layer: symbols_of(scene, layer) if layer or not base else NOTHING for layer in scene.layers}
     for layer in reversed(scene.layers[1:]):
         scene, tensors[layer], dropped = _drop_heads(scene, layer, tensors[layer])
         left_out += dropped
     kept = [layer for layer in scene.layers if layer == 0 or not auto or scene.deformation(layer) is not None]
-    arranged, rows = in_file_order(scene, tuple(kept))
+    arranged, rows = in_file_order(scene, tuple(kept), base_rows)
     if inactive := scene.rows[-1] - len(rows):
         why = f"mask at or below the threshold at level {scene.level}"
         left_out.append(LeftOut(f"{inactive} anchors", why, anchors=inactive))
     if options.omit != "nothing" and isinstance(arranged, Scene):
         arranged, unread = _without_unread(arranged, tensors)
         left_out += unread
-    table = kinds.row_table(arranged)
-    if isinstance(arranged, SplatScene) and not table.graded:
+    table = base.header.table if base else kinds.row_table(arranged)
+    if isinstance(arranged, SplatScene) and not table.graded and not base:
         table = _predicted(table, list(arranged.attributes.values()), NO_CLASSES)
-    layers = [layer_symbols(arranged, index, tensors[layer], table, options) for index, layer in enumerate(kept)]
-    return Plan(arranged, SceneSymbols(arranged.info, kinds.kind_of(arranged), table, layers), left_out)
+    layers = [
+        layer_symbols(arranged, index, tensors[layer], table, options, base_rows) for index, layer in enumerate(kept)
+    ]
+    return Plan(arranged, SceneSymbols(arranged.info, kinds.kind_of(arranged), table, layers, base), left_out)
+
+
+def _check_over(scene: AnyScene, base: Base) -> None:
+    """Raises EncodeError unless the scene's first rows and the grids and chains of its layer 0 are those of the base,
+    and its other rows are coded alike."""
+    header, n = base.header, base.reference.rows
+    table, own = header.table, kinds.row_table(scene)
+    alike = own.tensors == tuple(replace(tensor, predictor=0) for tensor in table.tensors)
+    alike &= kinds.kind_of(scene) == header.kind and scene.info.voxel_size == header.info.voxel_size
+    alike &= own.graded == table.graded and np.array_equal(own.centre_values, table.centre_values)
+    expect(alike, "kind, widths, steps, centres or voxel size, expected those of the base")
+    (voxels, classes, *rows), (codes,), _ = base.grown.arrays(False)
+    given = {"anchor_q": scene.anchor_q, **scene.attributes, "step classes": classes}
+    given |= {"step classes": scene.grading.classes} if scene.grading else {}
+    for (name, x), expected in zip(given.items(), (voxels, *rows, classes), strict=True):
+        same = len(x) >= len(expected) and np.array_equal(x[: len(expected)].reshape(expected.shape), expected)
+        expect(same, f"{name} of the first {n} anchors, expected those of the base")
+    shown = scene.mask[0][:n]
+    same = len(shown) == n and bool(((shown == codes) | (shown == 0)).all())
+    expect(same, f"mask of layer 0 of the first {n} anchors, expected codes of the base or 0")
+    tensors, others = kinds.tensors_of(scene, 0), base.grown.tensors[0]
+    same = tensors.tables == others.tables and all(map(np.array_equal, tensors.arrays, others.arrays))
+    expect(same, "networks of layer 0, expected those of the base")
 
 
 def _predicted(table: RowTable, values: Sequence[np.ndarray], classes: np.ndarray) -> RowTable:
@@ -146,25 +184,27 @@ def layer_symbols(
     tensors: Tensors = NOTHING,
     table: RowTable | None = None,
     options: EncodeOptions = DEFAULTS,
+    base_rows: int = 0,
 ) -> LayerSymbols:
     """Returns scene.layers[index] of a scene in file order, with these symbols of its grids and chains. table: of its
-    rows. Raises EncodeError for a value that has no symbol."""
-    first, last = scene.rows[index - 1] if index else 0, scene.rows[index]
+    rows. base_rows: its first rows, which belong to its base. Raises EncodeError for a value that has no symbol."""
+    first, last = scene.rows[index - 1] if index else base_rows, scene.rows[index]
     table = kinds.row_table(scene) if table is None else table
     codes = scene.mask[index].astype(np.int32)
-    before = scene.mask[index - 1].astype(np.int32) if index else codes[:0]
+    rises = codes[:first] - scene.mask[index - 1] if index else (codes[:first] == 0).astype(np.int32)
     classes = NO_CLASSES if scene.grading is None else scene.grading.classes[first:last].astype(np.int32)
     values = {name: x[first:last] for name, x in scene.attributes.items()}
     own = LayerSymbols(
         layer=scene.layers[index],
         table=table,
         anchor_q=scene.anchor_q[first:last],
-        rises=codes[:first] - before,
+        rises=rises,
         codes=codes[first:],
         classes=classes,
         rows=table.quantise(list(values.values()), classes, list(values)),
         tensors=tensors,
         fill=scene.fills[index] if scene.fills else None,
+        base_rows=base_rows,
     )
     return _with_layer_rows(own, scene, last, options) if isinstance(scene, SplatScene) and tensors.tables.rows else own
 
@@ -235,19 +275,22 @@ def passed(scene: Scene, index: int, rows: np.ndarray) -> Scene:
     return replace(scene, rows=(scene.rows[-1],) * len(masks), mask=tuple(masks))
 
 
-def in_file_order(scene: S, kept: tuple[int, ...]) -> tuple[S, np.ndarray]:
+def in_file_order(scene: S, kept: tuple[int, ...], base_rows: int = 0) -> tuple[S, np.ndarray]:
     """Returns (scene with the layers `kept` and rows sorted by (layer, Morton order), int64 [n], rows of the given
-    scene in this order). Anchors with masks of 0 in all of these layers are dropped."""
+    scene in this order). Anchors with masks of 0 in all of these layers are dropped. The first base_rows rows, those of
+    a base, stay as they are."""
     codes = scene.full_masks()
     by_layer = dict(zip(scene.layers, codes, strict=True))
     masks = np.stack([*(by_layer[layer] for layer in kept[:-1]), codes[-1]])
     first = np.where(masks[-1] > 0, (masks > 0).argmax(axis=0), len(kept))
+    first[:base_rows] = -1
     groups = [np.flatnonzero(first == i) for i in range(len(kept))]
-    order = np.concatenate([group[morton_order(scene.anchor_q[group])] if group.size else group for group in groups])
-    rows = tuple(int(n) for n in np.cumsum([group.size for group in groups]))
+    ordered = [group[morton_order(scene.anchor_q[group])] if group.size else group for group in groups]
+    order = np.concatenate([np.arange(base_rows), *ordered])
+    rows = tuple(int(n) for n in base_rows + np.cumsum([group.size for group in groups]))
     if (voxel := first_duplicate(scene.anchor_q[order])) is not None:
         raise EncodeError(f"anchor_q: voxel {voxel} holds more than one anchor, expected one")
-    if scene.grading is not None and not scene.grading.classes[order].any():
+    if scene.grading is not None and not (scene.grading.classes[order].any() or base_rows):
         scene = replace(scene, grading=None)
     masks_of = tuple(m[order][:n] for m, n in zip(masks, rows, strict=True))
     fills = dict(zip(scene.layers, scene.fills, strict=False))

@@ -85,9 +85,15 @@ class Packer:
         """Number of the source's Gaussians that no view sees."""
         return len(self.source.means[0]) - len(self.ordered.rows)
 
+    @property
+    def scalars(self) -> int:
+        """Numbers of all Gaussians at the key instant."""
+        return len(self.ordered.rows) * sum(self.ordered.channels.values())
+
     def scene(self, psnr: float) -> splats.SplatScene:
         """Returns the scene whose pictures have `psnr` dB against those of the source."""
-        theta = 10 ** (-psnr / 10) / (len(self.ordered.rows) * sum(self.ordered.channels.values()))
+        scalars = self.scalars
+        theta = 10 ** (-psnr / 10) / scalars
         if self.changes and not self.grouping:  # for all qualities: it takes longer than all else
             places = place(self.ordered.values["position"], self.info.box)
             self.grouping = Grouping.of(self.changes, places, theta)
@@ -126,15 +132,19 @@ class Packer:
             centres["color"], centres["harmonics"], steps["harmonics"] = middle[:3], middle[3:], steps["color"]
         if self.source.windows is not None:
             windows = self.source.windows[packed.rows].astype(np.float64)
-            shortest = np.quantile(windows[:, 1] + windows[:, 2], SHORT)
-            windows[:, 2] = np.log(windows[:, 2])
             spacing = np.ldexp(1.0, packed.classes.astype(int))[:, None]
-            step = float(np.float32(PRECISE * shortest / spacing.max()))
-            middle = np.rint(np.median(windows, axis=0) / step)
+            step = self._window_step(windows, float(spacing.max()))
+            windows[:, 2] = np.log(windows[:, 2])
+            middle = self.ordered.centre("window", windows, step)
             k = np.rint((windows / step - middle) / spacing)
             tensors["window"] = ((middle + k * spacing) * step).astype(np.float32)
-            steps["window"], centres["window"] = step, middle.astype(np.int32)
+            steps["window"], centres["window"] = step, middle
         return tensors, steps, centres
+
+    def _window_step(self, windows: np.ndarray, coarsest: float) -> float:
+        """Returns the step, exact binary32, of windows float64 [n, 3]. coarsest: the largest 2^class."""
+        shortest = np.quantile(windows[:, 1] + windows[:, 2], SHORT)
+        return float(np.float32(PRECISE * shortest / coarsest))
 
     # -- what changes --------------------------------------------------------------------------------------------------
 
@@ -168,7 +178,7 @@ class Packer:
         kept.sort(reverse=True)
         rest = np.cumsum([energy for energy, *_ in kept][::-1])[::-1]
         first = [row for row, behind in zip(kept, rest, strict=True) if behind > error]
-        allowed = STRAIGHT * grid.theta * len(self.ordered.rows) * sum(self.ordered.channels.values())
+        allowed = STRAIGHT * grid.theta * self.scalars
         at = (packed.cells + packed.tensors["offset"].astype(np.float64)) * packed.voxel_size
         grouping = self.grouping and replace(self.grouping, places=place(at, self.info.box))
         layers = {1: first or kept, 2: kept[len(first) :] if first else []}

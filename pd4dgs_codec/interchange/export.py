@@ -98,6 +98,7 @@ def exported(
     eyes: from which a scaffold is baked; None for splats, which stay as they are. degree: of the harmonics, at most.
     turn: rotation of the world, [3, 3].
     """
+    player, t = player.at(t)
     if isinstance(player, SplatPlayer):
         splats, slots = player.splats(t)
         if not (finite := finite_rows(vars(splats))).all():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +21,7 @@ from pd4dgs_codec.interchange.direct import Packer
 from pd4dgs_codec.interchange.sampled import Sampled, sampled
 from pd4dgs_codec.interchange.splats import evenly, picture
 from pd4dgs_codec.interchange.teacher import GOLDEN, SOLID, Options, Teacher, cameras_of, read_model
-from pd4dgs_codec.kinds.splats import SplatScene
+from pd4dgs_codec.kinds.splats import Splats, SplatScene
 from pd4dgs_codec.quality.image import mpsnr
 from pd4dgs_codec.scene import Camera, SceneInfo
 from pd4dgs_codec.threads import one_blas_thread
@@ -88,7 +88,8 @@ def import_model(
     about, seconds = metadata or Metadata(), seconds or model.seconds
     static = float(source.static.mean())
     tell(f"{place}: {_about(source, seconds, static)}")
-    info, cameras, judges = _scene_info(place, model, source, seconds, background, up)
+    some = [source.frame(i, bare=False) for i in evenly(range(instants), BOX_INSTANTS)]
+    info, cameras, judges = scene_info(place, model, some, seconds, background, up)
     with progress("packing", None) as step:
         packer = Packer(model, source, cameras, info, step)
         write = _writer(packer, slices, step)
@@ -115,19 +116,18 @@ def _about(source: Sampled, seconds: float, static: float) -> str:
     return f"{count:,} Gaussians, harmonics of degree {degree}, {times}, {source.order}, {static:.0%} static"
 
 
-def _scene_info(
-    place: str, model: Teacher, source: Sampled, seconds: float, background: Any, up: Any
+def scene_info(
+    place: str, model: Teacher, some: Sequence[Splats], seconds: float, background: Any, up: Any
 ) -> tuple[SceneInfo, list[Camera], list[tuple[Camera, float]]]:
-    """Returns (info but the voxel size, cameras that decide, cameras and times that measure)."""
-    middle = len(source.times) // 2
-    frames = [source.frame(i, bare=False) for i in evenly(range(len(source.times)), BOX_INSTANTS)]
-    everywhere = np.concatenate([frame.means[frame.opacities >= SOLID] for frame in frames])
+    """Returns (info but the voxel size, cameras that decide, cameras and times that measure). some: the Gaussians at
+    some instants, at one if nothing moves."""
+    everywhere = np.concatenate([frame.means[frame.opacities >= SOLID] for frame in some])
     if not len(everywhere):
-        everywhere = source.means[middle]
+        everywhere = np.concatenate([frame.means for frame in some])
     options = Options(views=CAMERAS, size=(SIZE, SIZE))
     cameras, level = cameras_of(Path(place), everywhere, replace(options, up=up) if up else options)
     near, far = depth_range([c.viewmat.astype(np.float64) for c in cameras], points_box(everywhere), everywhere)
-    times = seconds_range(0.0, seconds) if len(source.times) > 1 else (0.0, 1.0)
+    times = seconds_range(0.0, seconds) if len(some) > 1 else (0.0, 1.0)
     box, behind = points_box(everywhere).astype(np.float32), background or model.background
     near, far = (float(np.float32(x)) for x in (near, far))
     fitting, others = held_out(cameras, HOLDOUT)

@@ -89,7 +89,7 @@ def tensors_of(splats: Splats) -> Tensors:
     quats, scales = turned(splats.quats.astype(np.float64), splats.scales, np.array([1.0, 0, 0, 0]))
     return {
         "position": splats.means.astype(np.float64),
-        "color": (splats.sh @ YCOCG.T).reshape(len(scales), -1),
+        "color": (splats.sh @ YCOCG.T).reshape(len(scales), 3 * splats.sh.shape[1]),
         "opacity": logits(splats.opacities)[:, None],
         "scale": log_scales(scales),
         "rotation": quats[:, 1:],
@@ -177,18 +177,22 @@ class Grid:
     classes: np.ndarray
 
     @staticmethod
-    def of(weights: Tensors, channels: dict[str, int], bounds: Tensors, theta: float) -> Grid:
+    def of(
+        weights: Tensors, channels: dict[str, int], bounds: Tensors, theta: float, given: dict[str, float] | None = None
+    ) -> Grid:
         """Chooses steps and classes. channels: the number of a Gaussian's scalars by tensor. bounds: the largest step,
-        [n] or one for all, by tensor: derivatives tell nothing about larger errors, which uncover what is hidden."""
+        [n] or one for all, by tensor: derivatives tell nothing about larger errors, which uncover what is hidden.
+        given: the steps, of which only classes are chosen."""
         classes, steps = np.zeros(len(weights["color"])), dict[str, float]()
         for turn in range(7):  # steps follow from classes, and classes from steps
             steps = {name: np.sqrt(12 * theta / np.mean(h * 4.0**classes)) for name, h in weights.items()}
             steps |= {name: min(steps[name], np.median(most) / SPREAD) for name, most in bounds.items()}
+            steps = given or steps
             if turn == 6:
                 break
             added = np.sum([h * (channels[name] * steps[name] ** 2 / 12) for name, h in weights.items()], axis=0)
             own = 0.5 * np.log2(theta * sum(channels.values()) / np.maximum(added, 1e-12 * added.max()))
-            own = np.rint(own - np.quantile(own, FINEST))
+            own = np.rint(own if given else own - np.quantile(own, FINEST))
             for name, most in bounds.items():
                 own = np.minimum(own, np.floor(np.log2(np.maximum(most / steps[name], 1))))
             classes = np.clip(own, 0, MAX_CLASS)
@@ -241,21 +245,24 @@ class Ordered:
     rows: np.ndarray
 
     @staticmethod
-    def of(splats: Splats, weights: Tensors) -> Ordered:
-        """Sorts the Gaussians and leaves out those on which no picture depends."""
+    def of(
+        splats: Splats, weights: Tensors, place: Callable[[np.ndarray], tuple[float, np.ndarray]] | None = None
+    ) -> Ordered:
+        """Sorts the Gaussians and leaves out those on which no picture depends. place: finds voxels as `voxels` does,
+        the default."""
         rows = np.flatnonzero(sum(weights.values()) > 0)
         at = splats.means[rows].astype(np.float64)
-        voxel_size, cells = voxels(at)
+        voxel_size, cells = (place or voxels)(at)
         order = morton_order(cells)
         rows, cells = rows[order], cells[order].astype(np.int32)
         return Ordered(
             tensors_of(splats.taken(rows)), {k: h[rows] for k, h in weights.items()}, voxel_size, cells, rows
         )
 
-    def grid(self, theta: float) -> Grid:
-        """Returns the grid for an error by each scalar."""
+    def grid(self, theta: float, given: dict[str, float] | None = None) -> Grid:
+        """Returns the grid for an error by each scalar. given: its steps."""
         bounds = BOUNDS | {"position": OWN_SIZE * np.exp(self.values["scale"].max(axis=1))}
-        return Grid.of(self.weights, self.channels, bounds, theta)
+        return Grid.of(self.weights, self.channels, bounds, theta, given)
 
     @property
     def channels(self) -> dict[str, int]:
@@ -271,10 +278,14 @@ class Ordered:
                 coded, unit_ = "offset", self.voxel_size
                 x = x / unit_ - self.cells
             step = float(np.float32(grid.steps[name] / unit_))
-            centre = np.rint(np.median(x, axis=0) / step).astype(np.int32)
+            centre = self.centre(coded, x, step)
             tensors[coded] = grid.rounded(x, step, grid.weights[name] * unit_**2, centre)
             steps[coded], centres[coded] = step, centre
         return Packed(self.voxel_size, self.cells, tensors, steps, centres, grid.classes, self.rows)
+
+    def centre(self, name: str, values: np.ndarray, step: float) -> np.ndarray:
+        """Returns the value of symbol 0 of each channel of a tensor's values [n, C], int32 [C], in steps."""
+        return np.asarray(np.rint(np.median(values, axis=0) / step), np.int32)
 
 
 def voxels(at: np.ndarray) -> tuple[float, np.ndarray]:
@@ -286,10 +297,15 @@ def voxels(at: np.ndarray) -> tuple[float, np.ndarray]:
         if len(np.unique(np.rint(at / size).astype(np.int64) @ KEYS)) >= LONELY * len(at):
             break
         size /= 2
+    return float(size), cells_of(at, size, np.zeros((0, 3), np.int64))
+
+
+def cells_of(at: np.ndarray, size: float, others: np.ndarray) -> np.ndarray:
+    """Returns distinct voxels of this side near the positions [n, 3], none of them one of `others` [m, 3], int64."""
     own = np.rint(at / size).astype(np.int64)
     cells = own.copy()
-    taken, first = np.unique(own @ KEYS, return_index=True)
-    rows = np.setdiff1d(np.arange(len(at)), first)
+    lonely, taken = _first_come(own, others.astype(np.int64) @ KEYS)
+    rows = np.flatnonzero(~lonely)
     around = _offsets(1)
     order = np.argsort(np.square(around - (at[rows] / size - own[rows])[:, None]).sum(axis=2), axis=1)
     for choice in range(len(around)):  # the nearest free voxels
@@ -314,7 +330,7 @@ def voxels(at: np.ndarray) -> tuple[float, np.ndarray]:
         left = np.ones(len(rows), bool)
         left[near[won]] = False
         rows, tries, stride = rows[left], tries[left], stride[left]
-    return float(size), cells
+    return np.asarray(cells)
 
 
 def _offsets(reach: int) -> np.ndarray:

@@ -258,9 +258,9 @@ def _pairs(here: np.ndarray, there: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return rows, to[rows]
 
 
-def _matched(where: str, times: np.ndarray, frames: Sequence[Splats]) -> Sampled:
+def _matched(where: str, times: np.ndarray, frames: Sequence[Splats], reach: float | None = None) -> Sampled:
     """Chains the Gaussians of neighbouring frames that match. A chain stays as it is before and after its frames."""
-    reach = float(np.median([_reach(frame) for frame in evenly(frames, TRIPLES)]))
+    reach = reach or float(np.median([_reach(frame) for frame in evenly(frames, TRIPLES)]))
     chain, links = np.arange(len(frames[0].means)), [np.arange(len(frames[0].means))]
     count, kept, speed = len(chain), 0, np.zeros_like(frames[0].means)
     for now, later in zip(frames[:-1], frames[1:], strict=True):

@@ -112,8 +112,9 @@ def json(kind: Kind, table: RowTable) -> dict[str, Any]:
 def json_of_layer(kind: Kind, table: RowTable, layers: Mapping[int, Tables]) -> dict[str, Any]:
     """Returns the tables of the last of the layers so far, in the words of its kind as `json` does."""
     (layer, own) = list(layers.items())[-1]
-    try:
-        check(kind, table, {number: Tensors(tables) for number, tables in layers.items()})
+    try:  # without tables, layer 0 may be one that adds to a base
+        found = {number: Tensors(tables) for number, tables in layers.items()}
+        check(kind, table, found if layer or own != NOTHING.tables else {})
     except DecodeError:
         return own.json()
     if kind[0] == splats.NUMBER:

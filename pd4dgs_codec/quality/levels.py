@@ -19,7 +19,9 @@ from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.io import read_source
 from pd4dgs_codec.kinds import AnyScene
+from pd4dgs_codec.quality.timeline import Timeline
 from pd4dgs_codec.scene import MASK_THRESHOLD, Camera
+from pd4dgs_codec.segments import base_beside, is_folder
 
 if TYPE_CHECKING:
     from pd4dgs_codec.model.model import Model
@@ -74,19 +76,25 @@ def load_levels(
     last_only: bool = False,
     background: tuple[float, float, float] | None = None,
 ) -> list[Level]:
-    """Loads the levels of a `.pd4` file (or its bytes) or of a checkpoint, ascending, up to max_layer.
+    """Loads the levels of a `.pd4` file (or its bytes), of a folder of segments or of a checkpoint, ascending, up to
+    max_layer.
 
     max_bytes: decode only the slices of a `.pd4` within this many bytes. last_only: only the last of these levels.
     background: RGB in place of the scene's. Each level of a `.pd4` is decoded from its own prefix, so no data of later
     layers can leak into it. Raises DataError for a file that cannot be read, DecodeError for an invalid `.pd4`.
     """
-    data = file if isinstance(file, bytes) else read_source(file)
-    if isinstance(file, bytes) or data.startswith(SIGNATURE[:4]):
-        levels = _of_bytes(data, max_layer, max_bytes, last_only)
+    whole = isinstance(file, bytes) or not is_folder(file)
+    data = file if isinstance(file, bytes) else read_source(file) if whole else b""
+    if not whole and max_bytes is None:
+        levels = _of_segments(str(file), max_layer)[-1 if last_only else 0 :]
+    elif isinstance(file, bytes) or data.startswith(SIGNATURE[:4]):
+        base = None if isinstance(file, bytes) else base_beside(file)
+        levels = _of_bytes(data, max_layer, max_bytes, last_only, base)
     elif max_bytes is None:
         levels = _of_checkpoint(data, str(file), max_layer)[-1 if last_only else 0 :]
     else:
-        raise DataError(f"{file}: a checkpoint has no slices; expected a .pd4 file")
+        what = "a checkpoint has no slices" if whole else "segments have slices of their own"
+        raise DataError(f"{file}: {what}; expected a .pd4 file")
     if background is not None:
         for level in levels:
             level.model.info = replace(level.model.info, background=background)
@@ -95,17 +103,26 @@ def load_levels(
     return levels
 
 
-def _of_bytes(data: bytes, max_layer: int | None, max_bytes: int | None, last_only: bool) -> list[Level]:
+def _of_segments(path: str, max_layer: int | None) -> list[Level]:
+    found = [Timeline(path, max_layer)]
+    while found[0].level:
+        found.insert(0, Timeline(path, found[0].level - 1))
+    return [Level(each.level, each, len(each.active), each.bytes) for each in found]
+
+
+def _of_bytes(
+    data: bytes, max_layer: int | None, max_bytes: int | None, last_only: bool, base: bytes | None
+) -> list[Level]:
     levels, ends = [], dict[int, int]()
     for row in info(data)["layers"]:
         within = [part["end"] for part in row["slices"] if max_bytes is None or part["end"] <= max_bytes]
         if within and (max_layer is None or row["layer"] <= max_layer):
             ends[row["layer"]] = within[-1]
     if not ends and max_bytes is not None:
-        decode(data, max_bytes=max_bytes)  # raises the reason
+        decode(data, max_bytes=max_bytes, base=base)  # raises the reason
     for layer in list(ends)[-1:] if last_only else ends:
         start = perf_counter()
-        scene = decode(data[: ends[layer]], max_layer=layer, max_bytes=ends[layer])
+        scene = decode(data[: ends[layer]], max_layer=layer, max_bytes=ends[layer], base=base)
         seconds = perf_counter() - start
         levels.append(replace(level_of(scene), cumulative_bytes=ends[layer], decode_seconds=seconds))
     return levels

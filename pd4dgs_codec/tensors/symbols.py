@@ -10,7 +10,7 @@ import numpy as np
 
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.morton import MAX_VOXEL, morton_order
-from pd4dgs_codec.scene import Network
+from pd4dgs_codec.scene import MASK_MIN_CODE, Network
 from pd4dgs_codec.tensors.quantise import NO_CLASSES, RowTable, all_finite, dequantise
 from pd4dgs_codec.tensors.tables import Fill, Tables, Tensors
 
@@ -26,7 +26,8 @@ class LayerSymbols:
     int32 [W, n], in steps. tensors: int32. fill: what a prefix that ends here has behind its Gaussians; None: the
     background. earlier: int32 [rows before], the step classes of earlier anchors, empty without any and in a later
     slice. layer_rows: int32 [channels, rows before + n], in steps; in a later slice only of its own anchors. bits: that
-    each group of channels took in the file, by its name, if it was read from one.
+    each group of channels took in the file, by its name, if it was read from one. base_rows: so many of the earlier
+    anchors are those of the file's base; in its layer 0 a rise is 1 for those that it hides, else 0.
     """
 
     layer: int
@@ -41,6 +42,7 @@ class LayerSymbols:
     earlier: np.ndarray = field(default_factory=lambda: NO_CLASSES)
     layer_rows: np.ndarray = field(default_factory=lambda: NO_LAYER_ROWS)
     bits: Mapping[str, int] = field(default_factory=dict)
+    base_rows: int = 0
 
     @property
     def layer_table(self) -> RowTable:
@@ -96,7 +98,7 @@ def sliced(layer: LayerSymbols, rows: np.ndarray, first: bool) -> LayerSymbols:
     part, kept = layer, np.concatenate([np.arange(earlier if first else 0), earlier + rows])
     if not first:
         tensors = Tensors(Tables(rows=layer.tensors.tables.rows))
-        part = replace(layer, rises=layer.rises[:0], tensors=tensors, earlier=NO_CLASSES)
+        part = replace(layer, rises=layer.rises[:0], tensors=tensors, earlier=NO_CLASSES, base_rows=0)
     return replace(
         part,
         layer_rows=layer.layer_rows[:, kept] if layer.layer_rows.size else layer.layer_rows,
@@ -177,10 +179,10 @@ class Growing:
     """The values of the slices so far. Each slice is dequantised only once.
 
     The rows of a layer are in order of arrival until the next layer begins or `sort` is called, and then in the order
-    of clause 12.2.
+    of clause 12.2. base: of the base's layer 0, whose rows are the first ones of layer 0.
     """
 
-    def __init__(self, table: RowTable, voxel_size: float):
+    def __init__(self, table: RowTable, voxel_size: float, base: Growing | None = None):
         self._table, self._voxel_size = table, voxel_size
         self._anchor_q, self._classes = _Column(np.int32, 3), _Column(np.uint8)
         self._rows = [_Column(np.float32, tensor.channels) for tensor in table.tensors]
@@ -190,6 +192,15 @@ class Growing:
         self.fills = dict[int, Fill | None]()  #: by layer
         self._first = 0  # row of the layer in progress
         self._sorted = True  # whether its rows are
+        if base is not None:
+            self._codes, self._layer_rows = [_Column(np.uint8)], [[]]
+            own, others = (
+                (one._anchor_q, one._classes, *one._rows, one._codes[0])  # noqa: SLF001
+                for one in (self, base)
+            )
+            for column, values in zip(own, others, strict=True):
+                column.grow(values.size)[:] = values.values
+            self.tensors, self.fills = dict(base.tensors), dict(base.fills)
 
     def add(self, part: LayerSymbols, first: bool = True) -> None:
         """Adds a slice. first: whether it is the first one of its layer."""
@@ -197,11 +208,13 @@ class Growing:
         if first:
             self.sort()
             self._first, codes = self._anchor_q.size, _Column(np.uint8)
-            before = self.codes
-            raised = codes.grow(len(before))
-            np.add(before, part.rises, out=raised, casting="unsafe")
+            codes.grow(self._first)[:] = raised(self.codes, part)
+            if part.layer in self.tensors:  # its rows follow those of the base's layer 0
+                self._codes.pop()
+                self._layer_rows.pop()
+            else:
+                self.tensors[part.layer] = part.tensors.dequantised()
             self._codes.append(codes)
-            self.tensors[part.layer] = part.tensors.dequantised()
             self._layer_rows.append([_Column(np.float32, tensor.channels) for tensor in part.tensors.tables.rows])
         self.fills[part.layer] = part.fill
         self._sorted = first or (self._sorted and not n)
@@ -271,16 +284,22 @@ class Growing:
 # -- rules between slices ----------------------------------------------------------------------------------------------
 
 
+def raised(before: np.ndarray, part: LayerSymbols) -> np.ndarray:
+    """Returns the mask codes int32 [rows before] in a layer, by its first slice. before: uint8, in the layer before."""
+    codes: np.ndarray = before + part.rises if part.layer else before * (1 - part.rises)
+    return codes
+
+
 def check_slice(part: LayerSymbols, before: np.ndarray, voxel_size: float) -> None:
     """Checks a slice against the header and the mask codes before it, uint8 [rows before].
 
-    Raises Malformed if a mask code is above 255 or a dequantised value would not be finite.
+    Raises Malformed if a mask code is above 255 or 1 or 2, or a dequantised value would not be finite.
     """
     where = f"layer {part.layer}"
     if part.rises.size:
-        highest = int((before + part.rises).max())
-        if highest > 255:
-            raise Malformed(f"{where}: mask code {highest}, expected at most 255")
+        codes = raised(before, part)
+        if (odd := codes[(codes > 255) | ((codes > 0) & (codes < MASK_MIN_CODE))]).size:
+            raise Malformed(f"{where}: mask code {int(odd.max())}, expected 0 or {MASK_MIN_CODE}..255")
     stored = [(part.anchor_q, voxel_size), *zip(part.tensors.arrays, part.tensors.tables.steps, strict=True)]
     for table, v in ((part.table, part.rows), (part.layer_table, part.layer_rows)):
         stored += [(own, tensor.step) for tensor, own in table.of_each(v)]
@@ -294,6 +313,12 @@ class TakenVoxels:
     def __init__(self) -> None:
         self._runs = list[np.ndarray]()  # ascending keys, each run more than twice as long as the next
         self._latest = np.zeros(0, np.uint64)  # keys that no run has yet: of a single slice none are sorted
+
+    def copy(self) -> TakenVoxels:
+        """A copy that grows independently."""
+        found = TakenVoxels()
+        found._runs, found._latest = list(self._runs), self._latest
+        return found
 
     def take(self, anchor_q: np.ndarray) -> None:
         """Adds distinct voxels int32 [n, 3]. Raises Malformed if one of them is taken already."""

@@ -45,47 +45,95 @@ class Video:
     poster: bytes = b""
 
 
-def dash(slices: list[dict[str, Any]], seconds: float, video: Video | None = None, video_name: str = "") -> bytes:
-    """Returns the DASH MPD. slices: `layers` of the package's index. video, video_name: 2D rendition and its file."""
+@dataclass(frozen=True)
+class Track:
+    """A `Video` as manifests list it. init: bytes before the first fragment. rate: bits per second of the fragment with
+    the most."""
+
+    name: str
+    width: int
+    height: int
+    fps: float
+    init: int
+    pieces: list[Fragment]
+    codec: str
+    rate: int
+
+    @staticmethod
+    def of(name: str, video: Video) -> Track:
+        """Lists the video in the file `name`. Raises DeliveryError unless it is fragmented H.264."""
+        init, pieces = fragments(video.data)
+        rate = math.ceil(max(8 * (piece.end - piece.start) * video.fps / piece.samples for piece in pieces))
+        codec = _codec(video.data[:init])
+        return Track(name, video.width, video.height, video.fps, init, pieces, codec, rate)
+
+
+@dataclass(frozen=True)
+class Period:
+    """A part of a presentation. slices: `layers` of its file in the package's index; base: of the file whose layer 0 it
+    continues. video: its 2D rendition."""
+
+    slices: list[dict[str, Any]]
+    seconds: float
+    video: Track | None = None
+    base: Sequence[dict[str, Any]] = ()
+
+
+def dash(periods: Sequence[Period]) -> bytes:
+    """Returns the DASH MPD. Periods with the same base have the same AdaptationSets for it, by their ids."""
     root = Element("MPD", xmlns="urn:mpeg:dash:schema:mpd:2011", profiles="urn:mpeg:dash:profile:full:2011")
-    root.attrib |= {"type": "static", "mediaPresentationDuration": _duration(seconds)}
+    total = sum(period.seconds for period in periods)
+    root.attrib |= {"type": "static", "mediaPresentationDuration": _duration(total)}
     root.set("minBufferTime", _duration(MIN_BUFFER_SECONDS))
-    period = SubElement(root, "Period", id="0", start="PT0S")
-    if video is not None:
-        _video_set(period, video, video_name)
-    before = ""
-    for row in slices:
-        where = row["dash"]
-        group = SubElement(
-            period, "AdaptationSet", contentType="application", mimeType="application/mp4", codecs="mett"
-        )
-        SubElement(group, "SupplementalProperty", schemeIdUri=LAYER_SCHEME, value=str(row["layer"]))
-        if before:
-            SubElement(group, "SupplementalProperty", schemeIdUri=AFTER_SCHEME, value=before)
-        bandwidth = min(math.ceil(8 * where["range"][1] / MIN_BUFFER_SECONDS), (1 << 32) - 1)
-        before = f"L{row['layer']}.{row['slice']}" if row["slice"] else f"L{row['layer']}"
-        representation = SubElement(group, "Representation", id=before, bandwidth=str(bandwidth))
-        _segment_list(representation, where["file"], where["init"][1], seconds, [where["range"]])
+    start, shared = 0.0, dict[str, int]()
+    for i, part in enumerate(periods):
+        period = SubElement(root, "Period", id=str(i), start=_duration(start))
+        start += part.seconds
+        if part.video is not None:
+            _video_set(period, part.video)
+        before = ""
+        for row in part.base:
+            number = shared.setdefault(f"{row['dash']['file']} {row['slice']}", len(shared) + 1)
+            before = _slice_set(period, row, part.seconds, before, "B", {"id": str(number)})
+        for row in part.slices:
+            before = _slice_set(period, row, part.seconds, before, "L", {})
     indent(root)
     text: bytes = tostring(root, encoding="utf-8", xml_declaration=True)
     return text + b"\n"
 
 
-def _video_set(period: Element, video: Video, name: str) -> None:
-    init, pieces = fragments(video.data)
+def _slice_set(
+    period: Element, row: dict[str, Any], seconds: float, before: str, letter: str, more: dict[str, str]
+) -> str:
+    """Adds the set of a slice, which needs the Representation `before`; returns the id of its own."""
+    where = row["dash"]
+    kind = more | {"contentType": "application", "mimeType": "application/mp4", "codecs": "mett"}
+    group = SubElement(period, "AdaptationSet", kind)
+    SubElement(group, "SupplementalProperty", schemeIdUri=LAYER_SCHEME, value=str(row["layer"]))
+    if before:
+        SubElement(group, "SupplementalProperty", schemeIdUri=AFTER_SCHEME, value=before)
+    bandwidth = min(math.ceil(8 * where["range"][1] / MIN_BUFFER_SECONDS), (1 << 32) - 1)
+    name = f"{letter}{row['layer']}.{row['slice']}" if row["slice"] else f"{letter}{row['layer']}"
+    representation = SubElement(group, "Representation", id=name, bandwidth=str(bandwidth))
+    _segment_list(representation, where["file"], where["init"][1], seconds, [where["range"]])
+    return name
+
+
+def _video_set(period: Element, video: Track) -> None:
     kind = {"contentType": "video", "mimeType": "video/mp4", "segmentAlignment": "true", "startWithSAP": "1"}
     representation = SubElement(
         SubElement(period, "AdaptationSet", kind),
         "Representation",
         id="video",
-        bandwidth=str(_peak_rate(video, pieces)),
-        codecs=_codec(video.data[:init]),
+        bandwidth=str(video.rate),
+        codecs=video.codec,
         width=str(video.width),
         height=str(video.height),
         frameRate=f"{round(video.fps * 1000)}/1000",
     )
-    seconds = max(piece.samples for piece in pieces) / video.fps
-    _segment_list(representation, name, init, seconds, [(piece.start, piece.end) for piece in pieces])
+    seconds = max(piece.samples for piece in video.pieces) / video.fps
+    ranges = [(piece.start, piece.end) for piece in video.pieces]
+    _segment_list(representation, video.name, video.init, seconds, ranges)
 
 
 def _segment_list(parent: Element, url: str, init: int, seconds: float, ranges: Iterable[tuple[int, int]]) -> None:
@@ -101,32 +149,30 @@ def _duration(seconds: float) -> str:
     return f"PT{seconds:.3f}".rstrip("0").rstrip(".") + "S"
 
 
-def hls(index: str, video: Video | None = None, playlist: str = "") -> bytes:
+def hls(index: str, video: Track | None = None, playlist: str = "") -> bytes:
     """Returns the multivariant HLS playlist. index: name of the JSON index. playlist: media playlist of `video`."""
     lines = ["#EXTM3U", "#EXT-X-VERSION:7", f'#EXT-X-SESSION-DATA:DATA-ID="{SESSION_DATA_ID}",URI="{index}"']
     if video is not None:
-        init, pieces = fragments(video.data)
-        stream = f'BANDWIDTH={_peak_rate(video, pieces)},CODECS="{_codec(video.data[:init])}",'
+        stream = f'BANDWIDTH={video.rate},CODECS="{video.codec}",'
         stream += f"RESOLUTION={video.width}x{video.height},FRAME-RATE={video.fps:.3f}"
         lines += ["#EXT-X-INDEPENDENT-SEGMENTS", f"#EXT-X-STREAM-INF:{stream}", playlist]
     return ("\n".join(lines) + "\n").encode()
 
 
-def hls_video(video: Video, name: str) -> bytes:
-    """Returns the HLS media playlist of the 2D rendition, whose file is `name`."""
-    init, pieces = fragments(video.data)
-    seconds = [piece.samples / video.fps for piece in pieces]
-    lines = ["#EXTM3U", "#EXT-X-VERSION:7", "#EXT-X-PLAYLIST-TYPE:VOD", "#EXT-X-INDEPENDENT-SEGMENTS"]
-    lines.append(f"#EXT-X-TARGETDURATION:{max(1, math.ceil(max(seconds)))}")
-    lines.append(f'#EXT-X-MAP:URI="{name}",BYTERANGE="{init}@0"')
-    for piece, length in zip(pieces, seconds, strict=True):
-        lines += [f"#EXTINF:{length:.6f},", f"#EXT-X-BYTERANGE:{piece.end - piece.start}@{piece.start}", name]
-    return ("\n".join([*lines, "#EXT-X-ENDLIST"]) + "\n").encode()
-
-
-def _peak_rate(video: Video, pieces: list[Fragment]) -> int:
-    """Bits per second of the fragment with the highest rate."""
-    return math.ceil(max(8 * (piece.end - piece.start) * video.fps / piece.samples for piece in pieces))
+def hls_video(videos: Sequence[Track]) -> bytes:
+    """Returns the HLS media playlist of the 2D rendition, with a discontinuity between two of its files."""
+    lines, longest = list[str](), 1.0
+    for video in videos:
+        lines += ["#EXT-X-DISCONTINUITY"] if lines else []
+        lines.append(f'#EXT-X-MAP:URI="{video.name}",BYTERANGE="{video.init}@0"')
+        for piece in video.pieces:
+            length = piece.samples / video.fps
+            longest = max(longest, length)
+            where = f"#EXT-X-BYTERANGE:{piece.end - piece.start}@{piece.start}"
+            lines += [f"#EXTINF:{length:.6f},", where, video.name]
+    head = ["#EXTM3U", "#EXT-X-VERSION:7", "#EXT-X-PLAYLIST-TYPE:VOD", "#EXT-X-INDEPENDENT-SEGMENTS"]
+    head.append(f"#EXT-X-TARGETDURATION:{math.ceil(longest)}")
+    return ("\n".join([*head, *lines, "#EXT-X-ENDLIST"]) + "\n").encode()
 
 
 def _codec(init: bytes) -> str:

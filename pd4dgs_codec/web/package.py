@@ -9,6 +9,7 @@ import html
 import json
 import os
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -16,10 +17,24 @@ from urllib.parse import quote
 from pd4dgs_codec.errors import DeliveryError, printable
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.info import info
+from pd4dgs_codec.format.reader import Base, read_base
 from pd4dgs_codec.kinds import AnyScene
+from pd4dgs_codec.segments import INDEX as SEGMENTS_INDEX
+from pd4dgs_codec.segments import File, Index, Segment, read_file, read_index
 from pd4dgs_codec.web import PAGE
 from pd4dgs_codec.web.headers import cache_control
-from pd4dgs_codec.web.manifests import MAX_SECONDS, Video, dash, fragment, hls, hls_video, initialisation, ticks
+from pd4dgs_codec.web.manifests import (
+    MAX_SECONDS,
+    Period,
+    Track,
+    Video,
+    dash,
+    fragment,
+    hls,
+    hls_video,
+    initialisation,
+    ticks,
+)
 from pd4dgs_codec.web.page import CHARSET, Still, page, with_policy
 
 SCENE, SEGMENTS, MPD, PLAYLIST, INDEX = "scene.pd4", "scene.mp4", "scene.mpd", "scene.m3u8", "index.json"
@@ -62,10 +77,11 @@ def package(
     files = {names[name]: content for name, content in media.items()}
     for row in slices:
         row["dash"]["file"] = names[SEGMENTS]
-    files[MPD] = dash(slices, seconds, video, names.get(VIDEO, ""))
-    if video is not None:
-        files[VIDEO_PLAYLIST] = hls_video(video, names[VIDEO])
-    files[PLAYLIST] = hls(INDEX, video, VIDEO_PLAYLIST)
+    track = None if video is None else Track.of(names[VIDEO], video)
+    files[MPD] = dash([Period(slices, seconds, track)])
+    if track is not None:
+        files[VIDEO_PLAYLIST] = hls_video([track])
+    files[PLAYLIST] = hls(INDEX, track, VIDEO_PLAYLIST)
     files[PAGE] = page(names[SCENE], data, draw(scene)).encode()
     index = {
         "file": names[SCENE],
@@ -84,6 +100,84 @@ def package(
     }
     files[INDEX] = _json(index)
     return files
+
+
+def package_segments(
+    folder: Path,
+    render: Callable[[AnyScene], Video | None] = lambda scene: None,
+    draw: Callable[[AnyScene], Still | None] = lambda scene: None,
+    *,
+    immutable: bool = False,
+) -> Iterator[tuple[str, bytes]]:
+    """Yields (name, content) of every file of the package of a folder of segments; those that name others come last.
+
+    render, draw: as for `package`; `render` is called with each segment, `draw` with the first. `index.json` has the
+    slices of each file; `segments.json`, which players fetch first, has not. Raises DataError or DecodeError for a file
+    that is missing or damaged.
+    """
+    place, index = read_index(folder)
+    rows: dict[str, list[dict[str, Any]]] = {"bases": [], "segments": []}
+    periods, tracks, still, poster = list[Period](), list[Track](), None, b""
+    held: tuple[int, Base] | None = None
+
+    def media(file: File, data: bytes, seconds: float) -> Iterator[tuple[str, bytes]]:
+        """Yields a file and its MP4, and appends its row of the index."""
+        stem, _, _ = file.file.rpartition(".")
+        boxes, slices = _segments(data, info(data), seconds)
+        found = {file.file: data, f"{stem}.mp4": boxes}
+        names = [addressed(name, content) if immutable else name for name, content in found.items()]
+        for row in slices:
+            row["dash"]["file"] = names[1]
+        kind = "segments" if isinstance(file, Segment) else "bases"
+        rows[kind].append({**vars(file), "file": names[0], "layers": slices})
+        yield from zip(names, found.values(), strict=True)
+
+    for base in index.bases:
+        yield from media(base, read_file(place, base), STILL_SECONDS)
+    for number, segment in enumerate(index.segments):
+        data, (start, end) = read_file(place, segment), segment.time_range
+        if segment.base is not None and (held is None or held[0] != segment.base):
+            held = segment.base, read_base(read_file(place, index.bases[segment.base]))
+        scene = decode(data, base=held and held[1])
+        yield from media(segment, data, end - start)
+        if (video := render(scene)) is not None:
+            name = f"fallback-{number:05d}.mp4"
+            name = addressed(name, video.data) if immutable else name
+            yield name, video.data
+            tracks.append(Track.of(name, video))
+            poster = poster or video.poster
+        still = draw(scene) if number == 0 else still
+        shared = [] if segment.base is None else rows["bases"][segment.base]["layers"]
+        shared = [row for row in shared if row["layer"] == 0]
+        periods.append(Period(rows["segments"][-1]["layers"], end - start, tracks[-1] if video else None, shared))
+    files = {MPD: dash(periods), PLAYLIST: hls(INDEX, tracks[0] if tracks else None, VIDEO_PLAYLIST)}
+    files |= {VIDEO_PLAYLIST: hls_video(tracks)} if tracks else {}
+    files |= {POSTER: poster} if poster else {}
+    first = read_file(
+        place, index.segments[0] if index.segments[0].base is None else index.bases[index.segments[0].base]
+    )
+    files[PAGE] = page(SEGMENTS_INDEX, first, still).encode()
+    bases = [replace(file, file=row["file"]) for file, row in zip(index.bases, rows["bases"], strict=True)]
+    parts = [replace(file, file=row["file"]) for file, row in zip(index.segments, rows["segments"], strict=True)]
+    content = Index(tuple(bases), tuple(parts)).packed()
+    low, high = index.time_range
+    about = {
+        "file": SEGMENTS_INDEX,
+        "format_version": info(first)["format_version"],
+        "bytes": sum(file.bytes for file in index.files),
+        "sha256": hashlib.sha256(content).hexdigest(),
+        "time_range": [low, high],
+        "seconds": high - low,
+        "layers": periods[0].base or periods[0].slices,
+        "dash": MPD,
+        "hls": PLAYLIST,
+        "poster": POSTER if poster else None,
+        **rows,
+    }
+    end = about["layers"][0]["range"][1]
+    about["first_frame_seconds"] = {name: 8 * end / rate for name, rate in RATES.items()}
+    files |= {SEGMENTS_INDEX: content, INDEX: _json(about)}
+    yield from files.items()
 
 
 def addressed(name: str, content: bytes) -> str:

@@ -12,7 +12,7 @@ export const LONGEST_HEADER = PREAMBLE_SIZE + MAX_HEADER;
 const CHUNK_HEAD = 16;
 /** Bytes of a chunk around its payload. */
 export const CHUNK_OVERHEAD = CHUNK_HEAD + 4;
-const SCENE_ID_SIZE = 8;
+export const SCENE_ID_SIZE = 8;
 const ANCILLARY = 1;
 const MORE = 2;
 /** Bits 2..5. */

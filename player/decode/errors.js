@@ -4,7 +4,7 @@
  * The names of clause 15.
  *
  * @typedef {"BadSignature" | "UnsupportedVersion" | "Truncated" | "ChecksumMismatch" | "LimitExceeded"
- *   | "UnsupportedFeature" | "Malformed"} ErrorKind
+ *   | "UnsupportedFeature" | "BaseMissing" | "BaseMismatch" | "Malformed"} ErrorKind
  */
 
 /**

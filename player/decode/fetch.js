@@ -30,6 +30,7 @@ export class FetchError extends Error {
  * @property {number} [pause] seconds before the second attempt, doubled for each further one
  * @property {(received: number, total: number | null) => void} [progress] called as bytes arrive
  * @property {typeof globalThis.fetch} [fetch]
+ * @property {() => Stream} [stream] makes what decodes the file, anew if it changes
  */
 
 /** Limit of layer 0 without a budget of bytes: bytes are held until their slice is complete. */
@@ -64,8 +65,9 @@ export class SceneSource {
     /** Whether the server has no byte behind those received. */
     this._ended = false;
     this._signal = signal;
+    this._stream = options.stream ?? (() => new Stream());
     /** What decodes the bytes; another one if the file changes. */
-    this.decoder = new Stream();
+    this.decoder = this._stream();
     this._stall = stall;
     this._attempts = attempts;
     this._pause = pause;
@@ -355,7 +357,7 @@ export class SceneSource {
   _restart() {
     this.changes++;
     if (this.changes > MOST_CHANGES) throw new FetchError(`${this.url}: changed ${this.changes} times while it loaded`);
-    this.decoder = new Stream();
+    this.decoder = this._stream();
     this.received = 0;
     this._requested.received = 0;
     this._announced = this._tag = null;

@@ -70,10 +70,12 @@ function asReal(value, where) {
   return value.value;
 }
 
-/** Raises if these are not `size` bytes. @param {Value | undefined} value @param {number} size @param {string} where */
+/** These bytes; raises if they are not `size` bytes. @param {Value | undefined} value @param {number} size
+ * @param {string} where */
 export function checkBytes(value, size, where) {
   if (!(value instanceof Uint8Array)) throw malformed(`${where}: ${nameOf(value)}, expected bytes`);
   if (value.length !== size) throw malformed(`${where}: ${value.length} bytes, expected ${size}`);
+  return value;
 }
 
 /** A step: a real that is positive and normal. @param {Value | undefined} value @param {string} where */

@@ -37,14 +37,14 @@ function joined(type, arrays, order = null, first = 0) {
  * Per layer the SHA-256 of its integers and of its float32 values, of a complete file, of its layers up to maxLayer,
  * or, if allowPartial, of the slices that a cut file has. Raises as `decodeTensors` does.
  *
- * @param {Uint8Array} bytes @param {{maxLayer?: number | null, allowPartial?: boolean}} [options]
+ * @param {Uint8Array} bytes @param {import("./index.js").Options} [options]
  * @returns {LayerHashes[]}
  */
 export function hashes(bytes, options = {}) {
   /** @type {Slice[]} */
   const slices = [];
   const tensors = readAll(bytes, options, null, (slice) => slices.push(slice));
-  let first = 0;
+  let first = tensors.header.base?.rows ?? 0;
   return tensors.layers.map(({ layer, codes: { length: end } }, i) => {
     const symbols = symbolsOf(tensors, i, first, slices.filter((slice) => slice.layer === layer));
     const values = valuesOf(tensors, i, first, end);
@@ -80,6 +80,7 @@ function valuesOf({ header, positions, rows, layers }, i, first, end) {
     const { channels } = header.rows[k];
     return values.subarray(channels * first, channels * end);
   });
+  if (header.base && !i) return [positions.subarray(3 * first, 3 * end), ...own]; // the rest is the base's
   const planes = grids.flatMap((grid) => grid.planes.map(({ data }) => data));
   const weights = chains.flatMap(({ network }) => network.flatMap(({ weight, bias }) => [weight, bias]));
   return [positions.subarray(3 * first, 3 * end), ...own, ...layerRows, ...planes, ...weights];

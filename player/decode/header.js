@@ -1,9 +1,10 @@
 // Clause 5: the header.
 
-import { sceneIdOf } from "./container.js";
+import { SCENE_ID_SIZE, sceneIdOf } from "./container.js";
+import { hex } from "./digests.js";
 import { limitExceeded, malformed, unsupported } from "./errors.js";
 import { Fields, asId, asInteger, asIntegers, asItems, asList, asRegistered, asStep, checkBytes } from "./fields.js";
-import { MAX_CHANNELS, MAX_CHUNKS, MAX_KIND, MAX_PAYLOAD } from "./limits.js";
+import { MAX_CHANNELS, MAX_CHUNKS, MAX_KIND, MAX_PAYLOAD, MAX_ROWS } from "./limits.js";
 import { MAX_ROW_CHANNELS, MAX_ROW_TENSORS, MAX_SYMBOL } from "./limits.js";
 import { unpack } from "./msgpack.js";
 import { ROW_PREDICTORS, widthOf } from "./rows.js";
@@ -11,6 +12,9 @@ import { ROW_PREDICTORS, widthOf } from "./rows.js";
 /** @import { Camera, Info, RowTensor } from "./tensors.js" */
 
 /** @typedef {{type: number, length: number}} ListedChunk */
+
+/** What a file says of its base (5.6): its scene id and digest in hexadecimal, its rows, the bytes of the digest.
+ * @typedef {{sceneId: string, digest: string, rows: number, bytes: number}} Reference */
 
 /**
  * @typedef {object} Header
@@ -21,15 +25,17 @@ import { ROW_PREDICTORS, widthOf } from "./rows.js";
  * @property {number[] | null} centres of these channels; null if anchors have no step classes
  * @property {Info} info
  * @property {string} sceneId hexadecimal (3.3)
+ * @property {Reference | null} base null: the file holds its scene whole
  */
 
 /** How many layer types there are: 0, 1 and 2. */
 export const LAYER_TYPES = 3;
 
 /** The keys of a header (5.1), and of a camera. */
-const KEYS = [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14];
+const KEYS = [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15];
 const CAMERA_KEYS = [1, 2, 3, 4];
 const DIGEST_SIZE = 16;
+const BASE_DIGEST_SIZE = 32;
 const MAX_CAMERA_SIDE = 65535;
 
 /** @param {Uint8Array} bytes @returns {Header} */
@@ -45,8 +51,20 @@ export function readHeader(bytes) {
   const centres = fields.has(5) ? asIntegers(asList(fields.get(5), where, width), -MAX_SYMBOL, MAX_SYMBOL, where) : null;
   const info = readInfo(fields);
   checkBytes(fields.get(14), DIGEST_SIZE, "header: digest"); // of all layers, so that a decoder of some cannot check it
+  const base = fields.has(15) ? readReference(fields.get(15)) : null;
   if (mode === 1) throw unsupported("header: mode lzma, expected mode ans"); // an ans-only decoder (clause 16)
-  return { chunks, kind, rows, width, centres, info, sceneId: sceneIdOf(bytes.subarray(firstEntryEnd)) };
+  return { chunks, kind, rows, width, centres, info, sceneId: sceneIdOf(bytes.subarray(firstEntryEnd)), base };
+}
+
+/** @param {Value} value @returns {Reference} */
+function readReference(value) {
+  const [sceneId, digest, rows, bytes] = asList(value, "header: base", 4);
+  return {
+    sceneId: hex(checkBytes(sceneId, SCENE_ID_SIZE, "header: scene id of the base")),
+    digest: hex(checkBytes(digest, BASE_DIGEST_SIZE, "header: digest of the base")),
+    rows: asInteger(rows, 0, MAX_ROWS, "header: rows of the base"),
+    bytes: asInteger(bytes, 1, MAX_PAYLOAD, "header: bytes of the base"),
+  };
 }
 
 /** A kind's number and parameters, whatever they mean. @param {Value} value @param {string} where */

@@ -7,11 +7,12 @@
  */
 
 import { RULES, sceneOf } from "../kinds/index.js";
-import { readAll } from "./reader.js";
+import { Base, readAll } from "./reader.js";
 import { Stream } from "./stream.js";
 
 export { DecodeError } from "./errors.js";
 export { hashes } from "./hashes.js";
+export { Base } from "./reader.js";
 export { Stream } from "./stream.js";
 
 /** @typedef {import("../kinds/index.js").Scene} Scene */
@@ -24,8 +25,9 @@ export { Stream } from "./stream.js";
 /** @typedef {import("./errors.js").ErrorKind} ErrorKind */
 
 /** maxLayer: bytes behind the layers up to it are not looked at. allowPartial: a cut file, which raises Truncated, yields
- * its longest prefix of complete slices, at least one.
- * @typedef {{maxLayer?: number | null, allowPartial?: boolean}} Options */
+ * its longest prefix of complete slices, at least one, or its base alone. base: of a file that names one (clause 5.6), the
+ * bytes, or what `readBase` made of them.
+ * @typedef {{maxLayer?: number | null, allowPartial?: boolean, base?: import("./reader.js").GivenBase}} Options */
 
 /** @param {Uint8Array | ArrayBuffer} bytes */
 const viewOf = (bytes) => (bytes instanceof Uint8Array ? bytes : new Uint8Array(bytes));
@@ -52,10 +54,20 @@ export function decodeTensors(bytes, options = {}) {
 }
 
 /**
+ * Decodes the layer 0 of a file once for all files whose base it is. Raises DecodeError.
+ *
+ * @param {Uint8Array | ArrayBuffer} bytes of the file, at least up to the end of its layer 0
+ * @returns {Base}
+ */
+export function readBase(bytes) {
+  return new Base(viewOf(bytes));
+}
+
+/**
  * A decoder that takes a file in pieces: `feed(bytes)` gives the newest scene of each layer that they
  * complete a slice of.
  *
- * @param {{maxLayer?: number | null}} [options]
+ * @param {Omit<Options, "allowPartial">} [options]
  * @returns {Stream}
  */
 export function openStream(options) {

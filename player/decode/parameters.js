@@ -11,7 +11,7 @@ import { widthOf } from "./rows.js";
 /** @import { Value } from "./msgpack.js" */
 /** @import { RowTensor } from "./tensors.js" */
 
-/** The keys of a slice's parameters (6.2), and those that a later slice of a layer lacks. */
+/** The keys of a slice's parameters (6.2), and those that a later slice of a layer lacks, and layer 0 over a base. */
 const KEYS = [1, 2, 3, 4, 5, 6, 7];
 const FIRST_KEYS = [4, 5, 6, 7];
 
@@ -42,12 +42,13 @@ const FIRST_KEYS = [4, 5, 6, 7];
 /**
  * The parameters of a slice's payload; all counts are held against the limits and the payload.
  *
- * @param {Uint8Array} payload @param {Pick<import("./header.js").Header, "width" | "centres">} header
+ * @param {Uint8Array} payload @param {Pick<import("./header.js").Header, "width" | "centres" | "base">} header
  * @param {Declared} before by the slices before @param {RowTensor[] | null} known the layer's own tensors of rows if slices
- * of it came before: this one holds rows alone @param {string} where
+ * of it came before: this one holds rows alone @param {number} layer
  * @returns {Parameters}
  */
-export function readParameters(payload, { width, centres }, before, known, where) {
+export function readParameters(payload, { width, centres, base }, before, known, layer) {
+  const where = `layer ${layer}`;
   if (payload.length < 4) throw malformed(`${where}: a payload of ${payload.length} bytes, expected at least 4`);
   const length = new DataView(payload.buffer, payload.byteOffset).getUint32(0, true);
   if (length > MAX_FIELDS) throw limitExceeded(`${where}: parameters of ${length} bytes, limit ${MAX_FIELDS}`);
@@ -57,7 +58,8 @@ export function readParameters(payload, { width, centres }, before, known, where
   const rows = asInteger(fields.get(1), 0, MAX_ROWS - before.rows, `${where}: own rows`);
   const size = asInteger(fields.get(2), 0, MAX_PAYLOAD, `${where}: length of the codes`);
   if (size > rest) throw malformed(`${where}: codes of ${size} bytes, expected at most ${rest}`);
-  for (const key of FIRST_KEYS) if (known && fields.has(key)) throw malformed(`${where}: key ${key} in a later slice`);
+  const place = known ? "a later slice" : !layer && base ? "a file with a base" : null;
+  for (const key of FIRST_KEYS) if (place && fields.has(key)) throw malformed(`${where}: key ${key} in ${place}`);
   const grids = readStepped(fields, 4, MAX_GRIDS, `${where}: a grid`, readGrid);
   const chains = readStepped(fields, 5, MAX_CHAINS, `${where}: a chain`, readChain);
   const layerRows = known ?? (fields.has(7) ? readRows(fields.get(7), where) : []);

@@ -2,10 +2,12 @@
 
 import { Column } from "./columns.js";
 import { CHUNK_OVERHEAD, PREAMBLE_SIZE, readChunk, readPreamble } from "./container.js";
+import { hex, sha256 } from "./digests.js";
 import { DecodeError, limitExceeded, malformed, unsupported } from "./errors.js";
 import { LAYER_TYPES, readHeader } from "./header.js";
+import { unpack } from "./msgpack.js";
 import { dequantise, rowsOf } from "./rows.js";
-import { MOST_CODE, chainsOf, decodeSlice, gridsOf } from "./slice.js";
+import { LEAST_OWN_CODE, MOST_CODE, chainsOf, decodeSlice, gridsOf } from "./slice.js";
 import { VoxelTable, mortonOrder } from "./voxels.js";
 /** @import { Values } from "./columns.js" */
 /** @import { Header } from "./header.js" */
@@ -33,34 +35,95 @@ import { VoxelTable, mortonOrder } from "./voxels.js";
 
 /**
  * Reads a whole file, or its layers up to maxLayer; of a cut file, if allowPartial, the slices that are there, at least
- * one. Raises DecodeError.
+ * one, or without any those of its base. Raises DecodeError.
  *
- * @param {Uint8Array} bytes @param {{maxLayer?: number | null, allowPartial?: boolean}} options
+ * @param {Uint8Array} bytes @param {{maxLayer?: number | null, allowPartial?: boolean, base?: GivenBase}} options
  * @param {Rules | null} rules null: tensors of any kind are taken
  * @param {(slice: Slice) => void} [take] is given each slice
  * @returns {Tensors}
  */
-export function readAll(bytes, { maxLayer = null, allowPartial = false }, rules, take) {
-  const reader = new TensorReader(maxLayer, rules);
+export function readAll(bytes, { maxLayer = null, allowPartial = false, base = null }, rules, take) {
+  const reader = new TensorReader(maxLayer, rules, base);
   try {
     for (let slice; (slice = reader.next(bytes.subarray(reader.offset))); ) take?.(slice);
   } catch (error) {
     const cut = error instanceof DecodeError && error.kind === "Truncated";
-    if (!cut || !allowPartial || !reader.count) throw error;
+    if (!cut || !allowPartial || !reader.showable) throw error;
   }
   reader.sort();
   return reader.tensors();
 }
 
+/** @typedef {Base | Uint8Array | ArrayBuffer | null} GivenBase a file's bytes, or what was read of them */
+
+/** The layer 0 of a file, decoded once for all files whose base it is (5.6). */
+export class Base {
+  /** Raises DecodeError, Malformed if the file cannot be a base. @param {Uint8Array} bytes of the file, up to the end of
+   * its layer 0 or more */
+  constructor(bytes) {
+    const packed = readPreamble(bytes);
+    if (readHeader(packed).base) throw malformed("the base names a base itself");
+    this.reader = new TensorReader(0, null);
+    while (this.reader.next(bytes.subarray(this.reader.offset)));
+    const [layer] = this.reader.tensors().layers;
+    if (layer.rowTensors.length) throw malformed("the base has layer rows in layer 0, expected none");
+    this.header = /** @type {Header} */ (this.reader.header);
+    const parts = [packed.subarray(unpack(packed, "header").firstEntryEnd)];
+    let at = PREAMBLE_SIZE + packed.length;
+    for (const { type, length } of this.header.chunks) {
+      if (type === 0) parts.push(bytes.subarray(at, at + CHUNK_OVERHEAD + length));
+      at += CHUNK_OVERHEAD + length;
+    }
+    const digests = new Uint8Array(32 * parts.length);
+    parts.forEach((part, i) => digests.set(sha256(part), 32 * i));
+    this.digest = hex(sha256(digests));
+    this.bytes = parts.reduce((sum, { length }) => sum + length, 0);
+    this.rows = layer.codes.length;
+    this.taken = new VoxelTable();
+    this.taken.add(this.reader.tensors().voxels);
+  }
+
+  /** The base that a header names, null if it names none. Raises DecodeError if none or another one is given.
+   * @param {Header} header @param {GivenBase} given */
+  static of({ base: named, kind, rows, centres, info: { voxelSize } }, given) {
+    if (!named) return null;
+    const wanted = `the file adds to layer 0 of scene ${named.sceneId}`;
+    if (!given) throw new DecodeError("BaseMissing", `${wanted}, and no base is given`);
+    let base;
+    try {
+      base = given instanceof Base ? given : new Base(given instanceof Uint8Array ? given : new Uint8Array(given));
+    } catch (error) {
+      if (!(error instanceof DecodeError)) throw error; // its place is none in this file, of which no bytes are missing
+      throw new DecodeError(error.kind === "Truncated" ? "BaseMismatch" : error.kind, `the base: ${error.message}`);
+    }
+    const { header } = base;
+    if (named.sceneId !== header.sceneId || named.digest !== base.digest) {
+      throw new DecodeError("BaseMismatch", `${wanted}, the base given is another one, of scene ${header.sceneId}`);
+    }
+    if (named.rows !== base.rows || named.bytes !== base.bytes) {
+      throw malformed(`header: a base of ${named.rows} rows and ${named.bytes} bytes, not ${base.rows} and ${base.bytes}`);
+    }
+    const same = [header.kind, header.rows, header.centres, header.info.voxelSize];
+    if (JSON.stringify([kind, rows, centres, voxelSize]) !== JSON.stringify(same)) {
+      throw malformed("header: kind, rows, centres or voxel size, expected those of the base");
+    }
+    return base;
+  }
+}
+
 /** Reads a file slice by slice. It keeps no bytes but the header's: every call gets what follows those it consumed. */
 export class TensorReader {
-  /** @param {number | null} maxLayer layers above it are not read; null: all are @param {Rules | null} rules */
-  constructor(maxLayer, rules) {
+  /** @param {number | null} maxLayer layers above it are not read; null: all are @param {Rules | null} rules
+   * @param {GivenBase} [base] for a file that names one */
+  constructor(maxLayer, rules, base = null) {
     if (maxLayer !== null && !(Number.isInteger(maxLayer) && maxLayer >= 0)) {
       throw new RangeError(`maxLayer is ${maxLayer}, expected 0 or more`);
     }
     this.maxLayer = maxLayer;
     this._rules = rules;
+    this._given = base;
+    /** The file's. @type {Base | null} */
+    this._base = null;
     /** @type {Header | null} */
     this.header = null;
     /** Each slice's layer with the end of its chunk in the file, in file order; empty until the header is there.
@@ -98,6 +161,11 @@ export class TensorReader {
     return (this._following[this._index] ?? Infinity) > this.maxLayer;
   }
 
+  /** Whether there are tensors: of a slice, or of the base. */
+  get showable() {
+    return this._layers.length > 0;
+  }
+
   /** Whether the layer of the latest slice has no further ones. */
   get whole() {
     return this._following[this._index] !== this._layers[this._layers.length - 1].layer;
@@ -112,10 +180,13 @@ export class TensorReader {
   _begin(bytes) {
     const packed = readPreamble(bytes);
     const header = readHeader(packed);
+    const base = Base.of(header, this._given);
     this._rules?.checkHeader(header);
+    if (base) this._rules?.checkLayer(header, base.reader._layers);
     this.header = header;
     this.offset = PREAMBLE_SIZE + packed.length;
     this._rows = header.rows.map(({ channels }) => new Column(Float32Array, channels));
+    if (base) this._adopt(base, header);
     this._following = [null];
     for (const { type } of [...header.chunks].reverse()) {
       this._following.unshift(type < LAYER_TYPES ? type : this._following[0]);
@@ -131,6 +202,15 @@ export class TensorReader {
     this.end = end;
     this._share = sums.map((sum) => sum / come);
     return header;
+  }
+
+  /** Begins with the rows of a base, whose arrays nobody writes to. @param {Base} base @param {Header} header */
+  _adopt(base, { width, centres }) {
+    const { rows, bytes, reader } = base;
+    this._base = base;
+    this._declared = { rows, symbols: (width + (centres ? 5 : 4)) * rows, bytes };
+    this._columns.forEach((column, i) => column.become(reader._columns[i].values));
+    this._layers = reader._layers.map((layer) => ({ ...layer, slices: 0 }));
   }
 
   /**
@@ -183,7 +263,7 @@ export class TensorReader {
   _readSlice({ ancillary, more, number, payload }, layer, header) {
     if (ancillary) throw malformed(`layer ${layer} is flagged ancillary`);
     const latest = this._layers[this._layers.length - 1];
-    const had = latest?.layer === layer ? latest : null;
+    const had = latest?.layer === layer && latest.slices ? latest : null;
     const next = this._following[this._index + 1];
     const flagged = (/** @type {string} */ reason) => new DecodeError("Malformed", reason, { offset: 2 });
     if (number !== (had?.slices ?? 0)) throw flagged(`slice ${number}, expected ${had?.slices ?? 0}`);
@@ -211,8 +291,10 @@ export class TensorReader {
     const earlier = Uint8Array.from(rises);
     const before = this._layers[this._layers.length - 1]?.codes.values; // of a whole layer, in order
     for (let i = 0; i < rises.length; i++) {
-      const code = before[i] + rises[i];
-      if (code > MOST_CODE) throw malformed(`layer ${number}: a mask code of ${code}, limit ${MOST_CODE}`);
+      const code = number ? before[i] + rises[i] : before[i] * (1 - rises[i]);
+      if (code > MOST_CODE || (code && code < LEAST_OWN_CODE)) {
+        throw malformed(`layer ${number}: a mask code of ${code}, expected 0 or ${LEAST_OWN_CODE}..${MOST_CODE}`);
+      }
       earlier[i] = code;
     }
     this._checkVoxels(voxels);
@@ -228,7 +310,7 @@ export class TensorReader {
     if (!alone) for (const column of this._columns) column.reserve(own, growth);
     for (const column of [layer.codes, ...layer.rows]) column.reserve(rises.length + own, growth);
     // from here on nothing fails, but for want of memory to sort
-    if (!had) this._layers.push(layer);
+    if (!had) this._layers = [...this._layers.filter((other) => other.layer !== number), layer];
     this._columns.forEach((column, i) => (alone ? column.become(rows[i]) : column.append(rows[i])));
     layer.rows.forEach((column, i) => column.append(layerRows[i]));
     layer.codes.append(earlier);
@@ -246,7 +328,8 @@ export class TensorReader {
   _begun(slice) {
     const { layer, parameters: { kind, layerRows: rowTensors }, priors } = slice;
     const rows = rowTensors.map(({ channels }) => new Column(Float32Array, channels));
-    const made = { grids: gridsOf(slice), chains: chainsOf(slice), codes: new Column(Uint8Array, 1), rowTensors, rows };
+    const { grids, chains } = (!layer && this._layers[0]) || { grids: gridsOf(slice), chains: chainsOf(slice) };
+    const made = { grids, chains, codes: new Column(Uint8Array, 1), rowTensors, rows };
     return { layer, kind, ...made, fill: [], slices: 0, first: this._voxels.rows, sorted: true, priors };
   }
 
@@ -266,13 +349,15 @@ export class TensorReader {
     this._loose = [];
     for (let i = 0; i < voxels.length; i += 3) {
       const x = voxels[i], y = voxels[i + 1], z = voxels[i + 2];
-      if (this._taken.has(x, y, z)) throw malformed(`voxel ${x} ${y} ${z} holds more than one anchor`);
+      if (!this._taken.has(x, y, z) && !this._base?.taken.has(x, y, z)) continue;
+      throw malformed(`voxel ${x} ${y} ${z} holds more than one anchor`);
     }
   }
 
   /**
-   * The tensors of the slices read so far, at least one. Arrays of rows are views of those of later tensors, which leave
-   * these rows as they are; those of a layer that is not whole stand as they came, unless `sort` was called.
+   * The tensors of the slices read so far, at least one, or of the base. Arrays of rows are views of those of later
+   * tensors, which leave these rows as they are; those of a layer that is not whole stand as they came, unless `sort`
+   * was called.
    *
    * @returns {Tensors}
    */

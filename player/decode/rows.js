@@ -22,10 +22,13 @@ export const widthOf = (tensors) => tensors.reduce((sum, { channels }) => sum + 
  * @param {ChannelReader} reader @param {RowTensor[]} tensors @param {number} count of rows
  * @param {Int32Array | Uint8Array | null} classes [count] step classes, null if rows have none
  * @param {number[] | null} centres of the channels, null if they are 0 @param {Prior[]} priors see ChannelReader
+ * @param {number} [base] rows of a base, the first ones, which are channels of their own
  */
-export function decodeRows(reader, tensors, count, classes, centres, priors) {
+export function decodeRows(reader, tensors, count, classes, centres, priors, base = 0) {
   const values = new Int32Array(widthOf(tensors) * count);
-  const groups = classes && groupByClass(classes, STEP_CLASSES);
+  const parts = base ? Uint8Array.from(values.subarray(0, count), (_, i) => (i < base ? 0 : STEP_CLASSES)) : classes;
+  if (base) classes?.forEach((c, i) => (/** @type {Uint8Array} */ (parts)[i] += c));
+  const groups = parts && groupByClass(parts, 2 * STEP_CLASSES);
   const predictors = tensors.flatMap(({ channels, predictor }) => new Array(channels).fill(predictor));
   channelsOf(values, predictors.length).forEach((channel, c) => {
     reader.fill(channel, priors, groups);

@@ -40,7 +40,7 @@ import { STEP_CLASSES, decodeRows, dequantise } from "./rows.js";
 /** Entries of windows beyond one per symbol, of a first slice and of a later one. */
 const FREE_ENTRIES = 2 ** 18;
 const MORE_ENTRIES = 2 ** 10;
-const LEAST_OWN_CODE = 3;
+export const LEAST_OWN_CODE = 3;
 export const MOST_CODE = 255;
 
 /**
@@ -52,19 +52,20 @@ export const MOST_CODE = 255;
  */
 export function decodeSlice(payload, layer, header, before) {
   const known = before.layer;
-  const parameters = readParameters(payload, header, before.declared, known?.rowTensors ?? null, `layer ${layer}`);
+  const parameters = readParameters(payload, header, before.declared, known?.rowTensors ?? null, layer);
   const { rows: n, rises: earlier, grids, chains, codes: bytes, stream, symbols } = parameters;
   const reader = new ChannelReader(bytes, stream, symbols + (known ? MORE_ENTRIES : FREE_ENTRIES));
   const priors = known?.priors ?? { positions: [], rows: [] };
   const voxels = n ? decodePositions(reader, n, priors.positions) : new Int32Array(0);
-  const rises = reader.read([earlier], priors.rows, 0, MOST_CODE, "a rise of a mask code");
+  const rises = reader.read([earlier], priors.rows, 0, layer ? MOST_CODE : 1, "a rise of a mask code");
   const codes = reader.read([n], priors.rows, LEAST_OWN_CODE, MOST_CODE, "a mask code");
   const stepClasses = header.centres && reader.read([n], priors.rows, 0, STEP_CLASSES - 1, "a step class");
   const rows = decodeRows(reader, header.rows, n, stepClasses, header.centres, priors.rows);
   const classes = stepClasses && new Uint8Array(earlier + n);
   classes?.set(before.classes.subarray(0, earlier));
   classes?.set(/** @type {Int32Array} */ (stepClasses), earlier);
-  const layerRows = decodeRows(reader, parameters.layerRows, earlier + n, classes, null, priors.rows);
+  const base = known ? 0 : header.base?.rows;
+  const layerRows = decodeRows(reader, parameters.layerRows, earlier + n, classes, null, priors.rows, base);
   /** @type {Prior[]} */
   const others = []; // of grids and chains
   const planes = decodePlanes(reader, grids.list.flatMap((grid) => grid.planes), others);

@@ -9,9 +9,9 @@ const SMALLEST_BUFFER = 1 << 16;
 
 /** A decoder that takes a file in pieces of any size. Its scenes do not depend on where the pieces are cut. */
 export class Stream {
-  /** @param {{maxLayer?: number | null}} [options] layers above maxLayer are not looked at */
-  constructor({ maxLayer = null } = {}) {
-    this._reader = new TensorReader(maxLayer, RULES);
+  /** @param {Omit<import("./index.js").Options, "allowPartial">} [options] layers above maxLayer are not looked at */
+  constructor({ maxLayer = null, base = null } = {}) {
+    this._reader = new TensorReader(maxLayer, RULES, base);
     this._buffer = new Uint8Array(0);
     /** The bytes of the file from `consumed` on stand here in the buffer. */
     this._start = 0;

@@ -32,6 +32,7 @@ import { tracks } from "./tracks.js";
  * @property {number[]} rows rows[i]: number of anchors in the prefix that ends with layers[i]
  * @property {Int32Array} anchorQ [N, 3] voxel indices
  * @property {Uint8Array[]} mask per layer the codes of its rows[i] rows: the gate times 255; 0 is inactive
+ * @property {number} baseRows so many of the first anchors are those of the file's base, the same in all files over it
  * @property {number[][]} fill per layer the colour behind its Gaussians, RGB, 0..1
  */
 
@@ -94,6 +95,7 @@ export function sceneOf(tensors) {
     layers: layers.map(({ layer }) => layer),
     rows: layers.map(({ codes }) => codes.length),
     anchorQ: voxels,
+    baseRows: header.base?.rows ?? 0,
     mask: layers.map(({ codes }) => codes),
     fill: layers.map(({ fill }) => fill),
     motion: layers.map(({ kind }, i) => {

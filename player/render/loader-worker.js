@@ -2,6 +2,8 @@
 
 import { SceneSource } from "../decode/fetch.js";
 import { serve, tell } from "./remote.js";
+import { Segments } from "./segments.js";
+import { isIndex } from "./timeline.js";
 /** @import { Scene } from "../kinds/index.js" */
 
 /** Between two messages about progress, milliseconds. */
@@ -19,6 +21,8 @@ const REST = 4;
  * @property {number} bytes
  * @property {number | null} total
  * @property {{layer: number, end: number}[]} ends where in the file each slice ends, empty until the header is there
+ * @property {import("./timeline.js").Segment[]} [segments] of a scene that is cut in time, once
+ * @property {number} [part] of such a scene, see `Part` @property {string} [problem]
  */
 
 /** The answer that early.js asked for, which serves once. */
@@ -37,6 +41,8 @@ function ask(url, options) {
 
 /** @type {SceneSource} */
 let source;
+/** @type {Segments | null} */
+let segments = null;
 let told = 0;
 let arrived = 0;
 const epochNow = () => performance.timeOrigin + performance.now();
@@ -100,9 +106,28 @@ function report(scene, transfer, times = { arrived, decoded: epochNow() }) {
   told = performance.now();
 }
 
+/** Tells of a part of a scene that is cut in time. @param {Partial<import("./segments.js").Part>} part */
+function hand({ scene, ...part }) {
+  const { received: bytes, index } = /** @type {Segments} */ (segments);
+  /** @type {Transferable[]} */
+  const transfer = [];
+  const times = { arrived, decoded: epochNow() };
+  const own_ = scene && own(scene, transfer);
+  const first = index && !told && { segments: index.segments };
+  tell({ told: { ...(own_ && { scene: own_ }), ...part, ...first, bytes, total: null, ends: [], ...times } }, transfer);
+  if (index) told = performance.now();
+}
+
 serve({
   /** @param {string | Blob} from */
   open(from) {
+    if (isIndex(from)) {
+      segments = new Segments(/** @type {string} */ (from), ask, hand, () => {
+        arrived = epochNow();
+        if (told && performance.now() - told > PROGRESS_MS) hand({});
+      });
+      return;
+    }
     source = new SceneSource(typeof from === "string" ? from : "the file", {
       fetch: typeof from === "string" ? ask : async () => new Response(from), // no address that a policy may forbid
       progress: () => {
@@ -115,10 +140,17 @@ serve({
   /**
    * Loads on within a budget.
    *
-   * @param {import("../decode/fetch.js").Budget} budget
-   * @returns {Promise<{bytes: number, complete: boolean}>} complete: whether nothing is left to load
+   * @param {import("../decode/fetch.js").Budget & {time?: number | null}} budget time: seconds, of a scene that is cut
+   * in time
+   * @returns {Promise<{bytes: number, complete: boolean, superseded?: boolean}>} complete: whether nothing is left to
+   * load. superseded: whether a later call took its place
    */
   async load(budget) {
+    if (segments) {
+      const last = await segments.load(budget);
+      if (last) hand({});
+      return { bytes: segments.received, complete: false, superseded: !last };
+    }
     try {
       for await (const scene of source.scenes(budget)) offer(scene);
     } finally {

@@ -1,6 +1,7 @@
 // What Player and Playback share: the worker that fetches and decodes, and the scene's time.
 
 import { Remote } from "./remote.js";
+import { segmentAt } from "./timeline.js";
 import { WORKERS } from "./workers.js";
 /** @import { Scene } from "../kinds/index.js" */
 /** @import { News } from "./loader-worker.js" */
@@ -45,6 +46,52 @@ export class Clip extends EventTarget {
     /** @type {Remote | null} */
     this._loader = null;
     this.closed = false;
+    this._forget();
+  }
+
+  /** Forgets the parts of a scene that is cut in time. */
+  _forget() {
+    /** @type {import("./timeline.js").Segment[] | null} */
+    this._segments = null;
+    /** What has arrived of the segment at hand and the next, by number, and of bases, by -1 - number.
+     * @type {Map<number, Scene>} */
+    this._parts = new Map();
+    /** Why segments do not come. @type {Map<number, string>} */
+    this._problems = new Map();
+    /** The segment at hand. */
+    this._segment = -1;
+    /** @type {import("../decode/fetch.js").Budget} */
+    this._budget = {};
+  }
+
+  /** Why the segment at hand does not come, "" if it is there or on its way. */
+  get problem() {
+    return this._problems.get(this._segment) ?? "";
+  }
+
+  /** The range of time, seconds, of the segment at hand while it is on its way. */
+  get awaited() {
+    const there = !this._segments || this._segment < 0 || this._parts.has(this._segment) || this.problem;
+    return there ? null : /** @type {import("./timeline.js").Segment[]} */ (this._segments)[this._segment].range;
+  }
+
+  /** Shows the part that belongs to the time at hand, or its base, and sees to what comes next. */
+  _follow() {
+    const segments = this._segments;
+    if (!segments) return;
+    const now = segmentAt(segments, this.time);
+    if (now !== this._segment) {
+      const moved = this._segment >= 0;
+      this._segment = now;
+      const bases = [now, now + 1].map((k) => -1 - (segments[k]?.base ?? NaN));
+      for (const k of [...this._parts.keys()]) if (k !== now && k !== now + 1 && !bases.includes(k)) this._parts.delete(k);
+      this._problems.clear();
+      if (moved && this._loader) this._load(this._budget);
+    }
+    const scene = this._parts.get(now) ?? this._parts.get(-1 - (segments[now].base ?? NaN));
+    if (!scene || scene === this._scene) return;
+    this._scene = scene;
+    this._changed();
   }
 
   /** The scene's global properties (clause 5.1), null before the first layer. */
@@ -54,6 +101,7 @@ export class Clip extends EventTarget {
 
   /** Seconds of the scene's time at its start and end. @returns {[number, number]} */
   get timeRange() {
+    if (this._segments) return [this._segments[0].range[0], this._segments[this._segments.length - 1].range[1]];
     return this._scene?.info.timeRange ?? [0, 0];
   }
 
@@ -71,6 +119,7 @@ export class Clip extends EventTarget {
     if (isNaN(seconds)) return;
     const [start, end] = this.timeRange;
     this._time = this._scene ? Math.min(Math.max(seconds, start), Math.max(start, end)) : seconds;
+    this._follow();
     this._changed();
     this._emit("timeupdate", { time: this.time });
   }
@@ -106,6 +155,7 @@ export class Clip extends EventTarget {
     this._playing = false;
     this.stopLoading();
     this._scene = null;
+    this._forget();
   }
 
   /** Time, or whether it advances, is another. */
@@ -119,6 +169,7 @@ export class Clip extends EventTarget {
       const again = this.loop && end > start;
       this._time = next < end ? next : again ? start + ((next - start) % (end - start)) : end;
       if (next >= end && !again) this.pause();
+      this._follow();
       this._emit("timeupdate", { time: this._time });
     }
     this._resumed = false;
@@ -127,6 +178,7 @@ export class Clip extends EventTarget {
   /** Begins with another file. @param {string | URL | Blob} source */
   _open(source) {
     this.stopLoading();
+    this._forget();
     const from = source instanceof Blob ? source : new URL(source, document.baseURI).href;
     const loader = startLoader((news) => {
       if (loader === this._loader) this._told(news);
@@ -138,9 +190,10 @@ export class Clip extends EventTarget {
   /** Loads as much as a budget allows. @param {import("../decode/fetch.js").Budget} budget */
   async _load(budget) {
     const loader = /** @type {Remote} */ (this._loader);
+    this._budget = budget;
     try {
-      const result = await loader.call("load", [budget]);
-      if (loader !== this._loader) return;
+      const { superseded, ...result } = await loader.call("load", [{ ...budget, time: this._time }]);
+      if (loader !== this._loader || superseded) return;
       if (result.complete) this.stopLoading();
       this._emit("loaded", result);
     } catch (error) {
@@ -151,9 +204,17 @@ export class Clip extends EventTarget {
   }
 
   /** Takes what has arrived of the scene. @param {News} news @returns {boolean} whether it is the first */
-  _told({ scene }) {
+  _told({ scene, segments, part, problem }) {
     const first = !this._scene && !!scene;
-    if (scene) this._scene = scene;
+    if (segments) this._segments = segments;
+    if (part !== undefined) {
+      if (scene) this._parts.set(part, scene);
+      if (problem) {
+        this._problems.set(part, problem);
+        this._emit("error", { message: problem, kind: "SegmentError", segment: part });
+      }
+      this._follow();
+    } else if (scene) this._scene = scene;
     if (first) this.seek(this.time); // into the scene's range
     return first;
   }

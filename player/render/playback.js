@@ -90,7 +90,7 @@ export class Playback extends Clip {
    */
   load(source, { level, bytes, seconds }) {
     this._open(source);
-    this._load({ maxLayer: level ?? Infinity, bytes, seconds }).then(() => this.stopLoading());
+    this._load({ maxLayer: level ?? Infinity, bytes, seconds }).then(() => this._segments || this.stopLoading());
     return new Promise((resolve, reject) => {
       this._resolve = () => resolve(this);
       this._reject = reject;
@@ -116,8 +116,8 @@ export class Playback extends Clip {
    * the camera's centre, scene units
    */
   advance(elapsed, eye) {
-    const scene = this._sceneThere();
     this._advance(elapsed);
+    const scene = this._sceneThere();
     this._wanted = stateOf(scene, Math.max(this.level ?? Infinity, 0), this.time, eye);
     this._evaluate();
   }

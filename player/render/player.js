@@ -46,6 +46,8 @@ import { WORKERS } from "./workers.js";
  * @property {number} gaussians drawn
  * @property {boolean} software whether the CPU draws, for want of a GPU
  * @property {boolean} lost whether it is in view and the browser has taken the WebGL context
+ * @property {string} problem why the segment at hand does not come, "" if it does
+ * @property {[number, number] | null} awaited the seconds that it shows, while it is on its way
  */
 
 /** After so many milliseconds without movement the picture is drawn at full quality. */
@@ -82,6 +84,8 @@ export class Player extends Clip {
     this._level = options.level ?? null;
     this._pace = new Pace();
     this._sorter = new Remote(WORKERS.sort);
+    /** Whether it plays as soon as what it begins with is there. */
+    this._starts = false;
     /** The highest level that loading went for. */
     this._loadedLevel = Infinity;
     /** @type {Pick<Status, "bytes" | "total" | "loading" | "ends">} */
@@ -165,6 +169,7 @@ export class Player extends Clip {
     if (this.closed) return;
     this._open(source);
     this._scene = null;
+    this._starts = false;
     this._shownLevel = null;
     this._camera = null;
     this._gpu?.free(this._front?.splats.field, this._spare?.field);
@@ -246,6 +251,8 @@ export class Player extends Clip {
       scale: this._moving(now) ? this._scale() : 1,
       gaussians: this._painter?.count ?? 0,
       software: this._gpu?.software ?? false,
+      problem: this.problem,
+      awaited: this.awaited,
       lost: this._visible && now - this._lostAt > LOST_MS,
     };
   }
@@ -265,7 +272,7 @@ export class Player extends Clip {
 
   /** Waits until the picture is complete and at full quality. */
   async settled() {
-    while (!this.closed && !(this._scene && this._isSettled())) {
+    while (!this.closed && !(this._scene && !this.awaited && this._isSettled())) {
       await new Promise((resolve) => setTimeout(resolve, 5));
     }
   }
@@ -316,15 +323,19 @@ export class Player extends Clip {
 
   /** @param {import("./loader-worker.js").News} news */
   _told(news) {
-    const { scene, arrived, decoded, ...status } = news;
-    Object.assign(this._status, status);
-    this._emit("progress", { bytes: status.bytes, total: status.total });
+    const { scene, arrived, decoded, bytes, total, ends } = news;
+    Object.assign(this._status, { bytes, total, ends });
+    this._emit("progress", { bytes, total });
     if (scene) {
       const start = performance.timeOrigin + this._started;
       this._came.set(scene, { arrived: (arrived - start) / 1000, decoded: (decoded - start) / 1000 });
     }
     const first = super._told(news);
-    if (first && this._options.autoplay) this.play();
+    this._starts ||= first && !!this._options.autoplay;
+    if (this._starts && !this.awaited) {
+      this._starts = false;
+      this.play();
+    }
     if (scene) this._changed();
     return first;
   }

@@ -23,7 +23,7 @@ function faultOf(run) {
 test("there are vectors of every sort", () => {
   assert.ok(VECTORS.filter(({ error }) => error === null).length > 100);
   const kinds = new Set(VECTORS.map(({ error }) => error));
-  assert.equal(kinds.size, 8, [...kinds].join());
+  assert.equal(kinds.size, 10, [...kinds].join());
 });
 
 /** What a fault is, and where. @param {DecodeError | null} fault */
@@ -52,47 +52,47 @@ const PIECES = [1, 7, 1000];
 
 for (const folder of new Set(VECTORS.map(({ file }) => file.split("/")[0]))) {
   test(`vectors of ${folder}: hashes, or the named error at its place`, () => {
-    eachOf(folder, ({ bytes, error, chunk, offset, layers }) => {
-      const fault = faultOf(() => assert.deepEqual(hashes(bytes), layers));
+    eachOf(folder, ({ bytes, base, error, chunk, offset, layers }) => {
+      const fault = faultOf(() => assert.deepEqual(hashes(bytes, { base }), layers));
       assert.equal(fault?.kind ?? null, error, fault?.message);
       if (fault && error !== null) {
         assert.equal(fault.chunk, chunk);
         if (offset !== null) assert.equal(fault.offset, offset);
       }
       for (let i = 0; i + 1 < layers.length; i++) {
-        assert.deepEqual(hashes(bytes, { maxLayer: layers[i].layer }), layers.slice(0, i + 1));
+        assert.deepEqual(hashes(bytes, { base, maxLayer: layers[i].layer }), layers.slice(0, i + 1));
       }
     });
   });
 
   test(`vectors of ${folder}: a scene, or the error of tensors that are none`, () => {
-    eachOf(folder, ({ bytes, error, scene }) => {
-      if (error === null) assert.equal(faultOf(() => decode(bytes))?.kind ?? null, scene);
+    eachOf(folder, ({ bytes, base, error, scene }) => {
+      if (error === null) assert.equal(faultOf(() => decode(bytes, { base }))?.kind ?? null, scene);
     });
   });
 
   test(`vectors of ${folder}: a stream of any pieces yields each layer, then the same error`, () => {
-    eachOf(folder, ({ file, bytes, layers, slices }, index) => {
+    eachOf(folder, ({ file, bytes, base, layers, slices }, index) => {
       // a second or three each to decode, without other code than the rest
       if (file.startsWith("worst-case/") || file === "valid/planes-products-over-2-53.pd4") return;
       const size = PIECES[index % PIECES.length];
-      const stream = openStream();
+      const stream = openStream({ base });
       /** @type {Scene[]} */
       const scenes = [];
       const fault = faultOf(() => {
         for (let at = 0; at < bytes.length; at += size) scenes.push(...stream.feed(bytes.subarray(at, at + size)));
         stream.finish();
       });
-      const expected = placed(faultOf(() => decode(bytes)));
+      const expected = placed(faultOf(() => decode(bytes, { base })));
       assert.deepEqual(placed(fault), expected);
-      if (!isDeepStrictEqual(expected, placed(faultOf(() => hashes(bytes))))) return; // tensors that are no scene
+      if (!isDeepStrictEqual(expected, placed(faultOf(() => hashes(bytes, { base }))))) return; // tensors that are no scene
       const seen = scenes.map((scene) => scene.layers.length);
       assert.deepEqual([...new Set(seen)], [...new Set(slices)].map((_, i) => i + 1));
       assert.deepEqual(seen, [...seen].sort());
       assert.ok(scenes.length <= slices.length);
       const whole = bytes.subarray(0, stream.consumed);
-      if (scenes.length) assert.deepEqual(hashes(whole, { allowPartial: true }), layers);
-      if (scenes.length && !expected) assert.ok(same(scenes[scenes.length - 1], decode(bytes)));
+      if (scenes.length) assert.deepEqual(hashes(whole, { base, allowPartial: true }), layers);
+      if (scenes.length && !expected) assert.ok(same(scenes[scenes.length - 1], decode(bytes, { base })));
     });
   });
 }

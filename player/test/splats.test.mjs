@@ -57,6 +57,7 @@ function sceneOf({ degree = 0, window = false, heads = [ALL_HEADS, [0, 1]], grou
     mask: mask.map((codes) => Uint8Array.from(codes)),
     fill: ROWS.map(() => [0, 0, 0]),
     anchorQ: Int32Array.from(numbers(3 * N, 40)),
+    baseRows: 0,
     anchor: new Float32Array(3 * N), // not read
     offset: numbers(3 * N, 2),
     color: numbers(3 * N, 2),

@@ -1,4 +1,5 @@
-// Decodes the file that each line on stdin holds as base64, for programs that compare, and answers with a line of JSON:
+// Decodes the file that each line on stdin holds as base64, and its base behind a space if it has one, for programs that
+// compare, and answers with a line of JSON:
 // {"hashes": [...], "scene": null} where tensors and scene decode, with "scene": {"error": kind, "message", "offset",
 // "chunk"} where the tensors alone do; else {"error": kind, ...}, or {"crash": stack} of any other exception.
 
@@ -19,12 +20,12 @@ function faultOf(run) {
 }
 
 for await (const line of createInterface({ input: process.stdin })) {
-  const bytes = Buffer.from(line, "base64");
+  const [bytes, base] = line.split(" ").map((part) => Buffer.from(part, "base64"));
   let answer;
   try {
     /** @type {object} */
     let found = {};
-    answer = faultOf(() => (found = { hashes: hashes(bytes) })) ?? { ...found, scene: faultOf(() => decode(bytes)) };
+    answer = faultOf(() => (found = { hashes: hashes(bytes, { base }) })) ?? { ...found, scene: faultOf(() => decode(bytes, { base })) };
   } catch (error) {
     answer = { crash: error instanceof Error ? error.stack : String(error) };
   }

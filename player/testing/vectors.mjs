@@ -14,6 +14,7 @@ const FOLDER = new URL("../../spec/vectors/", import.meta.url);
  * @typedef {object} Vector
  * @property {string} file
  * @property {Uint8Array} bytes
+ * @property {Uint8Array | null} base that is given with the file
  * @property {string | null} error
  * @property {string | null} scene
  * @property {number | null} chunk
@@ -27,12 +28,13 @@ export function readVectors() {
   const manifest = JSON.parse(readFileSync(new URL("manifest.json", FOLDER), "utf8"));
   return manifest.vectors.map((/** @type {any} */ row) => {
     const { file, error = null, scene = null, chunk = null, offset = null, layers } = row;
-    const bytes = new Uint8Array(readFileSync(new URL(file, FOLDER)));
+    const [bytes, base] = [file, row.base].map((name) => name && new Uint8Array(readFileSync(new URL(name, FOLDER))));
     if (row.ans_only === "UnsupportedFeature") {
-      return { file, bytes, error: row.ans_only, scene: null, chunk: null, offset: null, layers: [], slices: [] };
+      const nothing = { scene: null, chunk: null, offset: null, layers: [], slices: [] };
+      return { file, bytes, base, error: row.ans_only, ...nothing };
     }
     const slices = row.slices ?? layers.map((/** @type {{layer: number}} */ { layer }) => layer);
-    return { file, bytes, error, scene, chunk, offset, layers, slices };
+    return { file, bytes, base, error, scene, chunk, offset, layers, slices };
   });
 }
 

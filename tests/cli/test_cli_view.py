@@ -9,6 +9,7 @@ import urllib.request
 from typing import IO
 
 import pytest
+import segmented
 
 import pd4dgs_codec
 from pd4dgs_codec import decode, show
@@ -52,6 +53,19 @@ def test_a_folder_is_listed_and_its_scenes_are_switched(scene_pd4, tmp_path):
     assert "a b&amp;c.pd4" in text and "notes" not in text
     process.send_signal(signal.SIGTERM)
     assert process.wait(60) == 0
+
+
+def test_segments_are_shown_as_one_scene(cli, tmp_path):
+    process = run(segmented.folder())
+    page = process.stdout.readline().strip()
+    assert page.endswith("/index.html?src=segments.json")
+    base = page.rsplit("/", 1)[0]
+    for path in segmented.folder().iterdir():
+        assert fetch(f"{base}/{path.name}") == path.read_bytes()
+    process.send_signal(signal.SIGTERM)
+    assert process.wait(60) == 0
+    one = cli("view", segmented.folder(), "-o", tmp_path / "a.html")
+    assert one.code == 2 and "see pd4dgs-package" in one.err
 
 
 def test_the_sample_is_shown_and_described_without_a_file(cli, scene_pd4, tmp_path, monkeypatch):

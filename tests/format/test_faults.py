@@ -63,7 +63,7 @@ MESSAGES = {
     "positions-index-over-limit": "voxel index 1048577, limit 1048576",
     "mask-code-2": "layer 0: mask code in 2..77, expected 3..255",
     "mask-rise-negative": "rise of a mask code in -1..0",
-    "mask-sum-over-255-in-layer-2": "layer 2: mask code 256, expected at most 255",
+    "mask-sum-over-255-in-layer-2": "layer 2: mask code 256, expected 0 or 3..255",
     "row-above": "a symbol of a row over 8388608 in magnitude",
     "overflow-rows": "a dequantised value is not finite",
     "voxel-twice": "voxel .1, 0, 0. holds more than one anchor, expected one",

@@ -185,7 +185,7 @@ def test_verification_notices_another_header_and_a_lost_layer(monkeypatch):
         ("the header decodes to other values", lambda header, found: (replace(header, mode="lzma"), found)),
         ("decodes to 1 layers, expected 3", lambda header, found: (header, found[:1])),
     ):
-        monkeypatch.setattr(encoder, "read_layers", lambda data, change=change: change(*read(data)))
+        monkeypatch.setattr(encoder, "read_layers", lambda data, base, change=change: change(*read(data)))
         with pytest.raises(EncodeError, match=f"verification: .*{message}"):
             encode(make_scene(0), layers=2)
 

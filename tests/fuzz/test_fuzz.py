@@ -164,10 +164,10 @@ def test_inputs_are_named_by_their_numbers():
 
 def test_random_files_are_legal_and_of_every_sort():
     parts = []
-    for i in range(80):
-        file = legal.numbered(i)
-        data = file.data()
-        assert hashes(data) == file.hashes()
+    for i in range(150):
+        file, base = legal.numbered(i)
+        data, under = file.data(), base and base.data()
+        assert hashes(data, base=under) == file.hashes()
         parts.append(mutate.take_apart(data))
     slices = [chunk for file in parts for chunk in file.chunks if chunk.meta is not None]
     assert {len(file.header[4]) for file in parts} >= {1, 2, 3, 5, 7} and {5 in file.header for file in parts} == {
@@ -258,7 +258,7 @@ def test_a_process_that_ends_or_gets_stuck_while_the_run_goes_on(monkeypatch, tm
         return check.Answer("decoded", case.meaning)
 
     monkeypatch.setattr(fuzz, "check_package", examine)
-    monkeypatch.setattr(fuzz, "check_memory", lambda data: 0.0)
+    monkeypatch.setattr(fuzz, "check_memory", lambda data, base: 0.0)
     monkeypatch.setattr(fuzz, "seeds", lambda paths: seeds())
     monkeypatch.setattr(fuzz, "STUCK_SECONDS", 8.0 if kind == "stuck" else 300.0)
     command = ["--inputs", "30", "--seed", "5", "--decoders", "python", "--out", str(tmp_path)]

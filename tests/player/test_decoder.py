@@ -96,6 +96,6 @@ def test_the_command_refuses_a_damaged_file_a_missing_one_and_other_arguments(tm
         done = run_node(PLAYER / "cli.mjs", "hashes", file)
         assert (done.returncode, done.stdout) == (1, "")
         assert re.fullmatch(rf"pd4-player: [^\n]*{says}[^\n]*\n", done.stderr)
-    for arguments in ([], ["hashes"], ["dance", path], ["hashes", path, "-n"]):
+    for arguments in ([], ["hashes"], ["dance", path], ["hashes", path, path, "-n"]):
         done = run_node(PLAYER / "cli.mjs", *arguments)
         assert (done.returncode, done.stdout) == (2, "") and done.stderr.startswith("usage: ")

@@ -15,7 +15,7 @@ import time
 import tracemalloc
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -104,6 +104,7 @@ def declared(data: bytes) -> tuple[int, bool]:
     try:
         preamble = read_preamble(data)
         header, offset = unpack_header(preamble.header), preamble.size
+        total = header.declared
         for number, length in header.chunks:
             if number < 3:
                 payload = read_chunk(data, offset, length=length).payload
@@ -116,24 +117,26 @@ def declared(data: bytes) -> tuple[int, bool]:
     return total.symbols, sliced
 
 
-def check_memory(data: bytes) -> float:
+def check_memory(data: bytes, base: bytes | None = None) -> float:
     """Peak memory of decoding (numpy's arrays are counted) as a share of its bound; Finding if it is over."""
-    symbols, sliced = declared(data)
-    bound = BYTES_PER_SYMBOL * symbols + BYTES_PER_BYTE * len(data) + (BYTES_OF_SLICES if sliced else BYTES_ALWAYS)
+    parts = [declared(part) for part in (data, base) if part is not None]
+    symbols, size = sum(count for count, _ in parts), len(data) + len(base or b"")
+    always = BYTES_OF_SLICES if any(sliced for _, sliced in parts) else BYTES_ALWAYS
+    bound = BYTES_PER_SYMBOL * symbols + BYTES_PER_BYTE * size + always
     tracemalloc.start()
     try:
-        outcome(decode, data)
+        outcome(decode, data, base=base)
         peak = tracemalloc.get_traced_memory()[1]
     finally:
         tracemalloc.stop()
     if peak > bound:
-        raise Finding("memory", f"peak of {peak} bytes, bound {bound} for {symbols} symbols, {len(data)} bytes")
+        raise Finding("memory", f"peak of {peak} bytes, bound {bound} for {symbols} symbols, {size} bytes")
     return peak / bound
 
 
-def streamed(data: bytes, rng: random.Random) -> tuple[int, ...]:
+def streamed(data: bytes, base: bytes | None, rng: random.Random) -> tuple[int, ...]:
     """The layers that a stream yields for `data` in pieces; DecodeError as decode would raise."""
-    stream, layers = open_stream(), tuple[int, ...]()
+    stream, layers = open_stream(base), tuple[int, ...]()
     cuts = sorted(rng.randint(0, len(data)) for _ in range(rng.randint(0, 4)))
     for a, b in zip([0, *cuts], [*cuts, len(data)], strict=True):
         layers = ([scene.layers for scene in stream.feed(data[a:b])] or [layers])[-1]
@@ -147,9 +150,9 @@ def check_package(case: Case, rng: random.Random) -> Answer:
     with junk_in_new_memory(), warnings.catch_warnings():
         warnings.simplefilter("error")  # a warning is a line on somebody's terminal
         start = time.process_time()
-        name, result = outcome(hashes, case.data)
+        name, result = outcome(hashes, case.data, base=case.base)
         between = time.process_time()
-        scene, found = outcome(decode, case.data)
+        scene, found = outcome(decode, case.data, base=case.base)
         seconds = max(between - start, time.process_time() - between)
         if seconds > MAX_SECONDS:
             raise Finding("time", f"{seconds:.2f} s of processor time, limit {MAX_SECONDS} s")
@@ -157,26 +160,26 @@ def check_package(case: Case, rng: random.Random) -> Answer:
             raise Finding("silent", "decoded a mutated file without an error, although its CRCs are wrong")
         if scene not in (name, "Malformed", "UnsupportedFeature") or (case.scene and scene != name):
             raise Finding("disagreement", f"tensors end in {name}, the scene in {scene} ({found})")
-        _other_entry_point(case.data, scene, found, rng)
+        _other_entry_point(case.data, case.base, scene, found, rng)
     return Answer(name, result, scene if name == DECODED else "")
 
 
-def _other_entry_point(data: bytes, name: str, result: Any, rng: random.Random) -> None:
+def _other_entry_point(data: bytes, base: bytes | None, name: str, result: Any, rng: random.Random) -> None:
     """name, result: of decode."""
     entry = rng.randrange(4)
     if entry == 0:
-        other, found = outcome(streamed, data, rng)
+        other, found = outcome(streamed, data, base, rng)
         places = [(r.chunk, r.offset) if isinstance(r, DecodeError) else r for r in (result, found)]
         if other != name or places[1] != (result.layers if name == DECODED else places[0]):
             raise Finding("disagreement", f"decode ends in {name} at {places[0]}, a stream in {other} at {places[1]}")
     elif entry == 1:
-        other, found = outcome(decode_partial, data, allow_partial=True)
+        other, found = outcome(decode_partial, data, allow_partial=True, base=base)
         if not (other == name or (name == "Truncated" and other == DECODED)):
             raise Finding("disagreement", f"decode ends in {name}, with allow_partial in {other}")
         if other == DECODED and found[1] != (name == DECODED):
             raise Finding("disagreement", f"decode ends in {name}, with allow_partial complete is {found[1]}")
     elif entry == 2:
-        other, _ = outcome(decode, data, max_layer=0)
+        other, _ = outcome(decode, data, max_layer=0, base=base)
         if other not in (DECODED, name):
             raise Finding("disagreement", f"decode ends in {name}, with max_layer=0 in {other}")
     else:
@@ -186,12 +189,12 @@ def _other_entry_point(data: bytes, name: str, result: Any, rng: random.Random) 
 # -- the other decoders ------------------------------------------------------------------------------------------------
 
 
-def reference_decoder(data: bytes) -> Answer | None:
+def reference_decoder(data: bytes, base: bytes | None) -> Answer | None:
     """That of the specification; None for an input that would take long."""
-    if declared(data)[0] > REFERENCE_SYMBOLS:
+    if sum(declared(part)[0] for part in (data, base or b"")) > REFERENCE_SYMBOLS:
         return None
     try:
-        return Answer(DECODED, refdec.hashes(data))
+        return Answer(DECODED, refdec.hashes(data, base=base))
     except refdec.Fault as fault:
         return Answer(fault.name, fault)
     except Exception as error:
@@ -205,15 +208,15 @@ class JavaScript:
         command = ["node", str(ROOT / "player" / "testing" / "decoder_loop.mjs")]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
 
-    def __call__(self, data: bytes) -> Answer | None:
+    def __call__(self, data: bytes, base: bytes | None) -> Answer | None:
         """None for an input that it need not decode."""
-        try:
-            if unpack_header(read_preamble(data).header).mode != "ans":
-                return None
-        except DecodeError:
-            pass
+        parts = [part for part in (data, base) if part is not None]
+        for part in parts:
+            with suppress(DecodeError):
+                if unpack_header(read_preamble(part).header).mode != "ans":
+                    return None
         assert self._process.stdin is not None and self._process.stdout is not None
-        self._process.stdin.write(base64.b64encode(data).decode() + "\n")
+        self._process.stdin.write(" ".join(base64.b64encode(part).decode() for part in parts) + "\n")
         self._process.stdin.flush()
         line = self._process.stdout.readline()
         found = json.loads(line) if line else {"crash": f"the process ended with exit code {self._process.wait()}"}
@@ -224,7 +227,7 @@ class JavaScript:
         return Answer(DECODED, found["hashes"], found["scene"]["error"] if found["scene"] else DECODED)
 
 
-Decoder = Callable[[bytes], Answer | None]
+Decoder = Callable[[bytes, bytes | None], Answer | None]
 
 
 def compare(answers: Mapping[str, Answer]) -> str | None:

@@ -8,6 +8,8 @@ which are bent: their tensors decode and may make no scene.
 
 from __future__ import annotations
 
+import copy
+import json
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -25,6 +27,7 @@ from vectors.blocks import (
     Known,
     Layer,
     Prior,
+    adding,
     ancillary,
     make_file,
     make_layer,
@@ -48,26 +51,30 @@ LEAST, LARGEST = 2.0**-126, (2.0 - 2.0**-23) * 2.0**127
 
 @dataclass(frozen=True)
 class Seed:
-    """A legal file to mutate."""
+    """A legal file to mutate, and its base."""
 
     name: str
     data: bytes
+    base: bytes | None = None
 
 
 def seeds(paths: Sequence[Path] = (), built: int = 60) -> list[Seed]:
     """The files at `paths` (or in them, if folders; those that do not decode are left out), small vectors, and `built`
     random files."""
-    found = [file for path in paths for file in (sorted(path.rglob("*.pd4")) if path.is_dir() else [path])]
-    vectors = [file for folder in ("valid", "uncommon") for file in sorted((VECTORS / folder).glob("*.pd4"))]
-    found += [file for file in vectors if file.stat().st_size <= LARGEST_SEED]
-    random_files = [Seed(f"legal-{i}", numbered(i).data()) for i in range(built)]
-    return [*random_files, *(Seed(file.stem, file.read_bytes()) for file in found if decodes(file.read_bytes()))]
+    files = [file for path in paths for file in (sorted(path.rglob("*.pd4")) if path.is_dir() else [path])]
+    found = [Seed(file.stem, file.read_bytes()) for file in files]
+    for row in json.loads((VECTORS / "manifest.json").read_text(encoding="utf-8"))["vectors"]:
+        if row["file"].startswith(("valid/", "uncommon/")) and row["size"] <= LARGEST_SEED:
+            data, base = (name and (VECTORS / name).read_bytes() for name in (row["file"], row.get("base")))
+            found.append(Seed(Path(row["file"]).stem, data, base))
+    made = [(file.data(), base and base.data()) for file, base in map(numbered, range(built))]
+    return [*(Seed(f"legal-{i}", *own) for i, own in enumerate(made)), *(seed for seed in found if decodes(seed))]
 
 
-def decodes(data: bytes) -> bool:
+def decodes(seed: Seed) -> bool:
     """Whether the package decodes a file."""
     try:
-        hashes(data)
+        hashes(seed.data, base=seed.base)
     except DecodeError:
         return False
     return True
@@ -162,11 +169,11 @@ class Tables:
 
 
 class Anything:
-    """Tables of no known kind. widths: channels of the rows by id."""
+    """Tables of no known kind. widths: channels of the rows by id. read: of planes of the layers so far."""
 
     def __init__(self, rng: random.Random):
         self.rng = rng
-        self.kind = self.any_kind()
+        self.kind, self.read = self.any_kind(), 0
         self.widths = self.some(rng.choices((1, 2, 3, 7, 32), (3, 6, 3, 3, 0.2))[0], ((1, 3, 16), (6, 6, 1)))
         if rng.random() < 0.02:
             self.widths = {0: 256, 9: 256}
@@ -208,7 +215,6 @@ class Scaffold(Anything):
         self.d, self.g = rng.choices(((1, 1), (2, 3), (7, 2), (32, 10), (64, 16)), (9, 9, 6, 2, 1))[0]
         self.kind, self.widths = [0, self.g, rng.randrange(8)], {0: self.d, 1: 6, 2: 3 * self.g}
         self.channels = rng.choices((1, 2, 3, 5, 9, 17), (6, 6, 6, 3, 1, 1))[0]  # of all planes
-        self.read = 0  # those of the layers so far
 
     def layer(self, number: int) -> Tables:
         """Of a layer."""
@@ -273,10 +279,11 @@ def bend(rng: random.Random, tables: Tables) -> None:
 
 
 class Maker:
-    """Makes the slices of a file. scene: whether they are sure to make one."""
+    """Makes the slices of a file. scene: whether they are sure to make one. base: whether others add to its layer 0."""
 
-    def __init__(self, rng: random.Random):
+    def __init__(self, rng: random.Random, base: bool = False):
         self.rng, self.plan = rng, rng.choice((Anything, Anything, Scaffold, Splats))(rng)
+        self.base, self.adds, self.base_rows = base, False, 0  # rows of the base that it adds to
         bent = type(self.plan) is not Anything and rng.random() < 0.4
         self.scene, self.bent = type(self.plan) is not Anything and not bent, bent
         self.mode = LZMA if rng.random() < 0.1 else ANS
@@ -290,6 +297,15 @@ class Maker:
         self.layer_table = list[Any]()  # of the layer
         self.taken = set[tuple[int, ...]]()
         self.codes = self.classes = np.zeros(0, np.int64)  # of the layers so far
+        self.of_base = self.codes, self.classes  # of layer 0
+
+    def over(self) -> Maker:
+        """The maker of a file that adds to the layer 0 of what this one has made."""
+        made = copy.copy(self)
+        made.plan, made.table, made.base, made.adds = copy.copy(self.plan), copy.deepcopy(self.table), False, True
+        made.codes, made.classes = self.of_base
+        made.base_rows, made.plan.read, made.mode = len(made.codes), 0, LZMA if self.rng.random() < 0.1 else ANS
+        return made
 
     def cells(self, count: int) -> list[list[int]]:
         """At most so many voxels that are free, of a slice."""
@@ -342,9 +358,10 @@ class Maker:
 
     def slice(self, number: int, first: bool, known: Known) -> Layer:
         """One slice, which refers to the priors of those before."""
-        rng, tables = self.rng, self.plan.layer(number) if first else Tables()
-        if self.bent and first and rng.random() < 0.5:
+        rng, tables = self.rng, Tables() if not first or (self.adds and number == 0) else self.plan.layer(number)
+        if self.bent and tables != Tables() and rng.random() < 0.5:
             bend(rng, tables)
+        tables.rows = {} if self.base and number == 0 else tables.rows
         if first:
             whole = {GROUP} if isinstance(self.plan, Splats) else set()
             steps = {i: 1.0 if i in whole else step(rng, (), M) for i in sorted(tables.rows)}
@@ -353,7 +370,8 @@ class Maker:
         lowest, high = rng.choice((3, 3, 200, 255)), rng.choice((0, 2, 255))
         graded = self.centres is not None
         classes, earlier = [near(rng, 0, 6) * graded for _ in cells], self.classes.tolist() if first else []
-        rises = [near(rng, 0, min(high, 255 - int(code))) for code in self.codes] if first else []
+        rises = [near(rng, 0, min(high, 255 - int(code)) if number else 1) for code in self.codes] if first else []
+        rises = [rise if code or number == 0 or rise > 2 else 0 for rise, code in zip(rises, self.codes, strict=False)]
         rows, layer_rows = (
             self.rows(classes, self.table, self.centres or []),
             self.rows(earlier + classes, self.layer_table, []),
@@ -377,6 +395,7 @@ class Maker:
             fill=[near(rng, 0, 255) for _ in range(3)] if rng.random() < 0.2 else None,
             steps=(step(rng, planes), step(rng, weights)),
             choose=Chooser(rng, known, counted + (1 << 18 if first else 1 << 10)),
+            base=self.base_rows if first else 0,
             known=known,
             first=first,
         )
@@ -387,10 +406,11 @@ class Maker:
     def header(self, layers: Sequence[Layer]) -> dict[int, Any]:
         """The fields of a file of these slices."""
         rng = self.rng
-        for i, row in enumerate(self.table):  # centres and the rows before add to symbols
-            row[2] = step(rng, [x.rows[i] for x in layers], M if self.centres is not None or row[3] else 1)
+        for i, row in enumerate(self.table):  # centres and the rows before add to symbols; others may add rows
+            most = M if self.centres is not None or row[3] or self.base else 1
+            row[2] = step(rng, [x.rows[i] for x in layers], most)
         header: dict[int, Any] = {2: self.mode, 3: self.plan.kind, 4: self.table, 5: self.centres}
-        header[6] = step(rng, [x.cells for x in layers])
+        header[6] = step(rng, [x.cells for x in layers], V if self.base else 1)
         if rng.random() < 0.3:
             box = sorted(rng.choice((-LARGEST, -1.0, -0.0, 2.0**-149, LARGEST)) for _ in range(2))
             header |= {7: [box[0]] * 3 + [box[1]] * 3, 8: [-LARGEST, LARGEST], 9: [0.0, 1.0, 2.0**-149]}
@@ -401,10 +421,19 @@ class Maker:
         return header
 
 
-def legal(rng: random.Random) -> tuple[File, bool]:
-    """(a file of random layers, slices, tables and priors, whether it is sure to make a scene). `File.hashes` says what
-    it decodes to."""
-    maker, layers = Maker(rng), list[Layer]()
+def legal(rng: random.Random) -> tuple[File, File | None, bool]:
+    """(a file of random layers, slices, tables and priors, its base if it has one, whether it is sure to make a scene).
+    `File.hashes` says what it decodes to."""
+    maker = Maker(rng, rng.random() < 0.25)
+    file = made(rng, maker)
+    if not maker.base:
+        return file, None, maker.scene
+    return made(rng, maker.over(), file), file, maker.scene
+
+
+def made(rng: random.Random, maker: Maker, base: File | None = None) -> File:
+    """A file of a maker, whose base is another one."""
+    layers = list[Layer]()
     for number in sorted({0, *rng.sample((1, 2), rng.randrange(3))}):
         known: Known = [[], [], []]
         count = 1 if maker.mode == LZMA else rng.choice((1, 1, 2, 3, rng.choice((5, 12))))
@@ -412,23 +441,29 @@ def legal(rng: random.Random) -> tuple[File, bool]:
         order = morton_order(np.concatenate([x.cells for x in own]))
         codes = np.concatenate([x.codes for x in own])[order]
         classes = np.concatenate([x.codes * 0 if x.classes is None else x.classes for x in own])[order]
-        maker.codes = np.concatenate([maker.codes + own[0].rises, codes])
-        maker.classes = np.concatenate([maker.classes, classes])
+        raised = maker.codes + own[0].rises if number else maker.codes * (1 - own[0].rises)
+        maker.codes, maker.classes = np.concatenate([raised, codes]), np.concatenate([maker.classes, classes])
+        if number == 0:
+            maker.of_base = maker.codes, maker.classes
         layers += own
     if maker.mode == LZMA:
         how = {"base": rng.choice((0, 0, None, K, -K, 1000)), "stream": rng.choice((lzma2.stored, lzma2.packed))}
         layers = [layer.packed(**how, width=rng.choice((None, 2))) for layer in layers]  # type: ignore[arg-type]
-    file = make_file(*layers, header=maker.header(layers))
-    if rng.random() < 0.2:  # it ends after any slice
+    header = maker.header(layers)
+    if base is None:
+        file = make_file(*layers, header=header)
+    else:
+        file = adding(base, *layers, header={key: value for key, value in header.items() if key not in range(3, 7)})
+    if rng.random() < 0.2 and not maker.base:  # it ends after any slice
         whole = file.fields()[14]
         file = replace(file, chunks=file.chunks[: rng.randint(1, len(file.chunks))]).with_header({14: whole})
-    return _with_what_is_ignored(rng, file), maker.scene
+    return _with_what_is_ignored(rng, file)
 
 
 @cache
-def numbered(index: int) -> File:
-    """A random file of its own for each number."""
-    return legal(random.Random(index))[0]
+def numbered(index: int) -> tuple[File, File | None]:
+    """A random file of its own for each number, and its base."""
+    return legal(random.Random(index))[:2]
 
 
 def _with_what_is_ignored(rng: random.Random, file: File) -> File:

@@ -35,7 +35,7 @@ SEALED_SHARE = 0.6  #: of the others
 class Case:
     """One input. sealed: whether lengths, ids and CRCs were made right after the mutation. recipe: what was done.
     origins: the files that it was made from. meaning: the hashes that a legal file must have; None for any other.
-    scene: whether it is sure to make a scene."""
+    scene: whether it is sure to make a scene. base: what is given as its base."""
 
     data: bytes
     sealed: bool
@@ -43,6 +43,7 @@ class Case:
     origins: tuple[bytes, ...] = ()
     meaning: list[dict[str, Any]] | None = None
     scene: bool = False
+    base: bytes | None = None
 
 
 # -- bytes -------------------------------------------------------------------------------------------------------------
@@ -265,12 +266,19 @@ def make_case(seeds: Sequence[Seed], run: int, index: int) -> Case:
     """Input number `index` of a run over these files."""
     rng = random.Random(run << 40 | index)
     if rng.random() < LEGAL_SHARE:
-        file, scene = legal(rng)
-        return Case(file.data(), True, "a legal file", meaning=file.hashes(), scene=scene)
+        file, base, scene = legal(rng)
+        under = base and base.data()
+        return Case(file.data(), True, "a legal file", meaning=file.hashes(), scene=scene, base=under)
     chosen, donor = rng.choice(seeds), rng.choice(seeds)
     names: list[str] = []
     act = rng.random()
     change = change_header_bytes if act < 0.05 else change_parts if act < SEALED_SHARE else change_bytes
     data, sealed = change(rng, chosen.data, donor.data, names), act < SEALED_SHARE
+    base = chosen.base
+    if base is not None and rng.random() < 0.3:
+        under = [seed for seed in (donor, *seeds) if seed.base is not None]
+        names.append("its base")
+        base = rng.choice((None, chosen.data, rng.choice(under).base, change(rng, base, donor.data, names)))
+        data = rng.choice((data, chosen.data))
     recipe = f"{chosen.name}{', sealed' if sealed else ''}: {', '.join(names)}"
-    return Case(data, sealed, recipe, (chosen.data, donor.data))
+    return Case(data, sealed, recipe, (chosen.data, donor.data), base=base)

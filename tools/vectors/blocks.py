@@ -347,7 +347,8 @@ class Layer:
 
     rows, layer_rows: symbols [C, n] and [C, earlier rows + n] of each tensor. earlier: step classes of the earlier rows
     in a first slice. chains: weights and biases. meta: the parameters but that of the codes' length. tree: head and
-    channels instead of those of the cells' octree. pieces: of the codes, by what they code.
+    channels instead of those of the cells' octree. base: so many earlier rows are a base's. pieces: of the codes, by
+    what they code.
     """
 
     number: int
@@ -363,6 +364,7 @@ class Layer:
     meta: dict[int, Any]
     choose: Choice
     tree: tuple[bytes, list[np.ndarray]] | None = None
+    base: int = 0
     pieces: dict[str, bytes] = field(default_factory=dict)
     stream: bytes = b""
 
@@ -397,9 +399,13 @@ class Layer:
         for piece, channels in self.channels().items():
             if piece == "grids":
                 channels = [*grid_channels(self.residuals)]
-            elif self.classes is not None and piece.endswith("rows"):
-                classes = np.append(self.earlier, self.classes) if piece == "layer_rows" else self.classes
-                channels = [channel[classes == q] for channel in channels for q in range(7)]
+            elif piece == "rows" and self.classes is not None:
+                channels = [channel[self.classes == q] for channel in channels for q in range(7)]
+            elif piece == "layer_rows" and channels:
+                classes = 0 if self.classes is None else np.append(self.earlier, self.classes)
+                of_base = np.arange(channels[0].size) < self.base
+                channels = [channel[own & (classes == q)] for channel in channels for own in (of_base, ~of_base)
+                    for q in range(1 if self.classes is None else 7)]  # fmt: skip
             pieces[piece] = coder.codes(2 if piece in ("grids", "chains") else 1, piece, channels)
         return replace(self, pieces=pieces, stream=coder.stream())
 
@@ -483,6 +489,7 @@ def make_layer(
     priors: Mapping[str, Mapping[int, Prior]] = {},  # noqa: B006  (never changed)
     choose: Choice | None = None,
     tree: tuple[bytes, list[np.ndarray]] | None = None,
+    base: int = 0,
     known: Known | None = None,
     first: bool = True,
 ) -> Layer:
@@ -526,6 +533,7 @@ def make_layer(
         {key: value for key, value in meta.items() if value is not None},
         choose or (lambda _, piece, number, k: priors.get(piece, {}).get(number) or default_prior(k)),
         tree,
+        base,
     ).written(known)
 
 
@@ -597,12 +605,23 @@ class File:
         return 20 + len(self.header_bytes()) + sum(20 + len(c.payload) for c in self.chunks[:index])
 
     @property
-    def scene_id(self) -> bytes:
-        """Clause 3.3, of the header as it is written. Where its chunk list is not there, of all its bytes."""
+    def described(self) -> bytes:
+        """The header as it is written, behind its chunk list; all of its bytes where that is not there."""
         header, fields = self.header_bytes(), self.fields()
         chunk_list = pack(1) + pack(fields[1]) if 1 in fields else header
-        described = header[header.find(chunk_list) + len(chunk_list) :] if chunk_list in header else header
-        return hashlib.sha256(described).digest()[:8]
+        return header[header.find(chunk_list) + len(chunk_list) :] if chunk_list in header else header
+
+    @property
+    def scene_id(self) -> bytes:
+        """Clause 3.3."""
+        return hashlib.sha256(self.described).digest()[:8]
+
+    def reference(self) -> list[Any]:
+        """What files say of it whose base it is (clause 5.6)."""
+        parts = [self.described, *(c.frame(self.scene_id) for c in self.chunks if c.type == 0)]
+        digest = hashlib.sha256(b"".join(hashlib.sha256(part).digest() for part in parts)).digest()
+        rows = sum(len(x.cells) for x in self.slices() if x.number == 0)
+        return [self.scene_id, digest, rows, sum(map(len, parts))]
 
     def data(self) -> bytes:
         """Its bytes."""
@@ -649,6 +668,12 @@ def make_file(*layers: Layer, header: Mapping[int, Any] | None = None) -> File:
     rows = [[i, width, STEPS[i % 3], 0] for i, width in enumerate(widths)]
     centres = {} if layers[0].classes is None else {5: [i % 5 - 2 for i in range(sum(widths))]}
     return File(tuple(chunks)).with_header({3: [0, widths[-1] // 3, 0], 4: rows, **centres, **(header or {})})
+
+
+def adding(base: File, *layers: Layer, header: Mapping[int, Any] | None = None) -> File:
+    """A file of these layers that adds to the layer 0 of another one."""
+    shared = {key: base.fields().get(key) for key in (3, 4, 5, 6)}
+    return make_file(*layers, header={**shared, 15: base.reference(), **(header or {})})
 
 
 def slices_of(*parts: Layer) -> File:

@@ -24,8 +24,9 @@ separated by ` ; `, edits one thing of it; lengths, CRCs, digest and scene ids a
 Values are Python expressions over the names of blocks.py and of this file. `it` is the value before, `base` the file,
 n(i) the length of the payload of chunk i. Options: `!Error` and clauses in place of those of the group, `@2` the
 chunk at fault (`@end` behind all chunks) where it does not follow from the first patch, `~Error` the error of a scene
-whose tensors decode. `for a: x | b: y` writes the line once for each name and value, in the places of {i} and {x}.
-`let name = value` defines a name for later lines. Without a sentence the name and the patch are the description.
+whose tensors decode, `^valid/name` the vector that is its base. `for a: x | b: y` writes the line once for each name
+and value, in the places of {i} and {x}. `let name = value` defines a name for later lines. Without a sentence the name
+and the patch are the description.
 """
 
 from __future__ import annotations
@@ -96,7 +97,7 @@ def vectors(without: Container[str] = ()) -> Iterator[tuple[dict[str, Any], byte
 
 def _lines() -> Iterator[str]:
     """One line for each vector: continuations are joined, and lines with `for` are written out."""
-    text = re.sub(r"\n +(?=[#!@~]|for [\w-]+: |\d[\d. ]*(?:  |\n))", "  ", TABLE.read_text(encoding="utf-8"))
+    text = re.sub(r"\n +(?=[#!@~^]|for [\w-]+: |\d[\d. ]*(?:  |\n))", "  ", TABLE.read_text(encoding="utf-8"))
     text = re.sub(r"\n +", " ", text)
     for row in text.splitlines():
         head, found, values = row.partition("  for ")
@@ -109,12 +110,14 @@ def _lines() -> Iterator[str]:
 def _vector(text: str, folder: str, base: File, clauses: str, error: str | None, names: dict[str, Any]) -> Any:
     text, _, what = text.partition("  # ")
     name, patches, *options = re.split(r" {2,}", text.strip())
-    target = scene = None
+    target = scene = under = None
     for option in options:
         if option.startswith("!"):
             error = option[1:]
         elif option.startswith("~"):
             scene = option[1:]
+        elif option.startswith("^"):
+            under = option[1:] + ".pd4"
         elif option.startswith("@"):
             target = option[1:]
         else:
@@ -144,6 +147,7 @@ def _vector(text: str, folder: str, base: File, clauses: str, error: str | None,
         "chunk": chunk if error else None,
         "offset": at if error else None,
         "scene": scene,
+        "base": under,
         "ans_only": "UnsupportedFeature" if file.fields().get(2) == LZMA else "same",
         "slices": slices[: len(file.slices(count))] if len(slices) > len(set(slices)) else None,
     }
@@ -360,6 +364,20 @@ def rows_at_limit(over: int = 0) -> File:
     layer = make_layer(0, line((1 << 13) + 2 * 600 + over))
     size = len(pack(layer.parameters())) + 600 - len(layer.payload())
     return make_file(layer).with_chunk(0, payload=layer.padded(size))
+
+
+def over_base(over: int = 0) -> File:
+    """As many symbols as clause 6.5 allows a file whose base has the rows of `rows_at_limit`, or `over` more."""
+    base, size = rows_at_limit(), 1500
+    _, _, n, bytes_of_base = base.reference()
+    first = make_layer(0, (), before=n, chains={})
+    left = (1 << 22) + 256 * (bytes_of_base + len(first.payload()) + size) + over - (4 + 11 + 2) * n
+    width, rest = divmod(left, n)
+    grids = [Grid(1, (min(4096, rest - at),), fill=constant(0), id=at >> 12) for at in range(0, rest, 4096)]
+    own = {i: np.zeros((min(256, width - 256 * i), n), np.int32) for i in range(-(-width // 256))}
+    layer = make_layer(1, (), before=n, base=n, layer_rows=own, grids=grids, chains={})
+    payload = layer.padded(len(pack(layer.parameters())) + size - len(layer.payload()))
+    return blocks.adding(base, first, layer).with_chunk(1, payload=payload)
 
 
 def lzma_file(*layers: Layer, **how: Any) -> File:
