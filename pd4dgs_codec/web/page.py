@@ -54,12 +54,12 @@ def bundle(root: Path, *entries: str, start: str = "") -> str:
         if name not in modules:
             modules[name] = ""
             modules[name] = _module(path, lambda other: add((path.parent / other).resolve()))
-        return f'take("{name}")'
+        return f'$take("{name}")'  # no name of a module's own
 
     first = [add((root / entry).resolve()) for entry in entries][0]
     bodies = "".join(f'"{name}"(){{\n{body}}},\n' for name, body in modules.items())
-    head = f'"use strict";\nconst modules={{\n{bodies}}};\nconst made={{}},take=(name)=>made[name]??=modules[name]();\n'
-    return f"{head}{f'take({start})' if start else first};\n"
+    head = f'"use strict";\nconst $modules={{\n{bodies}}};\nconst $made={{}},$take=(name)=>$made[name]??=$modules[name]();\n'
+    return f"{head}{f'$take({start})' if start else first};\n"
 
 
 def _module(path: Path, imported: Callable[[str], str]) -> str:

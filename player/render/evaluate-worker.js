@@ -16,7 +16,7 @@ let splats;
 let kept = null;
 
 /** @param {Scene | null} next */
-function take(next) {
+function renew(next) {
   if (!next) return;
   scene = next;
   if (scene.kind === "splats") splats = new SplatEvaluator(scene);
@@ -26,7 +26,7 @@ serve({
   /** @param {Scene | null} next a new scene @param {number} level @param {number} t @param {number[]} eye
    * @param {Texels | null} spare an earlier result, to overwrite */
   evaluate(next, level, t, eye, spare) {
-    take(next);
+    renew(next);
     const result = texelsAt(level, t, eye, spare);
     const means = result.data.slice(0, 4 * result.count);
     return { result: { ...result, means }, transfer: [result.data.buffer, means.buffer] };
@@ -35,7 +35,7 @@ serve({
   /** @param {Scene | null} next a new scene @param {number} level @param {number} t @param {number[]} eye
    * @param {Packed | null} spare an earlier result, to overwrite */
   pack(next, level, t, eye, spare) {
-    take(next);
+    renew(next);
     kept = texelsAt(level, t, eye, kept);
     const result = packed(kept, spare);
     return { result, transfer: result.extArrays.map(({ buffer }) => buffer) };
@@ -43,14 +43,14 @@ serve({
 
   /** @param {Scene | null} next of splats @param {number} level @param {number} t */
   means(next, level, t) {
-    take(next);
+    renew(next);
     const result = splats.means(level, t);
     return { result, transfer: [result.buffer] };
   },
 
   /** @param {Scene | null} next of splats @param {number} level */
   parts(next, level) {
-    take(next);
+    renew(next);
     const result = splats.parts(level);
     const { rest, coefficients, windows } = result;
     return { result, transfer: [rest.buffer, coefficients.buffer, ...(windows ? [windows.buffer] : [])] };
