@@ -389,7 +389,7 @@ class Thing:
 
     shape: str
     size: Point
-    at: Point | Callable[[float], Point]
+    at: Point | Callable[[float], Point | np.ndarray]
     turn: Callable[[float], np.ndarray] = lambda t: np.eye(3)
     stretch: Callable[[float], float | Point] = lambda t: 1.0
 

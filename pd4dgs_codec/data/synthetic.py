@@ -1,4 +1,5 @@
-"""`synthetic:NAME[?seed=n&size=WxH&frames=N&path=pass|sweeps|jump]`: ray-cast dynamic scenes, named in STAGES.
+"""`synthetic:NAME[?seed=n&size=WxH&frames=N&path=PATH]`: ray-cast dynamic scenes, named in STAGES, and RANDOM, which
+draws bodies, background and camera path from its seed.
 
 In a room one camera moves along an arc (60 training frames); two fixed cameras off that arc give the test views, with
 exact covisibility masks. On white the camera jumps on the upper hemisphere, as D-NeRF's does (150 frames without
@@ -19,6 +20,7 @@ from pd4dgs_codec.data.bodies import MOTIONS, NO_BODY, THINGS, Body, Eye, bodies
 from pd4dgs_codec.data.dancer import DANCER, Dancer
 from pd4dgs_codec.data.dataset import SYNTHETIC
 from pd4dgs_codec.data.files import check_downscale, split_options
+from pd4dgs_codec.data.random_bodies import RANDOM, random_scene
 from pd4dgs_codec.data.view import Dataset, Lens, View, shrunk_view, world_to_camera
 from pd4dgs_codec.errors import DataError
 
@@ -30,11 +32,13 @@ EXAMPLES = {
     "seed": "seed=1",
     "size": f"size=960x540, each {SIZES[0]} to {SIZES[-1]}",
     "frames": f"frames=300, {FRAMES[0]} to {FRAMES[-1]}",
-    "path": "path=pass, sweeps or jump",
+    "path": "path=pass, sweeps, orbit, jump or still",
 }
+STILL, STANDS, CAMERAS = "still", 0.5, 8
 #: Cycles of the camera along its path; None: it is at a random place at each instant. If it passes each place once,
-#: the place determines the time, and a static scene with view-dependent colours explains every motion.
-PATHS = {"pass": 0.5, "sweeps": 2.5, "jump": None}
+#: the place determines the time, and a static scene with view-dependent colours explains every motion. STILL: CAMERAS
+#: that stand along a path of STANDS cycles and show every instant.
+PATHS = {"pass": 0.5, "sweeps": 2.5, "orbit": 1.0, "jump": None, STILL: STANDS}
 NEAR, FAR = 0.5, 12.0
 POINTS = 5000
 COVISIBLE_SHARE = 0.05  #: of the training frames that must see a test pixel's surface point
@@ -118,7 +122,22 @@ FIGURE = replace(
 STAGES = dict.fromkeys(MOTIONS, ROOM) | dict.fromkeys(THINGS, WHITE) | {DANCER: FIGURE}
 
 
+def random_stage(seed: int, path: str | None) -> Stage:
+    """The stage of RANDOM. Without a room its test cameras are beside the way of the training camera."""
+    chance = random_scene(seed)
+    path = path or chance.path
+    if chance.room:
+        return replace(ROOM, frames=100, path=path)
+    turns = PATHS[path] or 1.0
+    fixed = white_viewmat(0.3 * turns, 0.4), white_viewmat(0.7 * turns, 0.55)
+    return replace(WHITE, frames=100, path=path, background=chance.background, fixed=fixed, instants=15)
+
+
 # -- a dataset of a scene ----------------------------------------------------------------------------------------------
+
+
+#: Viewmat, number of the camera, index of the instant.
+Shot = tuple[np.ndarray, int, int]
 
 
 @dataclass(frozen=True)
@@ -144,21 +163,40 @@ class Take:
         """The instants of the training frames."""
         return [i / (self.frames - 1) for i in range(self.frames)]
 
+    def bodies(self) -> list[Body]:
+        """All bodies of the scene."""
+        if self.name == RANDOM:
+            return random_scene(self.seed).bodies
+        return Dancer(self.seed).bodies() if self.name == DANCER else bodies(self.name, self.seed)
+
     def viewmats(self) -> list[np.ndarray]:
-        """The viewmats of the training frames."""
-        turns = PATHS[self.path]
+        """The viewmats of the training frames, of STILL one per camera."""
+        turns, rng = PATHS[self.path], np.random.default_rng([self.seed, 2])
+        if self.path == STILL:
+            places = enumerate(rng.uniform(size=CAMERAS).tolist())
+            return [self.stage.viewmat(STANDS * (k + 0.5) / CAMERAS, s) for k, s in places]
         if turns is not None:
             return [self.stage.viewmat(turns * t, t) for t in self.times]
-        places = np.random.default_rng([self.seed, 2]).uniform(size=(self.frames, 2))
-        return [self.stage.viewmat(phase, s) for phase, s in places.tolist()]
+        return [self.stage.viewmat(phase, s) for phase, s in rng.uniform(size=(self.frames, 2)).tolist()]
+
+    def shots(self) -> tuple[list[Shot], list[Shot]]:
+        """Of the training views and of the test views, camera by camera."""
+        viewmats, some = self.viewmats(), self.stage.instants
+        if self.path == STILL:
+            train = [(viewmat, camera, i) for camera, viewmat in enumerate(viewmats) for i in range(self.frames)]
+        else:
+            train = [(viewmat, 0, i) for i, viewmat in enumerate(viewmats)]
+        instants = range(2, self.frames, max(1, self.frames // some)) if some else range(self.frames)
+        fixed = enumerate(self.stage.fixed, start=train[-1][1] + 1)
+        return train, [(viewmat, camera, i) for camera, viewmat in fixed for i in instants]
 
 
 def parse(source: str) -> Take:
     """Parses a `synthetic:` source. Raises DataError."""
     name, options = split_options(source.removeprefix(SYNTHETIC), source, _value, EXAMPLES)
-    stage = STAGES.get(name)
+    stage = random_stage(options.get("seed", 0), options.get("path")) if name == RANDOM else STAGES.get(name)
     if stage is None:
-        expected = f"{SYNTHETIC}{'|'.join(STAGES)}[?seed=n&size=WxH&frames=N&path={'|'.join(PATHS)}]"
+        expected = f"{SYNTHETIC}{'|'.join((*STAGES, RANDOM))}[?seed=n&size=WxH&frames=N&path={'|'.join(PATHS)}]"
         raise DataError(f"{source}: unknown synthetic scene, expected {expected}")
     usual: dict[str, Any] = {"size": (stage.lens.width, stage.lens.height), "frames": stage.frames, "path": stage.path}
     return Take(name, stage, **(usual | options))
@@ -274,21 +312,20 @@ def _initial_points(
 
 @lru_cache(maxsize=4)
 def _dataset(take: Take) -> Dataset:
-    stage, lens, times, viewmats = take.stage, take.lens, take.times, take.viewmats()
-    scene = Dancer(take.seed).bodies() if take.name == DANCER else bodies(take.name, take.seed)
-    eyes = [Eye(place(scene, t), v) for t, v in zip(times, viewmats, strict=True)]
+    stage, lens, times, scene = take.stage, take.lens, take.times, take.bodies()
+    shots, tested = take.shots()
+    eyes = [Eye(place(scene, times[i]), viewmat) for viewmat, _, i in shots]
 
-    def view(viewmat: np.ndarray, camera: int, i: int) -> View:
+    def view(viewmat: np.ndarray, camera: int, i: int, *, masked: bool = False) -> View:
         image, K = _render(scene, viewmat, times[i], lens, stage.background), lens.matrix()
-        mask = _covisible(scene, eyes, viewmat, times[i], lens) if camera and stage.capture else None
+        mask = _covisible(scene, eyes, viewmat, times[i], lens) if masked else None
         return View(viewmat.astype(np.float32), K, *take.size, times[i], image, mask, f"{camera}_{i:05d}", camera)
 
-    train = tuple(view(v, 0, i) for i, v in enumerate(viewmats))
-    instants = range(2, take.frames, max(1, take.frames // stage.instants)) if stage.instants else range(take.frames)
-    test = tuple(view(v, camera, i) for camera, v in enumerate(stage.fixed, start=1) for i in instants)
+    train = tuple(view(*shot) for shot in shots)
+    test = tuple(view(*shot, masked=stage.capture) for shot in tested)
     points = None
     if stage.capture:
-        points = _initial_points(scene, viewmats, lens, stage.box, np.random.default_rng([take.seed, 1]))
+        points = _initial_points(scene, take.viewmats(), lens, stage.box, np.random.default_rng([take.seed, 1]))
     fields = stage.background, (0.0, SECONDS), (0.0, 0.0, 1.0), stage.capture
     return Dataset(f"synthetic-{take.name}", train, test, points, stage.box, NEAR, FAR, *fields)
 
@@ -303,3 +340,39 @@ def read_synthetic(source: str, downscale: int = 1) -> Dataset:
     K = take.lens.matrix(downscale)
     train, test = (tuple(replace(shrunk_view(v, downscale), K=K) for v in views) for views in (full.train, full.test))
     return replace(full, train=train, test=test)
+
+
+@dataclass(frozen=True, eq=False)
+class Mover:
+    """A body that moves, as the V test views of a scene show it.
+
+    shown: bool [V, H, W], valid pixels whose centre shows it. without: uint8 [V, H, W, 3], the pictures without it.
+    radius: of a disc with as many pixels as it has on average where it is shown; 0 if it never is. step: what its
+    centre moves at most between neighbouring instants, in its own sizes (the mean one of its three).
+    """
+
+    shown: np.ndarray
+    without: np.ndarray
+    radius: float
+    step: float
+
+
+def movers(source: str) -> list[Mover]:
+    """All bodies of a synthetic scene that move."""
+    take = parse(source)
+    scene, lens, (_, shots), times = take.bodies(), take.lens, take.shots(), take.times
+    masks = [True if view.mask is None else view.mask for view in _dataset(take).test]
+    hits = [Eye(place(scene, times[i]), viewmat).first_hits(*_grid(lens))[1] for viewmat, _, i in shots]
+    found = []
+    for k, body in enumerate(scene):
+        A, c = (np.stack(parts) for parts in zip(*map(body.pose, times), strict=True))
+        if np.ptp(A, axis=0).max() + np.ptp(c, axis=0).max() == 0:
+            continue
+        others = scene[:k] + scene[k + 1 :]
+        shown = np.stack([(index == k) & mask for index, mask in zip(hits, masks, strict=True)])
+        without = [_render(others, viewmat, times[i], lens, take.stage.background) for viewmat, _, i in shots]
+        areas, size = shown.sum(axis=(1, 2)), 2 * np.cbrt(abs(np.linalg.det(A)))
+        radius = float(np.sqrt(areas[areas > 0].mean() / np.pi)) if areas.any() else 0.0
+        step = float((np.linalg.norm(np.diff(c, axis=0), axis=1) / size[1:]).max())
+        found.append(Mover(shown, np.stack(without), radius, step))
+    return found
