@@ -379,7 +379,6 @@ class RoomBuilder(Painter):
 # -- scenes on white ---------------------------------------------------------------------------------------------------
 
 Point = tuple[float, float, float]
-GONE = 1e-4  #: the stretch of an absent body
 pi = np.pi
 
 
@@ -432,16 +431,6 @@ THINGS: dict[str, tuple[Thing, ...]] = {
         Thing("cylinder", (0.03, 0.03, 0.6), (0.6, 0.0, -0.2)),
     ),
     "bend": tuple(map(_slice, range(10))),  # a column bends, twists and breathes
-    "blink": (  # beside a cube a ball appears and vanishes, and a cylinder grows after it
-        Thing("box", (0.35, 0.35, 0.35), (-0.4, 0.2, -0.2)),
-        Thing("sphere", (0.25, 0.25, 0.25), (0.5, -0.4, 0.2), stretch=lambda t: 1.0 if 0.3 < t < 0.6 else GONE),
-        Thing(
-            "cylinder",
-            (0.2, 0.2, 0.5),
-            (0.3, 0.6, 0.0),
-            stretch=lambda t: (1.0, 1.0, max(GONE, min(1.0, 5 * t - 3))) if t > 0.6 else GONE,
-        ),
-    ),
 }
 
 

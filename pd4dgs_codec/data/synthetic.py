@@ -34,7 +34,7 @@ EXAMPLES = {
     "frames": f"frames=300, {FRAMES[0]} to {FRAMES[-1]}",
     "path": "path=pass, sweeps, orbit, jump or still",
 }
-STILL, STANDS, CAMERAS = "still", 0.5, 8
+STILL, STANDS, CAMERAS = "still", 0.5, 6
 #: Cycles of the camera along its path; None: it is at a random place at each instant. If it passes each place once,
 #: the place determines the time, and a static scene with view-dependent colours explains every motion. STILL: CAMERAS
 #: that stand along a path of STANDS cycles and show every instant.

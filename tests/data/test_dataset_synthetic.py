@@ -10,6 +10,7 @@ from pd4dgs_codec.data import synthetic as syn
 from pd4dgs_codec.data.bodies import MOTIONS, NO_BODY, THINGS, Eye, bodies, enter, place, shade
 from pd4dgs_codec.data.dancer import Dancer
 from pd4dgs_codec.data.dataset import load
+from pd4dgs_codec.data.random_bodies import PATHS, RANDOM, random_scene
 
 LENS, SWEEPS = syn.ROOM.lens, syn.PATHS["sweeps"]
 
@@ -275,3 +276,92 @@ def test_the_dancer_is_a_set_in_the_layout_of_d_nerf():
     for v in d.train:
         border = np.concatenate([v.image[0], v.image[-1], v.image[:, 0], v.image[:, -1]])
         assert (border == 255).all() and (v.image < 160).any()
+
+
+# -- random scenes -----------------------------------------------------------------------------------------------------
+
+
+def ways(bodies, instants=65):
+    """Places [n, instants, 3] of bodies over time."""
+    return np.stack([[body.pose(t)[1] for t in np.linspace(0, 1, instants)] for body in bodies])
+
+
+def test_random_scenes_are_of_all_kinds():
+    """3 to 8 bodies besides floor and wall, of which some move and some do not; every kind of way, camera and place."""
+    scenes = [random_scene(seed) for seed in range(40)]
+    assert {scene.path for scene in scenes} == set(PATHS)
+    assert {(scene.room, scene.background == (1, 1, 1)) for scene in scenes} >= {(True, True), (False, True)}
+    assert any(not scene.room and scene.background != (1, 1, 1) for scene in scenes)
+    counts = []
+    for scene in scenes:
+        way = ways(scene.bodies[2 * scene.room :])
+        moves = np.ptp(way, axis=1).max(axis=1) > 0
+        counts.append(len(way))
+        assert 0 < moves.sum() < len(way)
+    assert min(counts) == 3 and max(counts) == 8
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_random_bodies_stay_apart_and_in_view(seed):
+    """The inscribed balls of bodies never meet, nor do those of a room leave it through the floor; before a plain
+    background each training picture has nothing but background along its border."""
+    scene = random_scene(seed)
+    bodies = scene.bodies[2 * scene.room :]
+    way = ways(bodies, 41)
+    radii = [np.linalg.svd(body.pose(0.3)[0], compute_uv=False).min() for body in bodies]
+    for a, b in combinations(range(len(bodies)), 2):
+        assert np.linalg.norm(way[a] - way[b], axis=1).min() > radii[a] + radii[b]
+    if scene.room:
+        assert all(line[:, 2].min() > radius - 1e-9 for line, radius in zip(way, radii, strict=True))
+        return
+    for v in load(f"synthetic:{RANDOM}?seed={seed}&size=48x48&frames=12&path=jump").train:
+        border = np.concatenate([v.image[0], v.image[-1], v.image[:, 0], v.image[:, -1]])
+        assert (border == border[0]).all() and (v.image != border[0]).any()
+
+
+def test_the_lost_ball_is_within_reach():
+    """As in D-NeRF, a body goes half around a still one, by less than its radius between 100 views."""
+    scene = random_scene(242)
+    assert scene.path == "jump" and scene.background == (1, 1, 1) and not scene.room
+    way = ways(scene.bodies, 100)
+    moving = np.ptp(way, axis=1).max(axis=1) > 0
+    assert np.abs(way[~moving][0]).max() < 0.2
+    (around,) = way[moving]
+    distance = np.linalg.norm(around, axis=1)
+    assert np.ptp(distance) < 1e-6 and distance[0] > 0.9
+    length = np.linalg.norm(np.diff(around, axis=0), axis=1)
+    assert 0.4 < length.sum() / (2 * np.pi * distance[0]) < 0.6
+    (A,) = (body.pose(0)[0] for body, moves in zip(scene.bodies, moving, strict=True) if moves)
+    assert length.max() < 0.25 * np.cbrt(np.linalg.det(A))
+
+
+def test_cameras_that_stand_still_show_every_instant():
+    d = load("synthetic:random?seed=0&size=24x24&frames=5&path=still")
+    assert len(d.train) == syn.CAMERAS * 5 and {v.camera_id for v in d.test} == {syn.CAMERAS, syn.CAMERAS + 1}
+    for camera in range(syn.CAMERAS):
+        views = [v for v in d.train if v.camera_id == camera]
+        assert [v.time for v in views] == [0, 0.25, 0.5, 0.75, 1] and np.ptp(centers(views), axis=0).max() == 0
+    assert len(np.unique(centers(d.train), axis=0)) == syn.CAMERAS
+
+
+def test_pictures_without_a_body_differ_where_it_is():
+    """The body's pixels, its shadow and its edges are all that differ; nothing else moves in the scene."""
+    source = "synthetic:flyby?size=64x64&frames=7"
+    d, (ball,) = load(source), syn.movers(source)
+    truth = np.stack([v.image for v in d.test]).astype(int)
+    changed = (np.abs(truth - ball.without).max(axis=3) > 3)[ball.shown]
+    assert changed.mean() > 0.97
+    fixed = [v for v in d.test if v.camera_id == 1]
+    assert np.ptp(ball.without[: len(fixed)], axis=0).max() == 0 < np.ptp(truth[: len(fixed)], axis=0).max()
+    pixels = 0.18 / 4 * d.test[0].K[0, 0]  # at the mean distance
+    assert pixels * 0.7 < ball.radius < pixels * 1.3
+    assert ball.step == pytest.approx(np.linalg.norm([2 / 6, 2.4 * (0.25 - (0.5 - 1 / 6) ** 2)]) / 0.36, rel=1e-6)
+
+
+def test_pixels_of_a_body_count_within_the_masks():
+    source = "synthetic:fast?size=40x30&frames=9"
+    d, found = load(source), syn.movers(source)
+    assert len(found) == 6  # a crate, which turns in its place, three balls, a rod and its bob
+    assert min(body.step for body in found) == 0 < found[1].step
+    for body in found:
+        assert not (body.shown & ~np.stack([v.mask for v in d.test])).any()
