@@ -14,6 +14,7 @@ import numpy as np
 import page
 import pytest
 import quality
+import random_scenes
 import run
 import viewers
 from common import QUICK, ROOT, Run, Training
@@ -265,3 +266,55 @@ def test_pages_show_the_pictures_in_git_which_are_small():
     pictures = {path for path in (ROOT / "docs").rglob("*") if path.suffix in PICTURES}
     assert set().union(*map(shown, pages)) == pictures
     assert all(path.stat().st_size <= (LIMIT if path.suffix == ".gif" else 300_000) for path in pictures)
+
+
+# -- random scenes -----------------------------------------------------------------------------------------------------
+
+
+def test_random_scenes_are_trained_once_and_measured(tmp_path, monkeypatch, capsys):
+    """A second run trains nothing. A body that the file shows no better than a picture without it is not kept."""
+    trained = []
+
+    def command(tree, name, *words):
+        trained.append(words[0]) if name == "train" else None
+        return common.command(name, *words)
+
+    monkeypatch.setitem(PRESETS, "tiny", TINY)
+    monkeypatch.setattr(random_scenes, "in_tree", command)
+    words = ["5-6", "-o", str(tmp_path / "rows.jsonl"), "--frames", "4", "--side", "24", "--iterations", "3"]
+    random_scenes.main(words)
+    first = capsys.readouterr().out
+    assert random_scenes.main([*words, "--sheet", str(tmp_path / "worst.png")]) == 0
+    assert capsys.readouterr().out == first and trained == [
+        f"synthetic:random?seed={seed}&frames=4&size=24x24" for seed in (5, 6)
+    ]
+    rows = [json.loads(line) for line in (tmp_path / "rows.jsonl").read_text().splitlines()]
+    assert [row["seed"] for row in rows] == [5, 6] and all(row["bytes"] > 500 for row in rows)
+    for row, line in zip(rows, first.splitlines()[2:], strict=False):
+        (kept, counted), (others, slow) = random_scenes.kept(row), random_scenes.kept(row, counts=False)
+        assert counted + slow == len(row["bodies"]) > 0 == kept + others
+        assert f"{kept} of {counted}" in line
+    strips = Image.open(tmp_path / "worst.png").height // 24
+    assert strips == sum(1 + len(row["db"]) for row in rows)
+
+
+def test_a_truth_keeps_its_bodies():
+    """The views themselves are far above the views without a body; those are at 0 dB above themselves."""
+    source = "synthetic:random?seed=6&frames=5&size=32x32"
+    views = random_scenes.load(source).test
+    by_place = {(v.viewmat.tobytes(), v.time): v.image for v in views}
+    level = Mock(picture=lambda camera, time: by_place[camera.viewmat.tobytes(), time] / 255)
+    assert all(body["gain"] > 30 for body in random_scenes.gains(source, level, views))
+    (ball,) = random_scenes.movers(source)
+    by_place = dict(zip(by_place, ball.without, strict=True))
+    assert [body["gain"] for body in random_scenes.gains(source, level, views)] == [pytest.approx(0, abs=1e-9)]
+
+
+def test_what_a_log_says_of_time_and_decisions():
+    """A step takes a second; the fifth has a trial of nine seconds before it, and the first one compiles."""
+    seconds = 60 + np.arange(30) + 9 * (np.arange(30) >= 5)
+    records = [{"loss": 1.0, "seconds": float(s)} for s in seconds]
+    records[5]["predicted_gain"] = 2.5
+    steps, others = random_scenes.split_seconds(records)
+    assert (steps, others) == (28 + random_scenes.USUAL, 10 - random_scenes.USUAL)
+    assert random_scenes.decisions(records) == {"predicted_gain": 2.5}

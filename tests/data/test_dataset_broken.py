@@ -97,7 +97,7 @@ def test_bad_options(blender, refused):
 
 
 SYNTHETIC = {
-    "": "expected synthetic:static|global|local|fast|flyby|dart|rods|bend|dancer|random[?seed=n&size=WxH&frames=N&path=",
+    "": "expected synthetic:static|global|local|fast|flyby|dart|rods|bend|dancer|random[?seed=n&size=WxH&frames=N",
     "Static": "expected synthetic:static",
     "nothing?seed=1": "expected synthetic:static",
     **{
