@@ -292,7 +292,7 @@ def test_random_scenes_are_trained_once_and_measured(tmp_path, monkeypatch, caps
     assert [row["seed"] for row in rows] == [5, 6] and all(row["bytes"] > 500 for row in rows)
     for row, line in zip(rows, first.splitlines()[2:], strict=False):
         (kept, counted), (others, slow) = random_scenes.kept(row), random_scenes.kept(row, counts=False)
-        assert counted + slow == len(row["bodies"]) > 0 == kept + others
+        assert counted + slow == len(row["bodies"]) > 0 == kept + others == random_scenes.kept(row, "seen")[0]
         assert f"{kept} of {counted}" in line
     strips = Image.open(tmp_path / "worst.png").height // 24
     assert strips == sum(1 + len(row["db"]) for row in rows)
@@ -305,7 +305,7 @@ def test_a_truth_keeps_its_bodies():
     by_place = {(v.viewmat.tobytes(), v.time): v.image for v in views}
     level = Mock(picture=lambda camera, time: by_place[camera.viewmat.tobytes(), time] / 255)
     assert all(body["gain"] > 30 for body in random_scenes.gains(source, level, views))
-    (ball,) = random_scenes.movers(source)
+    (ball,) = random_scenes.movers(source, views)
     by_place = dict(zip(by_place, ball.without, strict=True))
     assert [body["gain"] for body in random_scenes.gains(source, level, views)] == [pytest.approx(0, abs=1e-9)]
 

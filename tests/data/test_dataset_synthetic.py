@@ -347,7 +347,8 @@ def test_cameras_that_stand_still_show_every_instant():
 def test_pictures_without_a_body_differ_where_it_is():
     """The body's pixels, its shadow and its edges are all that differ; nothing else moves in the scene."""
     source = "synthetic:flyby?size=64x64&frames=7"
-    d, (ball,) = load(source), syn.movers(source)
+    d = load(source)
+    (ball,) = syn.movers(source, d.test)
     truth = np.stack([v.image for v in d.test]).astype(int)
     changed = (np.abs(truth - ball.without).max(axis=3) > 3)[ball.shown]
     assert changed.mean() > 0.97
@@ -360,7 +361,8 @@ def test_pictures_without_a_body_differ_where_it_is():
 
 def test_pixels_of_a_body_count_within_the_masks():
     source = "synthetic:fast?size=40x30&frames=9"
-    d, found = load(source), syn.movers(source)
+    d = load(source)
+    found = syn.movers(source, d.test)
     assert len(found) == 6  # a crate, which turns in its place, three balls, a rod and its bob
     assert min(body.step for body in found) == 0 < found[1].step
     for body in found:
