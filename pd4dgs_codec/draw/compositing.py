@@ -110,7 +110,7 @@ def _tabulate(ts: Array, rs: Array, rests: Array, geom: Array, g: int, left: int
             store(ts, column * TILE_HEIGHT + first, single(t + splat(float(column) * (sa * LANES))))
 
 
-@kernel()
+@kernel(inline=True)
 def _begin(state: Array, channel: int, left: int, top: int, width: int, height: int) -> Bits:
     """Sets `channel` of the state to 1 inside the image and 0 outside; returns the blocks with a pixel inside."""
     alive = np.uint64(0)
@@ -131,7 +131,7 @@ def _place(x: int, y: int) -> int:
     return block // _ROWS * _STATE * WIDE + block % _ROWS * LANES + x % LANES
 
 
-@kernel()
+@kernel(inline=True)
 def _composite_tile(
     items: Array,
     start: int,
@@ -226,7 +226,7 @@ def composite(
                     picture[y, x, c] = state[p + (1 + c) * WIDE] + back
 
 
-@kernel()
+@kernel(inline=True)
 def _composite_tile_backward(
     items: Array,
     slot_of: Array,

@@ -39,13 +39,13 @@ SLOT_COLOR = 6  #: first of the three columns of colours
 SLOTS = SLOT_COLOR + 3
 
 
-@kernel()
+@kernel(inline=True)
 def _saturate(value: float) -> Any:
     """Converts `value` to float32, clamped to float32's range; NaN passes."""
     return np.float32(min(max(value, -_F32_MAX), _F32_MAX)) if value == value else np.float32(value)
 
 
-@kernel()
+@kernel(inline=True)
 def _rotation(w: float, x: float, y: float, z: float) -> tuple[Quaternion, float, Matrix3]:
     """Unit quaternion (w, x, y, z), 1/norm and the 9 entries of R; a zero quaternion is the identity with 1/norm 0."""
     w, x, y, z = np.float64(w), np.float64(x), np.float64(y), np.float64(z)  # float() of a float32 stays one in numba
@@ -63,7 +63,7 @@ def _rotation(w: float, x: float, y: float, z: float) -> tuple[Quaternion, float
     return (w, x, y, z), inverse, matrix
 
 
-@kernel()
+@kernel(inline=True)
 def _to_camera(means: Array, i: int, camera: Array) -> tuple[float, float, float]:
     """Point i in camera axes. camera: float64 [20] = R (9, row-major), t (3), fx, fy, cx, cy, then the limits of J."""
     a, b, c = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
@@ -74,7 +74,7 @@ def _to_camera(means: Array, i: int, camera: Array) -> tuple[float, float, float
     )
 
 
-@kernel()
+@kernel(inline=True)
 def _jacobian(x: float, y: float, z: float, camera: Array) -> tuple[float, float, float, Matrix23]:
     """1/z, the ratios x/z and y/z clamped to 1.3 x the field of view (as gsplat), and M = J W, 2x3 row-major."""
     iz = 1.0 / z
@@ -88,7 +88,7 @@ def _jacobian(x: float, y: float, z: float, camera: Array) -> tuple[float, float
     return iz, a, b, matrix
 
 
-@kernel()
+@kernel(inline=True)
 def _matmul23(m: Matrix23, r: Matrix3) -> Matrix23:
     """(2x3) (3x3), both row-major tuples."""
     return (
@@ -101,7 +101,7 @@ def _matmul23(m: Matrix23, r: Matrix3) -> Matrix23:
     )
 
 
-@kernel()
+@kernel(inline=True)
 def _clip_index(value: float, limit: int) -> int:
     """Converts `value` to int, clamped to 0 .. limit in floating point first, so that huge values convert safely."""
     return int(min(max(value, 0.0), float(limit)))
@@ -179,7 +179,7 @@ def project(
         visible[i] = True
 
 
-@kernel()
+@kernel(inline=True)
 def _rotation_gradient(unit: Quaternion, inverse_norm: float, g: Matrix3) -> Quaternion:
     """Returns d/d(unnormalised quaternion) from g = d/dR (9, row-major)."""
     w, x, y, z = unit
@@ -196,7 +196,7 @@ def _rotation_gradient(unit: Quaternion, inverse_norm: float, g: Matrix3) -> Qua
     )
 
 
-@kernel()
+@kernel(inline=True)
 def _image_gradient(
     sum_t: float, sum_tt: float, sum_r: float, sum_rr: float, sum_tr: float, k: float, sa: float, sb: float
 ) -> tuple[float, float, float, float, float]:

@@ -33,6 +33,7 @@ from pd4dgs_codec.draw.simd import (
     Array,
     Tasks,
     Vector,
+    copy,
     fma,
     fnma,
     kernel,
@@ -212,7 +213,7 @@ def _magnitudes(tasks: Tasks, channel_sums: Array, cell_sums: Array, grid: Array
                     store(sums, c, load(sums, c) + magnitude)
                     whole = whole + magnitude
                 cell_sums[cell] = total(whole)
-        channel_sums[p] = sums
+        copy(channel_sums, p * channels, sums, 0, channels)
 
 
 @kernel(inline=True)

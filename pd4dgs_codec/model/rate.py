@@ -41,7 +41,7 @@ _INVERSE_SQRT_PI = 1.0 / math.sqrt(math.pi)
 _FAR = 20.0
 
 
-@kernel()
+@kernel(inline=True)
 def _erfcx(x: float) -> float:
     """exp(x^2) erfc(x) for x >= 0."""
     if x < _FAR:

@@ -206,8 +206,10 @@ def nearest_distances(points: Tensor) -> Tensor:
 def _nearest_squares(tasks: Tasks, out: np.ndarray, points: np.ndarray, k: int) -> None:
     """out [n] = mean squared distance of points [n, 3], sorted along the first axis, to their k < n nearest neighbours.
     The search stops where the distance along that axis alone is too large."""
+    nearest = np.empty(k)
     for i in range(tasks[0], tasks[1]):
-        nearest = np.full(k, np.inf)
+        for n in range(k):  # numba's own full and mean take longer to compile than all the rest
+            nearest[n] = np.inf
         for way in (-1, 1):
             j = i + way
             while 0 <= j < len(points) and (points[j, 0] - points[i, 0]) ** 2 < nearest[k - 1]:
@@ -220,7 +222,10 @@ def _nearest_squares(tasks: Tasks, out: np.ndarray, points: np.ndarray, k: int) 
                         at -= 1
                     nearest[at] = square
                 j += way
-        out[i] = nearest.mean()
+        total = 0.0
+        for n in range(k):
+            total += nearest[n]
+        out[i] = total / k
 
 
 def _binary32(value: float) -> float:
