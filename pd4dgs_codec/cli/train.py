@@ -104,6 +104,7 @@ def _train(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.interchange.teacher import load_source
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.train import workers
+    from pd4dgs_codec.train.kernels import compiling
     from pd4dgs_codec.train.loop import Trainer
 
     checkpoint.target(args.output)  # refuses a device now, not after the first minute
@@ -112,7 +113,8 @@ def _train(args: argparse.Namespace, console: Console) -> int:
     workers.start(device, config.views_per_step)
     first = workers.rank() == 0
     reading = {name: getattr(config, name) for name in ("downscale", "holdout", "background", "fps")}
-    dataset = load_source(args.source, **reading)
+    with compiling(config, device):
+        dataset = load_source(args.source, **reading)
     trainer = Trainer(config, dataset, device)
     if args.resume:
         trainer.resume(Path(args.resume))

@@ -1,0 +1,62 @@
+"""Compilation of a run's kernels while its data are read.
+
+numba compiles a kernel at its first call, which takes a fresh environment longer than many runs take to read their
+data. A second thread therefore trains a model of a few anchors first: compilers wait for machine code half of the time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from threading import Event, Thread
+
+import numpy as np
+import torch
+
+from pd4dgs_codec.data.view import Dataset, View
+from pd4dgs_codec.model.config import PRESETS
+from pd4dgs_codec.train.config import TrainConfig
+from pd4dgs_codec.train.learner import Learner
+from pd4dgs_codec.train.schedule import Schedule
+
+
+@contextmanager
+def compiling(config: TrainConfig, device: str) -> Iterator[None]:
+    """Compiles, or loads from numba's cache, the kernels of a run on the CPU beside the `with` block, which may not
+    draw from torch's global generator. Those of level 0 are ready after it; those of higher levels may follow beside
+    the first steps."""
+    ready = Event()
+    if device == "cpu":
+        Thread(target=_compile, args=(config, ready), name="compiling").start()
+    else:
+        ready.set()
+    yield
+    ready.wait()
+
+
+def _compile(config: TrainConfig, ready: Event) -> None:
+    """Finds the gradients of one picture at level 0, then at the highest level, as at the end of a run."""
+    try:
+        size = replace(PRESETS["tiny"], initial_anchors=8)
+        learner = Learner(replace(config, iterations=1), _ball(), Schedule(1), torch.device("cpu"), size)
+        learner.iteration = 1
+        for level in sorted({0, learner.model.level}):
+            finish = learner.model_loss.begin(learner.model, level, learner.schedule, learner.position)
+            _, _, loss = learner.picture_loss(0, level)
+            loss.backward()  # type: ignore[no-untyped-call]
+            finish()
+            ready.set()
+    finally:
+        ready.set()  # after an error the run compiles for itself
+
+
+def _ball() -> Dataset:
+    """Eight points around 0 and a picture of them."""
+    viewmat, K = np.eye(4, dtype=np.float32), np.array([[16, 0, 8], [0, 16, 8], [0, 0, 1]], np.float32)
+    viewmat[2, 3] = 4
+    corners = np.stack(np.meshgrid(*[(-1.0, 1.0)] * 3), -1).reshape(-1, 3).astype(np.float32)
+    view = View(viewmat, K, 16, 16, 0.5, np.zeros((16, 16, 3), np.uint8), None, "ball", 0)
+    box = np.array([[-1, -1, -1], [1, 1, 1]], np.float32)
+    black, up = (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)
+    return Dataset("ball", (view,), (), corners, box, 1.0, 8.0, black, (0.0, 1.0), up, masked=False)
