@@ -58,7 +58,8 @@ def bundle(root: Path, *entries: str, start: str = "") -> str:
 
     first = [add((root / entry).resolve()) for entry in entries][0]
     bodies = "".join(f'"{name}"(){{\n{body}}},\n' for name, body in modules.items())
-    head = f'"use strict";\nconst $modules={{\n{bodies}}};\nconst $made={{}},$take=(name)=>$made[name]??=$modules[name]();\n'
+    head = f'"use strict";\nconst $modules={{\n{bodies}}};\n'
+    head += "const $made={},$take=(name)=>$made[name]??=$modules[name]();\n"
     return f"{head}{f'$take({start})' if start else first};\n"
 
 
