@@ -32,7 +32,7 @@ class Timeline(Drawer):
         self.level = max(layers, default=0)
         first = self._part(0)
         self.info = replace(first.info, time_range=self.index.time_range)
-        self.active, self.background = first.active, first.background
+        self.active, self.background, self.still = first.active, first.background, False
         self._own = self.background
 
     def at(self, t: float) -> tuple[Drawer, float]:

@@ -46,6 +46,7 @@ def test_commands_take_a_folder_or_its_index(cli, tmp_path, place):
     text = cli("info", scene).out.decode()
     assert "4 segments, 0 to 4 s" in text and "00003.pd4" in text
     assert cli("render", scene, "-o", tmp_path / "a.png", "--time", 0.6, "--json").json["width"] == 64
+    assert cli("render", scene, "-o", tmp_path / "%d.png", "--frames", 2, "--json").json["frames"] == 2
     info = load_levels(scene)[-1].model.info
     assert mpsnr(np.asarray(Image.open(tmp_path / "a.png")) / 255, to_uint8(truth(2.4, info)) / 255) > 35
     out = cli("export", scene, "-o", tmp_path / "ply", "--to", "ply-seq", "--fps", 2, "--json").json
