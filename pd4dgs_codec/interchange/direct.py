@@ -30,7 +30,7 @@ from pd4dgs_codec.interchange.pack import (
 )
 from pd4dgs_codec.interchange.sampled import Sampled
 from pd4dgs_codec.interchange.splats import evenly, picture
-from pd4dgs_codec.interchange.teacher import GOLDEN, Teacher
+from pd4dgs_codec.interchange.teacher import Teacher, spread
 from pd4dgs_codec.interchange.tracks import STRAIGHT, Change, Grouping, Motion, layer
 from pd4dgs_codec.kinds import splats
 from pd4dgs_codec.kinds.splats import YCOCG, Splats, product
@@ -64,15 +64,15 @@ class Packer:
         self, model: Teacher, source: Sampled, cameras: Sequence[Camera], info: SceneInfo, step: Callable[[], None]
     ):
         self.info, self.key = info, len(source.times) // 2
-        self.source = source = _canonical(source, self.key)
+        self.source = source = canonical(source, self.key)
         deciding, others = held_out(cameras, HOLDOUT if len(cameras) >= FEW else 0)
         last = len(source.times) - 1
-        instants = [round(i * GOLDEN % 1.0 * last) for i in range(len(deciding))]
+        instants = [round(t * last) for t in spread(len(deciding))]
         views = Views(lambda i: source.frame(i, bare=False), deciding, instants)
         weights = sensitivity(Pictures(views, info.background, info.near))
         step()
         self.cameras = others or evenly(deciding, CHECKED)
-        self.times = [model.nearest(i * GOLDEN % 1.0) for i in range(len(self.cameras))]  # also between samples
+        self.times = [model.nearest(t) for t in spread(len(self.cameras))]  # also between samples
         checked = Views(model.splats, self.cameras, self.times)
         self.images = Pictures(checked, info.background, info.near).images
         self.ordered = Ordered.of(source.frame(self.key), weights)
@@ -205,7 +205,7 @@ def _turns(quats: np.ndarray, key: np.ndarray) -> np.ndarray:
     return turns
 
 
-def _canonical(source: Sampled, key: int) -> Sampled:
+def canonical(source: Sampled, key: int) -> Sampled:
     """Describes each ellipsoid so that its rotation is smallest at the key instant, and continuous over time."""
     quats, scales = source.quats.astype(np.float64), source.scales.copy()
     instants = len(quats)

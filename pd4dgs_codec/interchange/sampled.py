@@ -95,13 +95,13 @@ def sampled(model: Teacher, where: str, fps: float = 30.0, step: Step = lambda: 
             _check_size(where, len(times), len(frame.means))
             frames.append(frame)
             step()
-        same = len({len(frame.means) for frame in frames}) == 1 and _in_order(frames)
+        same = len({len(frame.means) for frame in frames}) == 1 and in_order(frames)
     degree = min(frame.degree for frame in frames)
     frames = [replace(frame, sh=frame.sh[:, : (degree + 1) ** 2]) for frame in frames]
     if same:
         order = "one instant" if len(frames) == 1 else "rows in a stable order"
-        return _stacked(exact, frames, model.windows, order)
-    return _matched(where, exact, frames)
+        return stacked(exact, frames, model.windows, order)
+    return matched_frames(where, exact, frames)
 
 
 def _check_size(where: str, frames: int, count: int) -> None:
@@ -110,7 +110,7 @@ def _check_size(where: str, frames: int, count: int) -> None:
         raise DataError(f"{where}: {found}, expected at most {MOST_NUMBERS // NUMBERS:,} in all")
 
 
-def _stacked(times: np.ndarray, frames: Sequence[Splats], windows: np.ndarray | None, order: str) -> Sampled:
+def stacked(times: np.ndarray, frames: Sequence[Splats], windows: np.ndarray | None, order: str) -> Sampled:
     """Stacks frames with the same rows. Harmonics but the constants are means over the frames."""
     names = ("means", "quats", "scales", "opacities")
     means, quats, scales, opacities = (np.stack([getattr(frame, name) for frame in frames]) for name in names)
@@ -175,7 +175,7 @@ def _halfway(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 # -- frames ------------------------------------------------------------------------------------------------------------
 
 
-def _features(splats: Splats, means: np.ndarray, reach: float) -> np.ndarray:
+def features(splats: Splats, means: np.ndarray, reach: float) -> np.ndarray:
     """Returns float32 [n, 7] whose distances say how little Gaussians, moved to `means`, resemble each other."""
     size = np.log(np.maximum(splats.scales, 1e-12)).mean(axis=1, keepdims=True)
     return np.concatenate(
@@ -183,7 +183,7 @@ def _features(splats: Splats, means: np.ndarray, reach: float) -> np.ndarray:
     )
 
 
-def _reach(splats: Splats) -> float:
+def reach_of(splats: Splats) -> float:
     """Returns the distance of matches: REACH median distances between neighbours."""
     some = np.random.default_rng(0).permutation(len(splats.means))[:ROWS]
     if len(some) < 2:
@@ -192,17 +192,17 @@ def _reach(splats: Splats) -> float:
     return max(REACH * float(np.sqrt(np.median(nearest))), 1e-9)
 
 
-def _in_order(frames: Sequence[Splats]) -> bool:
+def in_order(frames: Sequence[Splats]) -> bool:
     """Whether frames of as many rows keep their rows: of most Gaussians, the one in the same row of the next frame is
     among the RANK that most resemble it where its last movement takes it."""
     n, rng = len(frames[0].means), np.random.default_rng(0)
     for i in evenly(range(min(1, len(frames) - 2), len(frames) - 1), TRIPLES):  # before the first there is no movement
         before, now, later = frames[max(i - 1, 0)], frames[i], frames[i + 1]
-        rows, reach = rng.permutation(n)[:ROWS], _reach(now)
+        rows, reach = rng.permutation(n)[:ROWS], reach_of(now)
         guesses = (now.means, 2 * now.means - before.means)
         ranks = []
         for guess in guesses:
-            here, there = _features(now, guess, reach)[rows], _features(later, later.means, reach)
+            here, there = features(now, guess, reach)[rows], features(later, later.means, reach)
             ranks.append(_others(here, there, rows)[0])
         if np.median(np.minimum(*ranks)) > RANK:
             return False
@@ -248,7 +248,7 @@ def _nearest(here: np.ndarray, there: np.ndarray) -> np.ndarray:
     return found
 
 
-def _pairs(here: np.ndarray, there: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def mutual(here: np.ndarray, there: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns the rows of features `here` and `there`, [n, d] and [m, d], that are each other's nearest."""
     order, back = (np.argsort(x[:, 0], kind="stable") for x in (there, here))
     to, fro = _nearest(here, there[order]), _nearest(there, here[back])
@@ -258,13 +258,13 @@ def _pairs(here: np.ndarray, there: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return rows, to[rows]
 
 
-def _matched(where: str, times: np.ndarray, frames: Sequence[Splats], reach: float | None = None) -> Sampled:
+def matched_frames(where: str, times: np.ndarray, frames: Sequence[Splats], reach: float | None = None) -> Sampled:
     """Chains the Gaussians of neighbouring frames that match. A chain stays as it is before and after its frames."""
-    reach = reach or float(np.median([_reach(frame) for frame in evenly(frames, TRIPLES)]))
+    reach = reach or float(np.median([reach_of(frame) for frame in evenly(frames, TRIPLES)]))
     chain, links = np.arange(len(frames[0].means)), [np.arange(len(frames[0].means))]
     count, kept, speed = len(chain), 0, np.zeros_like(frames[0].means)
     for now, later in zip(frames[:-1], frames[1:], strict=True):
-        rows, others = _pairs(_features(now, now.means + speed, reach), _features(later, later.means, reach))
+        rows, others = mutual(features(now, now.means + speed, reach), features(later, later.means, reach))
         chain, speed = np.full(len(later.means), -1), np.zeros_like(later.means)
         chain[others], speed[others] = links[-1][rows], later.means[others] - now.means[rows]
         new = np.flatnonzero(chain < 0)
@@ -290,5 +290,5 @@ def _matched(where: str, times: np.ndarray, frames: Sequence[Splats], reach: flo
     windows = np.stack([(low + high) / 2, (high - low) / 2, np.full(count, half * SHARP)], axis=1).astype(np.float32)
     share = kept / max(len(owner) - len(frames[0].means), 1)
     words = f"no stable order: {share:.0%} of the Gaussians match one of the frame before, the others have windows"
-    found = _stacked(times, [at(i) for i in range(len(frames))], windows, words)
+    found = stacked(times, [at(i) for i in range(len(frames))], windows, words)
     return replace(found, matched=share)

@@ -27,25 +27,25 @@ from pd4dgs_codec.format.info import info as about
 from pd4dgs_codec.format.metadata import Metadata
 from pd4dgs_codec.format.reader import Base, read_base
 from pd4dgs_codec.format.registry import MAX_SIDE
-from pd4dgs_codec.interchange.direct import CHECKED, Packer, Views, _canonical
+from pd4dgs_codec.interchange.direct import CHECKED, Packer, Views, canonical
 from pd4dgs_codec.interchange.imported import BEST, BOX_INSTANTS, Progress, scene_info
 from pd4dgs_codec.interchange.pack import Grid, Ordered, Packed, Pictures, Tensors, cells_of, matched, sensitivity
 from pd4dgs_codec.interchange.sampled import (
     MOVES,
     Sampled,
-    _features,
-    _in_order,
-    _matched,
-    _pairs,
-    _reach,
-    _stacked,
+    features,
+    in_order,
+    matched_frames,
+    mutual,
+    reach_of,
+    stacked,
 )
 from pd4dgs_codec.interchange.splats import evenly, picture
-from pd4dgs_codec.interchange.teacher import GOLDEN, Teacher, read_model
+from pd4dgs_codec.interchange.teacher import Teacher, read_model, spread
 from pd4dgs_codec.interchange.tracks import Grouping
 from pd4dgs_codec.io import check_path, write_bytes
 from pd4dgs_codec.kinds.splats import Splats, SplatScene
-from pd4dgs_codec.kinds.tracks import NONE, Tracks, place
+from pd4dgs_codec.kinds.tracks import Tracks, place
 from pd4dgs_codec.quality.image import mpsnr
 from pd4dgs_codec.scene import Camera, Grading, SceneInfo
 from pd4dgs_codec.segments import INDEX, File, Index, Segment, check, file_of, parse
@@ -71,6 +71,7 @@ class Frames(Sequence[Any]):
     def __init__(self, model: Teacher, times: Sequence[float]):
         self.model, self.times = model, times
         self.rows: int | None = None
+        self.harmonics: int | None = None
         self.harmonics = min(self[i].sh.shape[1] for i in {0, len(times) - 1})
         self.rows = len(self[0].means)
 
@@ -81,7 +82,7 @@ class Frames(Sequence[Any]):
         frame = self.model.splats(float(self.times[i]))
         if self.rows not in (None, len(frame.means)):
             raise Unordered
-        most = getattr(self, "harmonics", frame.sh.shape[1])
+        most = self.harmonics or frame.sh.shape[1]
         if frame.sh.shape[1] < most:
             raise DataError(f"frame {i}: has {frame.sh.shape[1]} harmonics, expected {most} as the first and last have")
         return replace(frame, sh=frame.sh[:, :most])
@@ -116,8 +117,8 @@ class Still:
         if self.reach is None:
             return self.rows
         found = np.full(len(self.rows), -1)
-        here, there = _features(self.first, self.first.means, self.reach), _features(frame, frame.means, self.reach)
-        rows, others = _pairs(here, there)
+        here, there = features(self.first, self.first.means, self.reach), features(frame, frame.means, self.reach)
+        rows, others = mutual(here, there)
         found[rows] = others
         return found
 
@@ -176,7 +177,7 @@ def groups(
     would have to be repeated in the segments before. reach: of matches; None if frames keep their rows, else Unordered
     is raised.
     """
-    if reach is None and not _in_order(frames):
+    if reach is None and not in_order(frames):
         raise Unordered
     found = list[tuple[int, Still]]()
     for k, (a, b) in enumerate(zip(cuts[:-1], cuts[1:], strict=True)):
@@ -215,7 +216,7 @@ class BasePacker(Packer):
             shown = together(own, still.others(frame))
             for name, h in sensitivity(Pictures([(camera, shown)], info.background, info.near)).items():
                 weights[name] = weights.get(name, 0) + h[: len(own.means)] / count
-        self.source = _stacked(np.zeros(1), [own], None, "")
+        self.source = stacked(np.zeros(1), [own], None, "")
         if window_step is not None:
             self.source = replace(self.source, windows=np.tile(np.array(ALWAYS, np.float32), (len(own.means), 1)))
         self.ordered = Ordered.of(own, weights)
@@ -233,7 +234,7 @@ class Backed(Views):
             return together(behind, own) if behind else own
 
         last = len(source.times) - 1
-        super().__init__(at, cameras, [round(i * GOLDEN % 1.0 * last) for i in range(len(cameras))])
+        super().__init__(at, cameras, [round(t * last) for t in spread(len(cameras))])
 
 
 def _known(source: Sampled) -> Teacher:
@@ -276,7 +277,7 @@ class SegmentPacker(Packer):
         theta: float,
     ):
         self.info, self.key, self.base = info, len(source.times) // 2, base
-        self.source = source = _canonical(source, self.key)
+        self.source = source = canonical(source, self.key)
         weights = sensitivity(Pictures(Backed(source, cameras, behind), info.background, info.near))
         some = Backed(source, evenly(cameras, CHECKED), behind)
         self.cameras, self.times = list(some.cameras), [float(source.times[i]) for i in some.times]
@@ -321,18 +322,8 @@ def joined(base: SplatScene, added: SplatScene) -> SplatScene:
     """Returns the scene of a segment: the rows of its base, which stand still, and those that it adds."""
     n, classes = len(base.anchor_q), np.concatenate([classes_of(base), classes_of(added)])
     assert base.grading is not None
-
-    def behind(tracks: Tracks) -> Tracks:
-        still = {name: np.zeros((n, head.coefficients.shape[1]), np.float32) for name, head in tracks.heads.items()}
-        heads = {
-            name: replace(head, coefficients=np.concatenate([still[name], head.coefficients]))
-            for name, head in tracks.heads.items()
-        }
-        groups = tracks.groups
-        if groups:
-            groups = replace(groups, rows=np.concatenate([np.full((n, 1), NONE, np.float32), groups.rows]))
-        return replace(tracks, heads=heads, groups=groups)
-
+    m = len(added.anchor_q)
+    rows = np.concatenate([np.full(n, m), np.arange(m)])  # tracks have no row m, which therefore stands still
     return replace(
         added,
         rows=tuple(n + rows for rows in added.rows),
@@ -341,7 +332,7 @@ def joined(base: SplatScene, added: SplatScene) -> SplatScene:
         grading=Grading(classes, base.grading.centre),
         steps=base.steps,
         tensors={name: np.concatenate([x, added.tensors[name]]) for name, x in base.tensors.items()},
-        tracks={layer: behind(tracks) for layer, tracks in added.tracks.items()},
+        tracks={layer: tracks.of_rows(rows) for layer, tracks in added.tracks.items()},
     )
 
 
@@ -406,7 +397,7 @@ def import_segments(
         try:
             found, reach = groups(frames, cuts, None, step), None
         except Unordered:
-            frames.rows, reach = None, _reach(first)
+            frames.rows, reach = None, reach_of(first)
             found = groups(frames, cuts, reach, step)
     some = [frames[i] for i in evenly(range(len(times)), BOX_INSTANTS)]
     info, cameras, judges = scene_info(place, model, some, total, background, up)
@@ -479,8 +470,8 @@ class _Writer:
         frames = (self.frames[i] for i in range(a, b + 1))
         rest = [still.others(frame) if still else frame for frame in frames]
         if self.reach is None or not any(len(frame.means) for frame in rest):
-            return _stacked(times, rest, None, "")
-        return _matched(f"segment {k}", times, rest, self.reach)
+            return stacked(times, rest, None, "")
+        return matched_frames(f"segment {k}", times, rest, self.reach)
 
     def group(self, still: Still, own: range) -> Group | None:
         """Makes the base of a group of segments; None if it would save nothing."""
@@ -500,7 +491,7 @@ class _Writer:
     def _base(self, still: Still, own: range) -> tuple[bytes, float]:
         """Returns a base and its theta, at which the first segment has the dB that are asked for."""
         a, b = self.cuts[own[0]], self.cuts[own[-1] + 1]
-        chosen = sorted(a + round(i * GOLDEN % 1.0 * (b - a)) for i in range(len(self.cameras)))
+        chosen = sorted(a + round(t * (b - a)) for t in spread(len(self.cameras)))
         views = ((camera, self.frames[i]) for camera, i in zip(self.cameras, chosen, strict=True))
         precise = None if self.reach is None else PRECISE / int(np.diff(self.cuts).max())
         packer = BasePacker(still, views, len(self.cameras), self._info(a, b), precise)
@@ -524,12 +515,7 @@ class _Writer:
         number, base, still = (group.number, group.base, group.still) if group else (None, None, None)
         old = self.before.segments[k] if k < len(self.before.segments) else None
         data = self._kept(old) if old and (old.base, old.time_range) == (number, info.time_range) else None
-        if (
-            data is not None
-            and group
-            and (of := about(data)["base"])
-            and of["digest"] != group.base.reference.digest.hex()
-        ):
+        if data and group and (about(data)["base"] or {}).get("digest") != group.base.reference.digest.hex():
             data = None
         quality = list[float]()
         if data is None:

@@ -122,7 +122,7 @@ def _around(source: str, place: Path, teacher: Teacher, options: Options, downsc
     solid = _solid(source, teacher, MIDDLE)
     cameras, up = cameras_of(place, teacher.splats(teacher.nearest(MIDDLE)).means[solid], options, downscale)
     still = teacher.times is not None and len(teacher.times) == 1
-    poses = [(camera, 0.0 if still else i * GOLDEN % 1.0) for i, camera in enumerate(cameras)]
+    poses = [(camera, 0.0 if still else t) for camera, t in zip(cameras, spread(len(cameras)), strict=True)]
     times = teacher.times or tuple(np.linspace(0, 1, BOX_TIMES))
     some = evenly(times, BOX_TIMES)
     everywhere = np.concatenate([teacher.splats(t).means[_solid(source, teacher, t)] for t in some])
@@ -224,6 +224,11 @@ class Teacher:
     def nearest(self, t: float) -> float:
         """Returns the known time nearest to t."""
         return t if self.times is None else min(self.times, key=lambda known: abs(known - t))
+
+
+def spread(count: int) -> list[float]:
+    """Returns normalised times of `count` consecutive cameras."""
+    return [i * GOLDEN % 1.0 for i in range(count)]
 
 
 def read_model(place: str, fps: float, seconds: float | None = None) -> Teacher:
