@@ -94,10 +94,7 @@ def whole_files(names: Sequence[str], overwrite: bool, told: str | None = None) 
     if missing. Raises DataError as check_new does; an OSError names `told` or the first."""
     check_new(names, overwrite)
     parent = Path(names[0]).parent
-    existing = next(p for p in (parent, *parent.parents) if p.exists())
-    if not existing.is_dir():
-        raise DataError(f"{existing}: is a file, expected a folder to write into")
-    with _naming(told or names[0]), temporary_folder(existing) as folder:
+    with _naming(told or names[0]), temporary_folder(_existing(parent)) as folder:
         temporaries = [folder / Path(name).name for name in names]
         yield temporaries
         for temporary in temporaries:
@@ -107,6 +104,27 @@ def whole_files(names: Sequence[str], overwrite: bool, told: str | None = None) 
             parent.mkdir(parents=True, exist_ok=True)
             for temporary, name in zip(temporaries, names, strict=True):
                 _move(temporary, Path(name))
+
+
+def write_files(folder: str | Path, files: Iterable[tuple[str, bytes]], overwrite: bool) -> dict[str, int]:
+    """Writes files (name, content) into one folder, all or none, and holds one at a time. Returns their sizes by name.
+    Raises as whole_files does."""
+    place, sizes = Path(folder), dict[str, int]()
+    with _naming(str(place)), temporary_folder(_existing(place)) as made:
+        for name, content in files:
+            sizes[name] = (made / name).write_bytes(content)
+        with whole_files([str(place / name) for name in sizes], overwrite) as temporaries:
+            for temporary in temporaries:
+                (made / temporary.name).rename(temporary)
+    return sizes
+
+
+def _existing(folder: Path) -> Path:
+    """The folder itself, or the nearest around it that exists. Raises DataError for a file."""
+    existing = next(p for p in (folder, *folder.parents) if p.exists())
+    if not existing.is_dir():
+        raise DataError(f"{existing}: is a file, expected a folder to write into")
+    return existing
 
 
 def check_source(path: str | Path) -> None:

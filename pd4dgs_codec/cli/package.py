@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from pd4dgs_codec.cli import options
 from pd4dgs_codec.cli.common import OK, STDIO, Console, command, number, progress_bar, read_bytes, same_file, say, table
 from pd4dgs_codec.errors import DeliveryError, RenderError
-from pd4dgs_codec.io import check_new, temporary_folder, whole_files, write_bytes
+from pd4dgs_codec.io import check_new, temporary_folder, write_files
 from pd4dgs_codec.segments import is_folder
 
 if TYPE_CHECKING:
@@ -104,9 +104,14 @@ def _package(args: argparse.Namespace, console: Console) -> int:
         return made("picture in the page", lambda: _still(scene))
 
     if whole:
-        files = _write(args, package(read_bytes(args.input), render, draw, immutable=args.immutable))
+        contents: Iterable[tuple[str, bytes]] = package(
+            read_bytes(args.input), render, draw, immutable=args.immutable
+        ).items()
+    elif same_file(args.input, args.output):
+        raise DeliveryError(f"found -o {args.output}, the folder of the segments, expected another one")
     else:
-        files = _write_each(args, package_segments(Path(args.input), render, draw, immutable=args.immutable))
+        contents = package_segments(Path(args.input), render, draw, immutable=args.immutable)
+    files = _write(args, contents)
     why = missing.get("2D video")
     result = {"input": args.input, "output": args.output, "files": files, "video": why is None}
     console.result(result | {"why_no_video": why}, _text(result))
@@ -122,30 +127,15 @@ def _library(args: argparse.Namespace, console: Console) -> int:
     options.conditional(args, False, "needs a .pd4 file, not a folder", immutable=False, no_video=False, fps=None)
     if not same_file(args.input, args.output):
         raise DeliveryError(f"found -o {args.output}, expected {args.input}, the folder of the packages")
-    result = {"input": args.input, "output": args.output, "files": _write(args, library(Path(args.input)))}
+    result = {"input": args.input, "output": args.output, "files": _write(args, library(Path(args.input)).items())}
     console.result(result, _text(result))
     return OK
 
 
-def _write(args: argparse.Namespace, files: dict[str, bytes]) -> list[dict[str, Any]]:
+def _write(args: argparse.Namespace, files: Iterable[tuple[str, bytes]]) -> list[dict[str, Any]]:
     """Writes all files or none; returns their names and sizes."""
-    names = [str(Path(args.output) / name) for name in files]
-    with whole_files(names, args.overwrite) as temporaries:
-        for temporary, content in zip(temporaries, files.values(), strict=True):
-            temporary.write_bytes(content)
-    return [{"name": name, "bytes": len(content)} for name, content in files.items()]
-
-
-def _write_each(args: argparse.Namespace, files: Iterable[tuple[str, bytes]]) -> list[dict[str, Any]]:
-    """Writes files one by one, so that memory does not grow with their number; returns their names and sizes."""
-    folder, found = Path(args.output), list[dict[str, Any]]()
-    if args.input != STDIO and same_file(args.input, args.output):
-        raise DeliveryError(f"found -o {args.output}, the folder of the segments, expected another one")
-    for name, content in files:
-        folder.mkdir(parents=True, exist_ok=True)
-        write_bytes(folder / name, content, args.overwrite)
-        found.append({"name": name, "bytes": len(content)})
-    return found
+    sizes = write_files(args.output, files, args.overwrite)
+    return [{"name": name, "bytes": size} for name, size in sizes.items()]
 
 
 def _render(scene: AnyScene, fps: float) -> Video:

@@ -109,6 +109,15 @@ def test_the_command_makes_a_page_that_shows_the_index(cli, tmp_path):
     assert not (segmented.folder() / "index.html").exists()
 
 
+def test_a_segment_that_is_damaged_leaves_no_package(cli, tmp_path):
+    shutil.copytree(segmented.folder(), tmp_path / "in")
+    last = tmp_path / "in" / "00003.pd4"
+    last.write_bytes(last.read_bytes()[:-9])
+    found = cli("package", tmp_path / "in", "-o", tmp_path / "out", "--no-video")
+    assert found.code == 1 and "00003.pd4: has" in found.err
+    assert [path.name for path in tmp_path.iterdir()] == ["in"]
+
+
 # -- the client --------------------------------------------------------------------------------------------------------
 
 
