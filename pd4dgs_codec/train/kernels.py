@@ -7,7 +7,7 @@ data. A second thread therefore trains a model of a few anchors first: compilers
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from threading import Event, Thread
 
@@ -37,7 +37,7 @@ def compiling(config: TrainConfig, device: str) -> Iterator[None]:
 
 def _compile(config: TrainConfig, ready: Event) -> None:
     """Finds the gradients of one picture at level 0, then at the highest level, as at the end of a run."""
-    try:
+    with suppress(Exception):  # the run compiles for itself, or has ended: it failed to read its data
         size = replace(PRESETS["tiny"], initial_anchors=8)
         learner = Learner(replace(config, iterations=1), _ball(), Schedule(1), torch.device("cpu"), size)
         learner.iteration = 1
@@ -47,8 +47,7 @@ def _compile(config: TrainConfig, ready: Event) -> None:
             loss.backward()  # type: ignore[no-untyped-call]
             finish()
             ready.set()
-    finally:
-        ready.set()  # after an error the run compiles for itself
+    ready.set()
 
 
 def _ball() -> Dataset:
