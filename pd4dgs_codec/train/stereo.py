@@ -30,7 +30,8 @@ DEPTHS, NEAREST = 100, 0.2
 NEIGHBOURS, AGREE, LEAST_BASE = 4, 2, 0.05
 #: A depth is taken if its correlation is ALIKE, and CLEAR above that of depths a patch or more away.
 ALIKE, CLEAR = 0.8, 0.05
-#: Points are used if at least so many of the searched pixels have one, here and in `phases.matching`.
+#: Points are used if at least so many of the searched pixels have one, here and in `phases.matching`: otherwise the
+#: cameras are too near to each other, or move too little between views, for depths to be trusted.
 LEAST_FOUND = 1 / 6
 
 
