@@ -41,9 +41,9 @@ terms; tmc, both mask terms; noise, the simulated quantisation; whitening, the t
 
 --segments 10s writes a folder, -o DIR, for a long SOURCE: a base, of what stands still all the time, and a file for
 each ten seconds that continues it. pd4dgs-info, -render, -eval, -export, -package and -view take the folder as one
-scene. --iterations and --max-seconds are those of the base and of each segment; as many segments train at a time as -j has
-threads. The same command goes on where it was interrupted. --manifest writes the lines by which pd4dgs-batch trains
-base and segments, each by --part; the same command without --manifest then adds the index.
+scene. --iterations and --max-seconds are those of the base and of each segment; as many segments train at a time as
+-j has threads. The same command goes on where it was interrupted. --manifest writes the lines by which pd4dgs-batch
+trains base and segments, each by --part; the same command without --manifest then adds the index.
 
 torchrun starts several workers for one scene: they share the V views of a step and average their gradients, and the
 first worker writes the files. Their number must divide V and may change when a run is resumed.

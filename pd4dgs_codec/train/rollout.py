@@ -15,10 +15,11 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d
+from torch.nn.functional import max_pool2d
 
 from pd4dgs_codec.train.phases.levels import other_views
 from pd4dgs_codec.train.phases.opening import window, within
+from pd4dgs_codec.train.phases.still import STILL_FROM, at_rest
 from pd4dgs_codec.train.ssim import REACH
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
@@ -38,9 +39,6 @@ STILL_ODDS, NEAR_ODDS = 0.15, 1 / 3
 NEAR_SHARE, NEAR_VIEWS, MOST_NEAR = 1 / 12, 4, 60
 #: Motion has changed a pixel if a colour differs by at least this between level 0 and the training image.
 STILL_CONTRAST = 0.15
-#: A base lacks what moves: a pixel has weight 0 if the mean difference of a square of so many pixels a side, whose
-#: texture cancels, is MOVED, and so many times the median over the picture, or if its SSIM depends on such a pixel.
-PATCH, MOVED, MANY = 5, 0.08, 4.0
 #: Share of the steps that train level 1 where there is a level 2.
 GLOBAL_ODDS = 0.1
 
@@ -123,13 +121,9 @@ def without_motion(state: TrainState, shown: TrainingView, image: Tensor) -> Tra
     key instant, pixels that motion has changed have weight 0. In scenes of little else (`TrainState.guided`) those
     around them have, too, whose SSIM depends on them: otherwise the faint edge of a body that has moved away would be
     erased, then the next edge, until the body is gone."""
-    early = state.practising or state.position < state.schedule.coarse_end
-    if state.config.still and not early:
-        apart = avg_pool2d((image.detach() - shown.image).permute(2, 0, 1), PATCH, 1, PATCH // 2).abs().amax(0)
-        limit = apart.median().clamp(min=MOVED / MANY) * MANY
-        apart = max_pool2d(apart[None], 2 * REACH + 1, 1, REACH)[0]
-        return replace(shown, weights=shown.weights * (apart < limit))
-    if state.key is None or early:
+    if state.config.still:
+        return shown if state.schedule.progress(state.position) < STILL_FROM else at_rest(shown, image)
+    if state.key is None or state.practising or state.position < state.schedule.coarse_end:
         return shown
     change = (image.detach() - shown.image).abs().amax(-1)
     if state.guided:
