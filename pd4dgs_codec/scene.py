@@ -270,6 +270,13 @@ def _perceptron(network: Network, x: np.ndarray) -> np.ndarray:
     return x
 
 
+def relative_area(logs: np.ndarray) -> np.ndarray:
+    """Returns the largest area that each of n Gaussians may cover, float32 [n], relative to the largest of all. logs:
+    float32 [n, 3], natural logarithms of their standard deviations."""
+    area = np.sort(logs, axis=1)[:, 1:].sum(axis=1)
+    return np.asarray(np.exp(area - area.max(initial=0)))
+
+
 def _unit(vectors: np.ndarray) -> np.ndarray:
     """Returns vectors [n, any] divided by their lengths."""
     unit: np.ndarray = vectors / np.linalg.norm(vectors, axis=1, keepdims=True).clip(min=1e-12)
@@ -369,6 +376,11 @@ class LayeredScene:
         """Quantisation steps by attribute name."""
         raise NotImplementedError
 
+    @property
+    def all_steps(self) -> dict[str, float]:
+        """Quantisation steps of attributes and of what layers share, by name."""
+        return self.row_steps
+
     def scaled(self: S, factor: float) -> S:
         """Returns the scene with every step times `factor`, rounded to binary32."""
         raise NotImplementedError
@@ -395,6 +407,12 @@ class LayeredScene:
         fill = [fill for layer, fill in zip(self.layers, self.fills, strict=False) if layer <= level][-1:]
         red, green, blue = [code / 255 for code in fill[0]] if fill and fill[0] else self.info.background
         return red, green, blue
+
+    @property
+    def utility(self) -> np.ndarray:
+        """Estimates each anchor's utility without views, float32 [N]: its mask code in the highest layer, times what
+        its kind knows."""
+        return self.mask[-1].astype(np.float32)
 
     @property
     def level(self) -> int:
@@ -539,6 +557,10 @@ class Scene(LayeredScene):
             slots=rows[owner] * slots + slot,
         )
 
+    @property
+    def utility(self) -> np.ndarray:
+        return np.asarray(super().utility * relative_area(self.scaling_log[:, 3:]))
+
     def with_deformation(self, layer: int, deformation: Deformation | None) -> Scene:
         """Returns the scene with this deformation in layer 1 or 2."""
         if layer == 1:
@@ -552,6 +574,10 @@ class Scene(LayeredScene):
     @property
     def row_steps(self) -> dict[str, float]:
         return self.steps.attributes
+
+    @property
+    def all_steps(self) -> dict[str, float]:
+        return vars(self.steps)
 
     def scaled(self, factor: float) -> Scene:
         return replace(self, steps=self.steps.scaled(factor))

@@ -36,8 +36,8 @@ level. The other values are the paper's, with the mean over time as level 0: ada
 the more the layers differ; uniform samples all levels equally; fixed samples them with probabilities 0.15, 0.30 and
 0.55; top trains only the highest level; all trains every level in every step, at about three times the cost. The first
 tenth of every run trains level 0.
---without turns off: rate, the bitrate terms; planes, the bitrate term of the planes; binary and smooth, the two mask
-terms; tmc, both mask terms; noise, the simulated quantisation; whitening, the transform of the feature channels.
+--without turns off: rate, the bitrate terms; planes, the bitrate term of the planes; binary, the term of the
+masks; noise, the simulated quantisation; whitening, the transform of the feature channels.
 
 --segments 10s writes a folder, -o DIR, for a long SOURCE: a base, of what stands still all the time, and a file for
 each ten seconds that continues it. pd4dgs-info, -render, -eval, -export, -package and -view take the folder as one

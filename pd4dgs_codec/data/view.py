@@ -715,5 +715,10 @@ def depth_range(views: Sequence[np.ndarray], box: np.ndarray, points: np.ndarray
     if not len(ahead):
         side = float((box[1] - box[0]).max())
         return 0.01 * side, 100.0 * side
-    near, far = np.percentile(ahead, [0.5, 99.5])
+    return depth_bounds(ahead)
+
+
+def depth_bounds(depths: np.ndarray) -> tuple[float, float]:
+    """(near, far): half the nearest and 1.5 times the farthest of some depths, without strays as in `points_box`."""
+    near, far = np.percentile(depths, [0.5, 99.5])
     return float(0.5 * near), float(1.5 * far)

@@ -48,7 +48,7 @@ class Drawer:
     """Draws the highest level of a decoded scene of any kind. Not thread-safe."""
 
     def __init__(self, scene: AnyScene):
-        self.info, self.level, self.background = scene.info, scene.level, scene.background()
+        self.scene, self.info, self.level, self.background = scene, scene.info, scene.level, scene.background()
         self.active = scene.active  #: int64 [n]: the anchors active at this level, ascending
         self.still = scene.still  #: whether all times look alike
 
@@ -57,8 +57,8 @@ class Drawer:
         return self, t
 
     def gaussians(self, camera: Camera, t: float) -> Gaussians:
-        """Returns the Gaussians that the camera may see at normalised time t in 0..1."""
-        raise NotImplementedError
+        """Returns the Gaussians that the camera may see at normalised time t, clamped to 0..1."""
+        return self.scene.gaussians(min(max(t, 0.0), 1.0), eye=camera.eye)
 
     def picture(self, camera: Camera, t: float) -> np.ndarray:
         """Draws float32 [H, W, 3] in 0..1 at normalised time t in 0..1. Raises RenderError unless t is finite."""
@@ -76,8 +76,10 @@ class Drawer:
 
 
 def drawer(scene: AnyScene) -> Drawer:
-    """Returns what draws a scene of this kind."""
-    return SplatPlayer(scene) if isinstance(scene, SplatScene) else Player(scene)
+    """Returns what draws a scene fastest."""
+    if isinstance(scene, Scene):
+        return Player(scene)
+    return SplatPlayer(scene) if isinstance(scene, SplatScene) else Drawer(scene)
 
 
 class SplatPlayer(Drawer):
@@ -85,7 +87,6 @@ class SplatPlayer(Drawer):
 
     def __init__(self, scene: SplatScene):
         super().__init__(scene)
-        self.scene = scene
         self._moving = Moving(scene)
         self._time, self._latest = 0.0, self._moving.at(0.0)
 

@@ -20,6 +20,8 @@ from pd4dgs_codec.train.config import LearningRates
 PER_ANCHOR = ("feature", "scaling_log", "offset", "mask_logits")
 #: Names of a parameter's moments: its steps so far, and the running means of gradients and of their squares.
 STEP, MEAN, SQUARE = "step", "exp_avg", "exp_avg_sq"
+#: Decay of both running means, and the number added to the root of the second.
+BETA1, BETA2, EPS = 0.9, 0.99, 1e-15
 
 
 class Optimiser:
@@ -62,8 +64,8 @@ class Optimiser:
             if moved:
                 torch._foreach_add_(steps, 1)
                 torch._fused_adam_(
-                    moved, gradients, means, squares, [], steps, amsgrad=False, maximize=False, beta1=0.9, beta2=0.99,
-                    lr=rate, weight_decay=0.0, eps=1e-15,
+                    moved, gradients, means, squares, [], steps, amsgrad=False, maximize=False, beta1=BETA1,
+                    beta2=BETA2, lr=rate, weight_decay=0.0, eps=EPS,
                 )  # fmt: skip
 
     def clip_gradients(self, most: float) -> float:

@@ -21,7 +21,8 @@ class Schedule:
     phase begins at infinity, and nothing is grown or pruned.
     coarse_end: before it only level 0 is trained; from it on, quantisation noise is added.
     moving: transparent anchors are pruned from here on; earlier, moving objects may be missing still.
-    progressive: the rate term, TMC and the average rho start here (T_progressive; T_warm is within the coarse phase).
+    progressive: the terms of rate and masks and the average rho start here (T_progressive; T_warm is within the coarse
+    phase).
     rho_every: iterations between updates of rho (K).
     rounding: planes and weights are rounded straight-through from here on.
     exact_rounding: the anchors' attributes are rounded straight-through from here on, instead of noise.

@@ -418,5 +418,5 @@ def test_coefficients_of_later_layers_are_not_lost_silently():
     rows, maps = np.zeros((len(later), 1), np.float32), {"color": np.ones((1, 4, 2), np.float32)}
     grouped = replace(moved.tracks[1], groups=Groups(rows, np.zeros((1, 3), np.float32), maps))
     with pytest.raises(EncodeError, match=r"tracks of layer 1: \['groups'\] of anchors of a later layer"):
-        encode(moved.with_deformation(1, grouped))
+        encode(replace(moved, tracks={**moved.tracks, 1: grouped}))
     assert decode(encode(moved)).rows == (len(later) - 1, len(later) - 1, len(later))

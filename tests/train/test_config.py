@@ -37,7 +37,7 @@ def test_options_out_of_range_are_refused(bad, message):
 
 
 def test_a_stored_configuration_comes_back():
-    config = TrainConfig(iterations=7, background=(0.0, 0.5, 1.0), **ABLATIONS["tmc"])
+    config = TrainConfig(iterations=7, background=(0.0, 0.5, 1.0), **ABLATIONS["binary"])
     assert TrainConfig.from_json(config.to_json(), "m.pt") == config
     for broken in ("[", "[]", '{"colour": 1}', '{"iterations": [5]}', '{"background": [0, "a", 1]}'):
         with pytest.raises(TrainError, match="m.pt: its stored configuration"):

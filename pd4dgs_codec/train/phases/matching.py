@@ -28,7 +28,7 @@ from pd4dgs_codec.data.view import View
 from pd4dgs_codec.train import phases, workers
 from pd4dgs_codec.train.phases.levels import images, other_views
 from pd4dgs_codec.train.state import TrainState
-from pd4dgs_codec.train.stereo import pixel_rays
+from pd4dgs_codec.train.stereo import LEAST_FOUND, pixel_rays
 
 
 class Strength(NamedTuple):
@@ -55,8 +55,6 @@ MOVED, CONSISTENT, AMBIGUOUS = 0.12, 0.16, 0.3
 #: Most of what the views show is elsewhere in level 0 if such pixels are at least this share of those that differ from
 #: the background: a body that has moved away changes the pixels that it had and those that it has.
 ELSEWHERE = 1.0
-#: If fewer of the pixels have a point, the camera moves too little between views for their depths to be trusted.
-LEAST_FOUND = 1 / 6
 #: Points of the key instant are those of KEY_VIEWS views around it.
 KEY_VIEWS = 5
 #: A match has the least distance, to which a difference in colour adds COLOUR_WEIGHT times. It attracts if the colours

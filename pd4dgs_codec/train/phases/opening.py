@@ -21,8 +21,8 @@ from pd4dgs_codec.train.state import TrainState
 
 #: The window, as a share of the longest time from the key instant: at first, and in the trial.
 FIRST, TRIAL = 1 / 12, 1 / 6
-#: (share, instants): the planes have so many instants while the window is below the share.
-FEW_INSTANTS = ((0.3, 3), (0.5, 5), (0.7, 9), (1.0, 17))
+#: The planes' instants double from 3 to 17 while the window grows, at each of so many parts of it.
+DOUBLINGS = 5
 #: Steps of the trial: a share of the run, and the fewest.
 TRIAL_SHARE, MIN_TRIAL = 1 / 15, 75
 #: Motion predicts if it gains MIN_GAIN dB over the static level 0 in whole pictures, so that missed motion counts, and
@@ -67,7 +67,7 @@ def window(state: TrainState) -> float:
 def few_instants(state: TrainState) -> int | None:
     """How many instants the planes have at this step; None: all their cells along time."""
     share = window(state)
-    return next((instants for below, instants in FEW_INSTANTS if share < below), None)
+    return 2 ** min(max(int(share * DOUBLINGS + 0.5), 1), 4) + 1 if share < 1 else None
 
 
 def within(state: TrainState, among: Sequence[int]) -> list[int]:
