@@ -27,7 +27,6 @@ from pd4dgs_codec.train.phases.opening import OpenTime, few_instants
 from pd4dgs_codec.train.phases.prefixes import Prefixes
 from pd4dgs_codec.train.phases.prune import Prune
 from pd4dgs_codec.train.phases.quantisation import FitQuantisation
-from pd4dgs_codec.train.phases.still import LeaveMotion
 from pd4dgs_codec.train.rollout import draw_levels, next_view, updated_rho, without_motion
 from pd4dgs_codec.train.schedule import PRUNING_ROUNDS, Schedule
 from pd4dgs_codec.train.ssim import image_loss
@@ -66,7 +65,6 @@ class Learner(TrainState):
             OpenTime(self.practise),
             self.match,
             self.levels,
-            LeaveMotion(),
             FitQuantisation(),
             *pruning,
             self.prefixes,

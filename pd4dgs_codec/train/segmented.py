@@ -33,7 +33,7 @@ from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.initialise import fresh_mask_logits, fresh_model, nearest_distances
 from pd4dgs_codec.train.loop import Progress, Trainer
 from pd4dgs_codec.train.phases.grow import contained
-from pd4dgs_codec.train.phases.matching import Points, moving_points
+from pd4dgs_codec.train.phases.matching import KEY_VIEWS, Points, moving_points
 from pd4dgs_codec.train.schedule import Schedule
 from pd4dgs_codec.train.state import TrainState
 
@@ -41,10 +41,6 @@ from pd4dgs_codec.train.state import TrainState
 BASE_VIEWS = 600
 #: Times differ by rounding; a view at the seam belongs to both segments. Seconds.
 ROUNDING = 1e-4
-#: A segment starts with anchors at points of what moves whose time is at most this from the key instant, normalised.
-NEAR_KEY = 1 / 8
-#: Gaussians whose features new anchors take have this opacity at least.
-OPAQUE = 0.5
 
 
 @dataclass(frozen=True)
@@ -148,7 +144,9 @@ def continued(config: TrainConfig, dataset: Dataset, base: Scene) -> Model:
     state = TrainState(replace(config, noise=False), dataset, Schedule(1), torch.device("cpu"), size, model)
     state.iteration = 1
     points, _ = moving_points(state)
-    return joined(_anchors_at(state, points.at((points.time - config.key_instant).abs() <= NEAR_KEY)))
+    apart = (points.time - config.key_instant).abs()
+    near = torch.unique(apart)[:KEY_VIEWS]
+    return joined(_anchors_at(state, points.at(torch.isin(apart, near))))
 
 
 @torch.no_grad()
@@ -164,7 +162,7 @@ def _anchors_at(state: TrainState, points: Points) -> dict[str, Tensor]:
     feature = model.feature.new_zeros(len(found), model.widths.feature)
     if len(found):
         shown = model.gaussians(0, 0.0, state.dataset.camera, EXACT)
-        solid = (shown.opacities >= OPAQUE).nonzero()[:, 0]
+        solid = (shown.opacities >= 0.5).nonzero()[:, 0]
         if len(solid):
             nearest = torch.cdist(colour, shown.colors[solid]).argmin(1)
             feature = model.feature[shown.slots[solid[nearest]] // model.widths.slots]
