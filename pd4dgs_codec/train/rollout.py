@@ -38,10 +38,10 @@ STILL_ODDS, NEAR_ODDS = 0.15, 1 / 3
 NEAR_SHARE, NEAR_VIEWS, MOST_NEAR = 1 / 12, 4, 60
 #: Motion has changed a pixel if a colour differs by at least this between level 0 and the training image.
 STILL_CONTRAST = 0.15
-#: A base does not train pixels that show what moves: the mean difference of a patch of PATCH pixels a side, in which
+#: A base does not train pixels that show what moves: the mean difference of a patch of REACH pixels a side, in which
 #: the errors of texture cancel, is MOVED. After half a run on `synthetic:local`, patches told 34 % of what moved, and
 #: 1.6 % of what stood still.
-PATCH, MOVED = 5, 0.08
+MOVED = 0.08
 #: Share of the steps that train level 1 where there is a level 2.
 GLOBAL_ODDS = 0.1
 
@@ -138,6 +138,6 @@ def at_rest(shown: TrainingView, image: Tensor) -> TrainingView:
     """The view without the pixels that show what moves, as it trains a base from the middle of its run on, when what
     moves has become a blur (trimmed least squares: Rousseeuw, Least median of squares regression, 1984). image: its
     picture."""
-    apart = avg_pool2d((image.detach() - shown.image).permute(2, 0, 1), PATCH, 1, PATCH // 2).abs().amax(0)
-    moved = max_pool2d(apart[None], PATCH, 1, PATCH // 2)[0] >= MOVED
+    apart = avg_pool2d((image.detach() - shown.image).permute(2, 0, 1), REACH, 1, REACH // 2).abs().amax(0)
+    moved = max_pool2d(apart[None], REACH, 1, REACH // 2)[0] >= MOVED
     return replace(shown, weights=shown.weights * ~moved)

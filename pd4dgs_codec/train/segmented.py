@@ -28,7 +28,7 @@ from pd4dgs_codec.io import write_bytes
 from pd4dgs_codec.model.config import PRESETS
 from pd4dgs_codec.model.model import Model, from_scene, to_scene
 from pd4dgs_codec.model.networks import EXACT
-from pd4dgs_codec.scene import Grading, Scene
+from pd4dgs_codec.scene import SCALING_DIM, Grading, Scene
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.initialise import fresh_mask_logits, fresh_model, nearest_distances
 from pd4dgs_codec.train.loop import Progress, Trainer
@@ -170,7 +170,7 @@ def _anchors_at(state: TrainState, points: Points) -> dict[str, Tensor]:
     return {
         "anchor_q": found,
         "feature": feature.detach().clone(),
-        "scaling_log": size.log()[:, None].repeat(1, 6),
+        "scaling_log": size.log()[:, None].repeat(1, SCALING_DIM),
         "offset": model.offset.new_zeros(len(found), *model.offset.shape[1:]),
         "mask_logits": fresh_mask_logits(len(found), model.level),
     }
