@@ -18,7 +18,7 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from pd4dgs_codec.train.phases.levels import other_views
-from pd4dgs_codec.train.phases.opening import window, within
+from pd4dgs_codec.train.phases.opening import NEAR_SHARE, window, within
 from pd4dgs_codec.train.ssim import REACH
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
@@ -33,9 +33,9 @@ LOWEST: Probabilities = (1.0, 0.0, 0.0)
 RHO_DECAY = 0.95
 #: Share of the steps after the coarse phase that train level 0, and the share of these near the key instant.
 STILL_ODDS, NEAR_ODDS = 0.15, 1 / 3
-#: The views near the key instant: a share of all, the fewest and the most. Where many cameras show each instant, more
-#: would be of instants at which what moves is elsewhere.
-NEAR_SHARE, NEAR_VIEWS, MOST_NEAR = 1 / 12, 4, 60
+#: The views near the key instant, NEAR_SHARE of all: the fewest and the most. Where many cameras show each instant,
+#: more would be of instants at which what moves is elsewhere.
+NEAR_VIEWS, MOST_NEAR = 4, 60
 #: Motion has changed a pixel if a colour differs by at least this between level 0 and the training image.
 STILL_CONTRAST = 0.15
 #: A base does not train pixels that show what moves: the mean difference of a patch of REACH pixels a side, in which
