@@ -206,7 +206,7 @@ def plan_priors(
     """Returns the prior of each channel; channels that share one get the same object. share: whether channels may share
     new priors. known: priors that were described earlier, at no cost now. room: most entries of all new tables, at
     least one per channel."""
-    plan = [fit(h) for h in histograms]
+    plan = fits = [fit(h) for h in histograms]
     far = len(known) - NEAR
     free = [replace(fitted, price=0, token=8 * BIT * (i < far)) for i, fitted in enumerate(known)]
     if free and plan:
@@ -218,7 +218,7 @@ def plan_priors(
     narrow = [c for c, h in enumerate(histograms) if len(h.values) <= WIDE]
     for start in range(0, len(narrow) if share else 0, BLOCK):
         block = narrow[start : start + BLOCK]
-        shared = _shared([histograms[c] for c in block], [plan[c] for c in block], free)
+        shared = _shared([histograms[c] for c in block], [fits[c] for c in block], free)
         for c, prior in zip(block, shared, strict=True):
             plan[c] = prior
     return _within(room, histograms, plan, free, fit)

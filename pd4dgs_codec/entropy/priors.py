@@ -26,9 +26,9 @@ from pd4dgs_codec.errors import Malformed, UnsupportedFeature
 
 K_MAX = 1 << 24  #: |k| of any symbol
 MAX_WINDOW = 1 << 14
-#: Most entries of all tables that a slice defines, beyond one per symbol: the first of its layer, and a later one. They
-#: bound memory: eight bytes can define a table of 2**14 entries, 128 KiB.
-FREE_ENTRIES, MORE_ENTRIES = 1 << 18, 1 << 10
+#: Most entries of all tables that a layer defines, beyond one per symbol of the file so far. They bound memory: eight
+#: bytes can define a table of 2**14 entries, 128 KiB.
+FREE_ENTRIES = 1 << 18
 MU8_MAX = 1 << 31
 SI_MIN, SI_MAX = -640, 1280  #: sigma = Q * 2 ** (si / 64)
 FIRST_REUSE = 8  #: family codes from here on refer to an earlier prior

@@ -166,13 +166,14 @@ class TrainState:
         schedule: Schedule,
         device: torch.device,
         size: ModelConfig | None = None,
+        start: Model | None = None,
     ):
-        """Starts with a fresh model for `dataset`, of the preset's size by default."""
+        """Starts with the model `start`, by default with a fresh one for `dataset`, of the preset's size by default."""
         self.config, self.dataset, self.schedule, self.device = config, dataset, schedule, device
         self.size = size or PRESETS[config.preset]
         steps = config.model_steps(self.size.steps)
         key = config.key_instant if config.rollout == "key" else None
-        model = fresh_model(self.size, dataset, config.widths, steps, config.seed, config.max_layer, key)
+        model = start or fresh_model(self.size, dataset, config.widths, steps, config.seed, config.max_layer, key)
         check_visible(model, dataset)
         self.model = model.to(device)
         self.views = TrainingViews(dataset.train, model.info.background, device)
@@ -320,6 +321,11 @@ class TrainState:
             if (stored := state["exposures"][camera]).shape != exposure.shape:
                 raise ValueError(f"exposure has shape {tuple(stored.shape)}, expected {tuple(exposure.shape)}")
             exposure.data.copy_(stored)
+        frozen = self.model.frozen
+        for name in ("anchor_q", *PER_ANCHOR):
+            if not torch.equal(getattr(model, name)[:frozen].to(self.device), getattr(self.model, name)[:frozen]):
+                raise ValueError(f"{name} of the first {frozen} anchors is not that of the base")
+        model.freeze(frozen)
         self.model = model.to(self.device)
         self.optimiser = Optimiser(self.model, self.config.rates, self.config.cooldown, self.views.exposures.values())
         self.optimiser.load_state(state["optimiser"])

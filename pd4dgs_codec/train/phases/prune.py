@@ -60,6 +60,7 @@ class Prune(Phase):
         views = state.views.spread(VIEWS, order, self.turn)
         errors = added_error(model, levels, views, state.rounding(noisy=False), omission_error).to(state.device)
         errors[:, round_of(model.anchor_q) != self.turn] = torch.inf
+        errors[:, : model.frozen] = torch.inf
         redundant = least(errors.amax(0), share)
         keep = (~redundant | redundant.all()).nonzero()[:, 0]
         state.keep_anchors(keep)
