@@ -22,7 +22,7 @@ from pd4dgs_codec.model.networks import EXACT, level_mask
 from pd4dgs_codec.model.picture import render, render_image
 from pd4dgs_codec.model.sensitivity import rounding_error
 from pd4dgs_codec.scene import ATTRIBUTES, MASK_THRESHOLD, MAX_CLASS
-from pd4dgs_codec.train import learner, losses, rollout
+from pd4dgs_codec.train import learner, losses
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.loop import Trainer
 from pd4dgs_codec.train.phases import levels, opening, prefixes, prune, quantisation
@@ -104,7 +104,7 @@ def test_time_opens_from_the_key_instant_where_motion_predicts(dataset, monkeypa
     for learner.iteration in range(10, 100, 5):
         window = opening.within(learner, range(len(learner.views)))
         seen = {next_view(learner, 2) for _ in range(40)}
-        assert seen <= set(window) or len(window) < rollout.NEAR_VIEWS
+        assert seen <= set(window) or len(window) < levels.MIN_VIEWS
         counts.append(len(window))
         instants.append(opening.few_instants(learner))
     if learner.opened:

@@ -20,13 +20,12 @@ from torch.nn.functional import avg_pool2d, softplus
 from pd4dgs_codec.model.picture import render
 from pd4dgs_codec.train import phases, workers
 from pd4dgs_codec.train.initialise import TIED
+from pd4dgs_codec.train.schedule import COARSE_SHARE
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
-#: One in EVERY training views is held back until levels are selected, if these are at least MIN_VIEWS.
-EVERY = 16
-MIN_VIEWS = 4
-#: Share of a run for which the level below is trained before it is compared.
-PRACTICE = 1 / 10
+#: One in EVERY training views is held back until levels are selected, if these are at least MIN_VIEWS: fewer say little
+#: of a scene, here and wherever views are chosen by time.
+EVERY, MIN_VIEWS = 16, 4
 #: Standard errors by which a level must be better than the one that would take its place: few views are held back.
 NEEDED = 2.0
 #: A picture is visibly wrong if its mean squared error in a block, a part PART of the shorter side, is over LACKS. It
@@ -82,7 +81,7 @@ class SelectLevels(phases.Phase):
                 state.model.mask_logits[:, below] += softplus(state.model.mask_logits[:, above])
         suffices = False
         try:
-            self._practise(below, state.steps_in(PRACTICE))
+            self._practise(below, state.steps_in(COARSE_SHARE))
             instead = workers.alike(lambda: [error(state, view, below) for view in views])
             worse = [after - with_it for after, with_it in zip(instead, errors, strict=True)]
             suffices = fmean(worse) <= NEEDED * stdev(worse) / math.sqrt(len(worse)) + rate
