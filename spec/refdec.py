@@ -606,7 +606,7 @@ class Coder:
 
     # 8 Coded channels: "Channels of length 0 leave no trace."
     # 8.1 Tokens: "the prior F − 8 places before the last one of the prior list"
-    # 8.2 Priors: "The entries of all windows of the prior list, n each, MUST NOT exceed S (6.5) plus 2^18"
+    # 8.2 Priors: "The entries of all windows of the prior list, n each, MUST NOT exceed the S of the slice (6.5)"
     # 8.4 Symbols: "The symbol is kmin + s. Exceptions are then put in their places."
     def channel(self, count):
         if count == 0:
