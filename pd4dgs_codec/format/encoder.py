@@ -31,7 +31,7 @@ from pd4dgs_codec.format.payload import StreamReport, write_slice
 from pd4dgs_codec.format.plan import LeftOut, SceneSymbols, plan
 from pd4dgs_codec.format.reader import Base, Source, read_base, read_layers
 from pd4dgs_codec.format.registry import MAX_CHUNKS
-from pd4dgs_codec.kinds import AnyScene, utility_of
+from pd4dgs_codec.kinds import AnyScene
 from pd4dgs_codec.tensors.symbols import LayerSymbols, sliced
 from pd4dgs_codec.tensors.tables import Fill
 from pd4dgs_codec.threads import one_blas_thread
@@ -128,7 +128,7 @@ def encode_with_report(
 
     left_out: parts that the caller has removed from the scene, added to the report. metadata: stored in the file.
     utility: function of the decoded scene, float [N], the gain in image quality by each anchor. It orders the anchors
-    of sliced layers; `kinds.utility_of` if None. fill: function of the scene that ends with a slice, its fill; called
+    of sliced layers; `scene.utility` if None. fill: function of the scene that ends with a slice, its fill; called
     for each slice but the last. If None, each slice has the fill of its layer. base: a file, or what `read_base` made
     of it, whose layer 0 the file names and does not hold: the scene's first rows and its networks of layer 0 are those
     of the base, whose mask codes in layer 0 may be 0 instead. changes: fields of EncodeOptions that replace those of
@@ -142,7 +142,8 @@ def encode_with_report(
     symbols, omitted = planned.symbols, planned.left_out
     errors = verify_errors(planned.scene, symbols) if options.verify else []
     del planned  # as large as the scene
-    written = _write_layers(symbols, options, utility or utility_of, None if fill is None else LONGEST)
+    utility = utility or (lambda scene: scene.utility)
+    written = _write_layers(symbols, options, utility, None if fill is None else LONGEST)
     if fill is not None:
         written = _filled(symbols, options, written, fill)
     data, about_bytes = _container(symbols, options.mode, written), 0

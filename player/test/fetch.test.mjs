@@ -269,6 +269,13 @@ test("temporary status codes are tried again, others are final, and a dead serve
   assert.equal(dead.asked.length, 3);
 });
 
+test("an answer that breaks is told from none", async () => {
+  const { source } = await serving(() => ({ cut: 0 }), { attempts: 2 });
+  await assert.rejects(all(source), { name: "FetchError", message: /the connection broke \(0 bytes received\)$/ });
+  const none = await serving(undefined, { attempts: 2, fetch: () => Promise.reject(new TypeError("fetch failed")) });
+  await assert.rejects(all(none.source), { message: /no connection, or no CORS permission of the server \(0 bytes/ });
+});
+
 test("an abort raises the signal's reason, before and during the download", async () => {
   const controller = new AbortController();
   const { source } = await serving(() => ({ cut: ENDS[0] + 5, hang: true }), { signal: controller.signal });
