@@ -386,7 +386,8 @@ class LayeredScene:
 
     def of_anchors(self, rows: np.ndarray | slice) -> dict[str, Any]:
         """Returns the fields of the anchors `rows`, without masks, as arguments of `dataclasses.replace`."""
-        raise NotImplementedError
+        grading = None if self.grading is None else replace(self.grading, classes=self.grading.classes[rows])
+        return {"anchor_q": self.anchor_q[rows], "grading": grading}
 
     def of_layers(self) -> dict[str, Any]:
         """Returns the deformations without those of absent layers, as arguments of `dataclasses.replace`."""
@@ -517,9 +518,7 @@ class Scene(LayeredScene):
         return {name: getattr(self, name) for name in ATTRIBUTES}
 
     def of_anchors(self, rows: np.ndarray | slice) -> dict[str, Any]:
-        grading = None if self.grading is None else replace(self.grading, classes=self.grading.classes[rows])
-        attributes = {name: values[rows] for name, values in self.attributes.items()}
-        return {"anchor_q": self.anchor_q[rows], **attributes, "grading": grading}
+        return super().of_anchors(rows) | {name: values[rows] for name, values in self.attributes.items()}
 
     def deformation(self, layer: int) -> Deformation | None:
         """Returns the deformation of layer 1 or 2, None if it is left out; None for layer 0, which has none."""
