@@ -25,7 +25,7 @@ WHOLE_TINY = PRESETS["tiny"]  # tests have a smaller one
 @pytest.fixture
 def short_runs_match(monkeypatch, short_runs_have_phases):
     """Short runs find points, at any depth; time opens at once."""
-    monkeypatch.setattr(opening, "_error_beyond", lambda state: 1.0 - state.opened)
+    monkeypatch.setattr(opening, "_errors_beyond", lambda state: [1.0 - state.opened])
     monkeypatch.setattr(matching, "AMBIGUOUS", 1.0)
     monkeypatch.setattr(matching, "LEAST_FOUND", 0.0)
     monkeypatch.setattr(matching, "ELSEWHERE", 0.0)
@@ -145,7 +145,7 @@ def test_points_are_drawn_without_the_numbers_of_the_other_thread(dataset):
 
 @pytest.mark.usefixtures("short_runs_match")
 def test_steady_motion_needs_no_points(dataset, monkeypatch):
-    monkeypatch.setattr(opening, "_error_beyond", lambda state: float(state.opened))
+    monkeypatch.setattr(opening, "_errors_beyond", lambda state: [float(state.opened)])
     assert not len(trainer_of(dataset, 60, steps=8).learner.match.points.time)
 
 

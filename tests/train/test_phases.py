@@ -80,24 +80,24 @@ def test_short_runs_and_few_views_have_no_measured_phases(dataset, tmp_path, req
 # -- opening of time ---------------------------------------------------------------------------------------------------
 
 
-def opening_told(monkeypatch, errors: list[float]) -> None:
+def opening_told(monkeypatch, errors: list[list[float]]) -> None:
     """Lets the branches that open time gradually and at once have these errors."""
     left = iter(errors)
-    monkeypatch.setattr(opening, "_error_beyond", lambda state: next(left))
+    monkeypatch.setattr(opening, "_errors_beyond", lambda state: next(left))
 
 
 @pytest.mark.usefixtures("short_runs_have_phases")
-@pytest.mark.parametrize("errors", [[0.1, 0.1], [0.2, 0.1]])
-def test_time_opens_from_the_key_instant_where_motion_predicts(dataset, monkeypatch, errors):
+@pytest.mark.parametrize("errors, opened", [([0.1, 0.1, 0.2, 0.21], False), ([0.1, 0.1, 0.1, 0.12], True)])
+def test_time_opens_from_the_key_instant_where_motion_predicts(dataset, monkeypatch, errors, opened):
     """The run goes on with the steps of the better branch."""
     learner, ends, seen = trainer_of(dataset, 100, 10).learner, [], []
     monkeypatch.setattr(learner, "_update", lambda few: seen.append(few) or type(learner)._update(learner, few))
-    opening_told(monkeypatch, errors)
+    opening_told(monkeypatch, [errors[:2], errors[2:]])
     (phase,) = [phase for phase in learner.before_step if isinstance(phase, opening.OpenTime)]
     phase._practise = lambda *at: learner.practise(*at) or ends.append(weights_of(learner.model))
     assert phase.due(learner)
     phase.apply(learner, record := {})
-    assert record["opening_errors"] == errors and learner.opened == (errors[1] < errors[0])
+    assert record["opening_errors"] == pytest.approx([0.1, sum(errors[2:]) / 2]) and learner.opened == opened
     assert seen == [3] * 7 + [None] * 7
     assert not moved(ends[learner.opened], learner.model) and moved(ends[not learner.opened], learner.model)
     counts, instants = [], []
@@ -140,7 +140,7 @@ def times_of(field) -> list[np.ndarray]:
 
 @pytest.mark.usefixtures("short_runs_have_phases")
 def test_steps_while_time_opens_leave_planes_linear_between_few_instants(dataset, monkeypatch):
-    opening_told(monkeypatch, [0.1, 0.1])
+    opening_told(monkeypatch, [[0.1], [0.2]])
     field = trainer_of(dataset, 100, 20).model.global_deformation
     times = times_of(field)
     assert any(np.ptp(plane) > 1e-3 for plane in times)

@@ -26,7 +26,8 @@ from pd4dgs_codec.train.state import TrainingView, TrainState
 #: One in EVERY training views is held back until levels are selected, if these are at least MIN_VIEWS: fewer say little
 #: of a scene, here and wherever views are chosen by time.
 EVERY, MIN_VIEWS = 16, 4
-#: Standard errors by which a level must be better than the one that would take its place: few views are held back.
+#: Standard errors by which a level must be better than the one that would take its place, and gradual opening better
+#: than opening at once: few views are compared.
 NEEDED = 2.0
 #: A picture is visibly wrong if its mean squared error in a block, a part PART of the shorter side, is over LACKS. It
 #: lacks what another picture shows if it is wrong there and its error is MORE times that of the other.
@@ -83,8 +84,7 @@ class SelectLevels(phases.Phase):
         try:
             self._practise(below, state.steps_in(COARSE_SHARE))
             instead = workers.alike(lambda: [error(state, view, below) for view in views])
-            worse = [after - with_it for after, with_it in zip(instead, errors, strict=True)]
-            suffices = fmean(worse) <= NEEDED * stdev(worse) / math.sqrt(len(worse)) + rate
+            suffices = not larger(instead, errors, rate)
         finally:  # a picture that is not finite ends the phase, and the level stays
             if not suffices:
                 state.return_to(before)
@@ -129,6 +129,13 @@ def worst_block(view: TrainingView, own: Tensor, other: Tensor) -> Lack | None:
     row, column = divmod(int(lost.argmax()), lost.shape[1])
     x, y = (round((k + 0.5) * block_side(view)) for k in (column, row))
     return Lack((x, y), float(own[row, column]), float(other[row, column]))
+
+
+def larger(errors: Sequence[float], others: Sequence[float], by: float = 0.0) -> bool:
+    """Whether the errors of some views are larger than other errors of these views, by more than `by` and the noise."""
+    worse = [own - other for own, other in zip(errors, others, strict=True)]
+    noise = stdev(worse) / math.sqrt(len(worse)) if len(worse) > 1 else 0.0
+    return bool(worse) and fmean(worse) > NEEDED * noise + by
 
 
 def error(state: TrainState, view: TrainingView, level: int) -> float:

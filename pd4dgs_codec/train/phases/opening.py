@@ -16,7 +16,7 @@ import torch
 
 from pd4dgs_codec.data.view import thinned
 from pd4dgs_codec.train import phases, workers
-from pd4dgs_codec.train.phases.levels import images
+from pd4dgs_codec.train.phases.levels import error, larger
 from pd4dgs_codec.train.state import TrainState
 
 #: The views near the key instant: a share of all, and of the longest time from the key instant, which is the window at
@@ -41,21 +41,21 @@ class OpenTime(phases.Phase):
         return state.reached(state.schedule.coarse_end) and window(state) < 1
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
-        """Trains the highest level in the window, then instead in all views, and goes on with the better branch. Logs
-        the squared errors of both."""
-        before, ends = state.snapshot(), []
-        record["opening_errors"] = errors = []
+        """Trains the highest level in the window, then instead in all views, and goes on with the first branch if it is
+        better beyond the noise. Logs the mean squared errors of both."""
+        before, ends, errors = state.snapshot(), [], []
         try:
             for state.opened in (False, True):
                 self._practise(state.model.level, state.steps_in(TRIAL_SHARE))
-                errors.append(workers.alike(lambda: _error_beyond(state)))
+                errors.append(workers.alike(lambda: _errors_beyond(state)))
                 ends.append(state.snapshot())
                 state.return_to(before)
         except BaseException:
             state.opened = False
             state.return_to(before)
             raise
-        state.opened = errors[True] < errors[False]
+        record["opening_errors"] = [sum(own) / max(len(own), 1) for own in errors]
+        state.opened = not larger(errors[True], errors[False])
         state.return_to(ends[state.opened])
 
 
@@ -86,8 +86,8 @@ def _distance(state: TrainState, index: int) -> float:
 
 
 @torch.no_grad()
-def _error_beyond(state: TrainState) -> float:
-    """The squared error of the highest level in views outside the window of the trial."""
+def _errors_beyond(state: TrainState) -> list[float]:
+    """The mean squared errors of the highest level in views outside the window of the trial."""
     far = [i for i in range(len(state.views)) if 1 < _distance(state, i) / (2 * NEAR_SHARE) <= 2]
     views = [state.picture(index) for index in thinned(far, VIEWS)]
-    return sum(view.squared_error(images(state, view, (state.model.level,))[0].clamp(0, 1)) for view in views)
+    return [error(state, view, state.model.level) for view in views]
