@@ -25,11 +25,11 @@ STEPS, REACH = (0.3, 0.12, 0.06), 2
 #: A body is lost where its points are less than KEPT times as alike as at the key instant at so many instants in a row.
 KEPT, LOST = 0.4, 3
 #: It moves if its points are so much more alike where it is followed than where it was.
-MOVES = 0.1
+MOVES = 0.03
 
 
 class Track(NamedTuple):
-    """points: [n, 3], world, of a body at the key instant. times: [T], normalised. offsets: [T, 3], where it is then."""
+    """points: [n, 3], world, of a body at the key instant. times: [T], normalised. offsets: [T, 3], its way."""
 
     points: Tensor
     times: Tensor
@@ -57,7 +57,7 @@ def bodies_of(points: Tensor, apart: float) -> list[Tensor]:
         if (lower == label).all():
             break
         label = lower
-    return [(label == one).nonzero()[:, 0] for one in label.unique()]
+    return [(label == one).nonzero()[:, 0] for one in set(label.tolist())]
 
 
 class _Body(NamedTuple):
@@ -66,12 +66,12 @@ class _Body(NamedTuple):
 
     def alike(self, pictures: Sequence[Picture], time: float, offset: Tensor, speed: Tensor) -> Tensor:
         """[k]: how alike, 0..1, the points are in the pictures at each of k offsets [k, 3] at `time` and speeds."""
-        total: Tensor | float = 0.0
+        total = torch.zeros(2, len(offset))
         for picture in pictures:
             places = self.points + (offset + speed * (picture.time - time))[:, None]
             contrast = picture.contrast(places, self.colour)
             alike, seen = (-(contrast / ALIKE).square()).exp().nan_to_num(0.0), contrast.isfinite().float()
-            total = total + torch.stack([alike.mean(1), seen.mean(1).clamp(min=0.5)])
+            total += torch.stack([alike.mean(1), seen.mean(1).clamp(min=0.5)])
         return total[0] / total[1]
 
 

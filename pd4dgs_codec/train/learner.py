@@ -58,11 +58,11 @@ class Learner(TrainState):
         self.unit = float(deformation_unit(self.model.info.box))  #: of lengths in the loss, scene units
         self.model_loss = ModelLoss(config, self.generator)
         self.levels, self.prefixes, self.grow = SelectLevels(self.practise), Prefixes(), Grow()
-        self.match, self.follow = Match(), Follow()
+        self.match = Match()
         self.before_practice: Callable[[int, int], None] = lambda done, steps: None
         pruning = (Prune(turn) for turn in range(PRUNING_ROUNDS))
         self.before_step: list[Phase] = [
-            self.follow,
+            Follow(),
             OpenTime(self.practise),
             self.match,
             self.levels,
@@ -218,13 +218,9 @@ class Learner(TrainState):
             x, y, z = (picture.gaussians.scales / self.unit).unbind(1)  # the gradient of prod() is slow
             terms["volume"] = (x * y * z).mean()
             loss = loss + config.volume * terms["volume"]
-        weight = self.match.weight(self)
-        guide = self.follow.term(self, level) if weight else None
-        if guide is None:
-            guide = self.match.term(self, level)
-        if guide is not None:
+        if (guide := self.match.term(self, level)) is not None:
             terms["match"] = guide
-            loss = loss + weight * guide
+            loss = loss + self.match.weight(self) * guide
         return picture, terms, loss
 
     def _measure(self, record: dict[str, Any]) -> None:

@@ -9,10 +9,12 @@ key instant agree on a colour (photo-consistency: Seitz and Dyer, Photorealistic
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d
+from torch.nn.functional import avg_pool2d, max_pool2d
 
 from pd4dgs_codec.data.view import Dataset, View, shrunk_view
 from pd4dgs_codec.train.stereo import AMBIGUOUS, SIZE, rays_of
@@ -21,7 +23,7 @@ from pd4dgs_codec.train.stereo import AMBIGUOUS, SIZE, rays_of
 NEAR, OTHERS = 6, 8
 #: Other times are farther from the key instant than this share of all times: there a body has left its place.
 APART = 1 / 6
-#: Pixels of a view that are searched, at random.
+#: Pixels of a view that are searched, about, evenly spread over what differs from the background.
 PIXELS = 3000
 #: Colours are alike if no channel differs by more. A place stands still if it is alike in a share STILL of the other
 #: views; a body is there if it is alike in AGREE views near the key instant besides its own.
@@ -41,27 +43,37 @@ def moving_starts(dataset: Dataset, key: float) -> Tensor:
         return none
     eyes = np.stack([-view.viewmat[:3, :3].T @ view.viewmat[:3, 3] for view in views])
     others: dict[int, Picture] = {}
-    box, background = torch.from_numpy(np.array(dataset.box, np.float32)), torch.tensor(dataset.background)
-    generator, found, owners = torch.Generator().manual_seed(0), [none], [torch.zeros(0, dtype=torch.int64)]
-    for i, own in enumerate(near):
-        pixels = (own.valid & ((own.colour - background).abs() > ALIKE).any(-1)).nonzero()
-        pixels = pixels[torch.randperm(len(pixels), generator=generator)[:PIXELS]]
-        rays = rays_of(own.view, pixels, *box, dataset.near)
+    low, high = torch.from_numpy(np.array(dataset.box, np.float32))
+    background = torch.tensor(dataset.background)
+    found, owners = [none], [torch.zeros(0, dtype=torch.int64)]
+    searched: list[tuple[Tensor, Tensor]] = []
+    for own in near:
+        shown = own.valid & ((own.colour - background).abs() > ALIKE).any(-1)
+        own.stride = max(1, round(math.sqrt(int(shown.sum()) / PIXELS)))
+        shown = shown[:: own.stride, :: own.stride]
+        pixels = shown.nonzero() * own.stride
+        colour = own.colour[pixels[:, 0], pixels[:, 1]]
+        rays = rays_of(own.view, pixels, low, high, dataset.near)
         distance = np.linalg.norm(eyes[away] - rays.eye.numpy(), axis=1)
         beside = [away[k] for k in distance.argsort(kind="stable")[:OTHERS]]
         others |= {index: Picture(views[index]) for index in beside if index not in others}
-        colour = own.colour[pixels[:, 0], pixels[:, 1]]
         still = torch.stack([others[index].contrast(rays.places, colour[:, None]) for index in beside])
         share = (still <= ALIKE).sum(0) / still.isfinite().sum(0).clamp(min=OTHERS // 2)
-        agree = torch.stack([other.contrast(rays.places, colour[:, None]) for other in near if other is not own])
+        moves = rays.inside & (share.amax(1) < STILL)
+        own.moves = torch.zeros(shown.shape).masked_scatter(shown, moves.float())
+        own.moves = max_pool2d(own.moves[None], 3, 1, 1)[0] > 0
+        searched.append((rays.places[moves], colour[moves]))
+    for i, (own, (places, colour)) in enumerate(zip(near, searched, strict=True)):
+        agree = torch.stack(
+            [other.contrast(places, colour[:, None], moving=True) for other in near if other is not own]
+        )
         contrast = agree.nan_to_num(1.0).sort(0).values[AGREE - 1]
         least, best = contrast.min(1)
         clear = (least <= ALIKE) & ((contrast <= ALIKE).float().mean(1) <= AMBIGUOUS)
-        moves = rays.inside & (share.amax(1) < STILL) & clear
-        found.append(rays.places[moves, best[moves]])
+        found.append(places[clear, best[clear]])
         owners.append(torch.full((len(found[-1]),), i))
     points, owner = torch.cat(found), torch.cat(owners)
-    return points[_found_twice(torch.floor(points / ((box[1] - box[0]).max() / CELLS)), owner)]
+    return points[_found_twice(torch.floor(points / ((high - low).max() / CELLS)), owner)]
 
 
 class Picture:
@@ -74,20 +86,23 @@ class Picture:
         self.colour = avg_pool2d(image, 3, 1, 1, count_include_pad=False).permute(1, 2, 0)
         mask = np.ones(view.image.shape[:2], bool) if view.mask is None else np.array(view.mask)
         self.valid, self.time = torch.from_numpy(mask), float(view.time)
+        self.moves, self.stride = self.valid, 1
         viewmat, K = (np.array(matrix, np.float32) for matrix in (view.viewmat, view.K))
         self._turn, self._shift = torch.from_numpy(K @ viewmat[:3, :3]).T, torch.from_numpy(K @ viewmat[:3, 3])
 
-    def at(self, places: Tensor) -> tuple[Tensor, Tensor]:
+    def at(self, places: Tensor, *, moving: bool = False) -> tuple[Tensor, Tensor]:
         """(colours [..., 3] at places [..., 3], world; bool [...]: whether the view shows them)."""
         x, y, z = (places @ self._turn + self._shift).unbind(-1)
         height, width = self.valid.shape
         column, row = (x / z).clamp(0, width - 1).long(), (y / z).clamp(0, height - 1).long()
         inside = (z > 0) & (x >= 0) & (y >= 0) & (x < width * z) & (y < height * z)
-        return self.colour[row, column], inside & self.valid[row, column]
+        shown = self.moves[row // self.stride, column // self.stride] if moving else self.valid[row, column]
+        return self.colour[row, column], inside & shown
 
-    def contrast(self, places: Tensor, colour: Tensor) -> Tensor:
-        """[...]: the largest difference of a channel of `colour` [..., 3] at places [..., 3]; NaN outside the view."""
-        found, inside = self.at(places)
+    def contrast(self, places: Tensor, colour: Tensor, *, moving: bool = False) -> Tensor:
+        """[...]: the largest difference of a channel of `colour` [..., 3] at places [..., 3]; NaN outside the view, and
+        if `moving` where it shows nothing that moves."""
+        found, inside = self.at(places, moving=moving)
         return (found - colour).abs().amax(-1).where(inside, torch.nan)
 
 
@@ -95,4 +110,5 @@ def _found_twice(cells: Tensor, owner: Tensor) -> Tensor:
     """bool [n]: in which of the `cells` [n, 3] there are points of two owners (int64 [n])."""
     _, cell = torch.unique(cells, dim=0, return_inverse=True)
     owners = torch.unique(torch.stack([cell, owner]), dim=1)[0].bincount()
-    return owners[cell] > 1
+    twice: Tensor = owners[cell] > 1
+    return twice

@@ -126,7 +126,8 @@ def without_motion(state: TrainState, shown: TrainingView, image: Tensor) -> Tra
     """The view with the pixel weights that train level 0, of which `image` [H, W, 3] is its picture. In a scene with a
     key instant, pixels that motion has changed have weight 0, but views near it count whole: a body that level 0 lacks
     there could never return. In scenes of little else (`TrainState.guided`) the pixels around them have weight 0, too,
-    since their SSIM depends on them: otherwise the faint edge of a body that has moved away would be erased, then the next edge, until the body is gone."""
+    since their SSIM depends on them: otherwise the faint edge of a body that has moved away would be erased, then the
+    next edge, until the body is gone."""
     whole = state.key is None or state.practising or state.position < state.schedule.coarse_end
     if whole or _is_near(state, shown.view):
         return shown

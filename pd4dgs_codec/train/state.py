@@ -183,7 +183,6 @@ class TrainState:
         self.iteration = self.skipped = 0
         self.share: float | None = None
         self.rho, self.practising, self.opened, self.guided = 0.0, False, False, False
-        self.followed = False  # of no effect after the step that sets it
         self.order: list[int] = []
         self._before = -1  #: the previous step's position; a timed run may advance by more than one
 

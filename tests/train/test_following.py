@@ -5,13 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from runs import trainer_of
 
 from pd4dgs_codec.data.dataset import load
-from pd4dgs_codec.data.synthetic import movers, parse
+from pd4dgs_codec.data.synthetic import parse
 from pd4dgs_codec.train.following import bodies_of, followed
 from pd4dgs_codec.train.movers import moving_starts
-from pd4dgs_codec.train.phases import follow
 
 #: A room with a small body that flies through it, seen by a camera that jumps; six cameras around three bodies.
 ROOM, CAMERAS = "synthetic:random?seed=9&frames=40&size=80x80", "synthetic:random?seed=0&frames=20&size=80x80"

@@ -94,8 +94,8 @@ class Match(phases.Phase):
         return Points.joined(self._instants)
 
     def due(self, state: TrainState) -> bool:
-        """At the end of the coarse phase, if motion is not steady and no body was followed."""
-        return state.reached(state.schedule.coarse_end) and state.opened and not state.followed
+        """At the end of the coarse phase, if motion is not steady."""
+        return state.reached(state.schedule.coarse_end) and state.opened
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
         """Finds the points and logs their number; sets `TrainState.guided`."""
