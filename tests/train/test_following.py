@@ -5,11 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from runs import trainer_of
 
 from pd4dgs_codec.data.dataset import load
-from pd4dgs_codec.data.synthetic import parse
+from pd4dgs_codec.data.synthetic import movers, parse
+from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.train.following import bodies_of, followed
 from pd4dgs_codec.train.movers import moving_starts
+from pd4dgs_codec.train.phases.follow import Follow
 
 #: A room with a small body that flies through it, seen by a camera that jumps; six cameras around three bodies.
 ROOM, CAMERAS = "synthetic:random?seed=9&frames=40&size=80x80", "synthetic:random?seed=0&frames=20&size=80x80"
@@ -56,3 +59,22 @@ def test_points_that_hang_together_are_one_body():
     points = torch.tensor([[0.0, 0, 0], [9.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0], [9.5, 0, 0]])
     assert [rows.tolist() for rows in bodies_of(points, 1.5)] == [[0, 2, 3], [1, 4]]
     assert bodies_of(points[:0], 1.5) == []
+
+
+def test_motion_knows_where_bodies_are_before_it_sees_a_picture():
+    """Level 0, learnt near the key instant, shows bodies; level 2 then shows them where they are at other times, which
+    it learnt from tracks alone. Bodies of this scene were lost before."""
+    dataset = load(CAMERAS)
+    learner = trainer_of(dataset, 500, 50).learner
+    record: dict[str, object] = {}
+    Follow().apply(learner, record)
+    assert record["bodies"] == 3 and learner.opened
+    views = [view for view in dataset.train if abs(view.time - 0.5) > 0.3][::12]
+    truth = np.stack([view.image for view in views]) / 255.0
+    drawn = [
+        np.stack([np.asarray(render_image(learner.model, level, view.time, view.camera)) for view in views])
+        for level in (0, 2)
+    ]
+    for body in movers(CAMERAS, views):
+        still, moved = (np.square(image - truth)[body.shown].mean() for image in drawn)
+        assert moved < 0.7 * still

@@ -39,7 +39,7 @@ def test_a_run_with_all_phases_resumes_bit_for_bit(dataset, tmp_path, monkeypatc
     """Cut on quarter pictures before anchors grow, between two rounds of pruning, and while prefixes are trained."""
     monkeypatch.setattr("pd4dgs_codec.train.state.LARGE", 24)
     monkeypatch.setattr(prefixes, "FEWEST", 20)
-    config = TrainConfig(preset="tiny", iterations=44, seed=5, prune=0.05, grading=0.5, small_pictures=0.6)
+    config = TrainConfig(preset="tiny", iterations=44, seed=6, prune=0.05, grading=0.5, small_pictures=0.6)
     trainer, schedule, whitenings = Trainer(config, dataset), Schedule(44), []
     monkeypatch.setattr(quantisation, "whiten", lambda *args: whitenings.append(trainer.iteration) or whiten(*args))
     cuts = (12, schedule.prune[2], 36)
