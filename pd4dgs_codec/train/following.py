@@ -14,16 +14,16 @@ import torch
 from torch import Tensor
 
 from pd4dgs_codec.data.view import Dataset, thinned
-from pd4dgs_codec.train.movers import ALIKE, CELLS, NEAR, Picture
+from pd4dgs_codec.train.movers import AGREE, ALIKE, CELLS, NEAR, Picture
 
 #: Views that are searched at most.
 VIEWS = 240
-#: Bodies that are followed at most, the largest first; their fewest points, and how many of each are compared.
-BODIES, LEAST, SAMPLE = 12, 8, 48
+#: Bodies that are followed at most, the largest first, and points of each that are compared.
+BODIES, SAMPLE = 12, 48
 #: Steps of the search, in sizes of the body, each up to REACH times in every direction.
 STEPS, REACH = (0.3, 0.12, 0.06), 2
-#: A body is lost where its points are less than KEPT times as alike as at the key instant at so many instants in a row.
-KEPT, LOST = 0.4, 3
+#: A body is lost where its points are less than KEPT times as alike as at the key instant at AGREE instants in a row.
+KEPT = 0.4
 #: It moves if its points are so much more alike where it is followed than where it was.
 MOVES = 0.03
 
@@ -44,7 +44,7 @@ def followed(dataset: Dataset, points: Tensor, key: float) -> list[Track]:
     near = sorted(pictures, key=lambda picture: abs(picture.time - key))[:NEAR]
     colour = torch.stack([picture.at(points)[0] for picture in near]).median(0).values
     bodies = sorted(bodies_of(points, cell), key=len, reverse=True)[:BODIES]
-    tracks = [_followed(pictures, points[rows], colour[rows], key, cell) for rows in bodies if len(rows) >= LEAST]
+    tracks = [_followed(pictures, points[rows], colour[rows], key, cell) for rows in bodies if len(rows) > NEAR]
     return [track for track in tracks if track is not None]
 
 
@@ -121,7 +121,7 @@ def _way(pictures: Sequence[Picture], body: _Body, key: float, cell: float) -> l
             lost = 0 if float(body.alike(window, time, offset, speed)) > KEPT * first else lost + 1
             found.append((time, offset))
             last = time
-            if lost == LOST:
-                found = found[:-LOST]
+            if lost == AGREE:
+                found = found[:-AGREE]
                 break
     return found

@@ -49,12 +49,13 @@ class Learner(TrainState):
         schedule: Schedule,
         device: torch.device,
         size: ModelConfig | None = None,
+        start: Model | None = None,
     ):
-        """Starts with a fresh model for `dataset`, of the preset's size by default."""
+        """As `TrainState`."""
         keep_freed_memory()
         if device.type == "cuda":  # TF32 is too coarse for SSIM's variances, differences of blurred images
             torch.backends.cudnn.allow_tf32 = False
-        super().__init__(config, dataset, schedule, device, size)
+        super().__init__(config, dataset, schedule, device, size, start)
         self.unit = float(deformation_unit(self.model.info.box))  #: of lengths in the loss, scene units
         self.model_loss = ModelLoss(config, self.generator)
         self.levels, self.prefixes, self.grow = SelectLevels(self.practise), Prefixes(), Grow()

@@ -17,12 +17,11 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from pd4dgs_codec.data.view import Dataset, View, shrunk_view
+from pd4dgs_codec.train.schedule import NEAR_SHARE
 from pd4dgs_codec.train.stereo import AMBIGUOUS, SIZE, rays_of
 
-#: Views near the key instant; views of other times that tell whether a pixel shows what stands still.
+#: Views near the key instant; views of other times, at which a body has left its place, that tell what stands still.
 NEAR, OTHERS = 6, 8
-#: Other times are farther from the key instant than this share of all times: there a body has left its place.
-APART = 1 / 6
 #: Pixels of a view that are searched, about, evenly spread over what differs from the background.
 PIXELS = 3000
 #: Colours are alike if no channel differs by more. A place stands still if it is alike in a share STILL of the other
@@ -37,7 +36,7 @@ def moving_starts(dataset: Dataset, key: float) -> Tensor:
     """float32 [n, 3] points, world, of what moves, where it is at the key instant `key`, normalised time."""
     views, none = dataset.train, torch.zeros(0, 3)
     order = sorted(range(len(views)), key=lambda index: abs(views[index].time - key))
-    away = [index for index in order if abs(views[index].time - key) >= APART]
+    away = [index for index in order if abs(views[index].time - key) >= 2 * NEAR_SHARE]
     near = [Picture(views[index]) for index in order[:NEAR] if index not in away]
     if len(near) <= AGREE or len(away) < OTHERS:
         return none

@@ -35,7 +35,6 @@ const FIRST_KEYS = [4, 5, 6, 7];
  * @property {RowTensor[]} layerRows those of the layer, with a row for each rise and each own row
  * @property {Uint8Array} codes
  * @property {Uint8Array} stream
- * @property {number} symbols so many as 6.5 counts for this slice
  * @property {Declared} declared by the slices so far, this one included
  */
 
@@ -89,7 +88,6 @@ export function readParameters(payload, { width, centres, base }, before, known,
     layerRows,
     codes: payload.subarray(4 + length, 4 + length + size),
     stream: payload.subarray(4 + length + size),
-    symbols,
     declared,
   };
 }

@@ -27,7 +27,7 @@ def test_it_learns_and_logs_every_term(dataset, tmp_path):
     records = records_of(trainer_of(dataset, 90), tmp_path)
     assert [r["iteration"] for r in records] == list(range(90))
     assert np.mean([r["l1"] for r in records[-10:]]) < 0.6 * np.mean([r["l1"] for r in records[:5]])
-    assert {"l1", "dssim", "volume", "rate", "tmc_binary", "tmc_smooth", "rho", "pi", "anchors"} <= set(records[-1])
+    assert {"l1", "dssim", "volume", "rate", "binary", "rho", "pi", "anchors"} <= set(records[-1])
     assert all(r["level"] == 0 for r in records[: Schedule(90).coarse_end])
     assert {r["level"] for r in records} == {0, 1, 2}
     assert "rate" not in records[Schedule(90).progressive - 1] and "rate" in records[Schedule(90).progressive]
