@@ -94,12 +94,11 @@ class Widths:
 
     @property
     def head_columns(self) -> dict[str, slice]:
-        """The columns of an anchor's row to which each residual head adds: one run per `Head.unit`, in the order in
-        which HEADS first names them."""
-        columns, end = dict[str, slice](), 0
-        for head in HEADS.values():
-            if head.unit not in columns:
-                columns[head.unit] = slice(end, end := end + head.outputs(self))
+        """The columns of an anchor's row to which each residual head adds: position, then the attributes in their
+        order."""
+        columns, end = {"length": slice(0, 3)}, 3
+        for name, shape in self.attributes.items():
+            columns[name] = slice(end, end := end + math.prod(shape))
         return {name: columns[head.unit] for name, head in HEADS.items()}
 
 
@@ -387,7 +386,8 @@ class LayeredScene:
 
     def of_anchors(self, rows: np.ndarray | slice) -> dict[str, Any]:
         """Returns the fields of the anchors `rows`, without masks, as arguments of `dataclasses.replace`."""
-        raise NotImplementedError
+        grading = None if self.grading is None else replace(self.grading, classes=self.grading.classes[rows])
+        return {"anchor_q": self.anchor_q[rows], "grading": grading}
 
     def of_layers(self) -> dict[str, Any]:
         """Returns the deformations without those of absent layers, as arguments of `dataclasses.replace`."""
@@ -518,9 +518,7 @@ class Scene(LayeredScene):
         return {name: getattr(self, name) for name in ATTRIBUTES}
 
     def of_anchors(self, rows: np.ndarray | slice) -> dict[str, Any]:
-        grading = None if self.grading is None else replace(self.grading, classes=self.grading.classes[rows])
-        attributes = {name: values[rows] for name, values in self.attributes.items()}
-        return {"anchor_q": self.anchor_q[rows], **attributes, "grading": grading}
+        return super().of_anchors(rows) | {name: values[rows] for name, values in self.attributes.items()}
 
     def deformation(self, layer: int) -> Deformation | None:
         """Returns the deformation of layer 1 or 2, None if it is left out; None for layer 0, which has none."""
@@ -535,7 +533,8 @@ class Scene(LayeredScene):
     def _evaluated(self, t: float, eye: np.ndarray) -> Gaussians:
         slots, rows = self.widths.slots, self.active
         mask, values = self.mask[-1][rows] * MASK_STEP, {"length": self.anchor_at(rows)}
-        values |= {name: array[rows].reshape(len(rows), -1) for name, array in self.attributes.items()}
+        for name, shape in self.widths.attributes.items():
+            values[name] = self.attributes[name][rows].reshape(-1, math.prod(shape))
         if motion := self.motion(self.level):
             for unit, added in motion.residuals(values["length"], t, self.info.box).items():
                 values[unit] = values[unit] + added
@@ -546,7 +545,7 @@ class Scene(LayeredScene):
         opacity = np.tanh(outputs[0])
         seen = opacity * mask[:, None] >= np.float32(MIN_OPACITY)
         owner, slot = np.nonzero(seen)
-        shape, color = (values.reshape(*seen.shape, -1)[seen] for values in outputs[1:])
+        shape, color = (values.reshape(*seen.shape, n)[seen] for values, n in zip(outputs[1:], (7, 3), strict=True))
         offset = values["offset"].reshape(*seen.shape, 3)[seen]
         return Gaussians(
             means=position[owner] + offset * extent[owner, :3],

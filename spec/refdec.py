@@ -603,7 +603,7 @@ def read_exceptions(codes, count, kmin, n):
 
 
 # 10.2 Octree: "an index into the ascending list of the bytes in which as many bits are 1"
-PATTERNS = [[byte for byte in range(256) if bin(byte).count("1") == k] for k in range(9)]
+PATTERNS = [[byte for byte in range(256) if bin(byte).count("1") == k] for k in range(1, 9)]
 
 
 # 8 Coded channels: "Mode ans reads a slice with two cursors, one in the codes and one in the ANS stream."
@@ -660,22 +660,22 @@ class Coder:
         need(all(v <= MAX_VOXEL for cell in cells for v in cell), "a voxel index over 2^20")
         return cells
 
-    # 10.2 Octree: "class 0 of the nodes whose parent has one child, class 1 of all others, the root included"
+    # 10.2 Octree: "From a level of n nodes on, every node has one child, which is not coded."
     # 10.2 Octree: "The symbol is an index into the ascending list of the bytes in which as many bits are 1"
     def grow(self, depth, count):
         """The relative indices (x, y, z) of the anchors, in Morton order."""
-        levels, classes = [], [1]
+        levels, size = [], 1
         for _ in range(depth):
-            coded = self.split(classes, 2) if len(classes) < count else [0] * count
-            levels.append([1 + k for k in ranged(coded, 0, 7, "a number of children less 1")])
-            need(sum(levels[-1]) <= count, f"{sum(levels[-1])} nodes, expected at most {count}")
-            classes = [int(k > 1) for k in levels[-1] for _ in range(k)]
-        need(len(classes) == count, f"{len(classes)} nodes at the end, expected {count}")
+            coded = self.channel(size) if size < count else [0] * size
+            levels.append(ranged(coded, 0, 7, "a number of children less 1"))
+            size += sum(coded)
+            need(size <= count, f"{size} nodes, expected at most {count}")
+        need(size == count, f"{size} nodes at the end, expected {count}")
         nodes = [(0, 0, 0)]
-        for children in levels:
-            indices = self.split([k - 1 for k in children], 8)
-            need(all(0 <= i < len(PATTERNS[k]) for i, k in zip(indices, children)), "an index out of its list")
-            patterns = [PATTERNS[k][i] for i, k in zip(indices, children)]
+        for further in levels:
+            indices = self.split(further, 8)
+            need(all(0 <= i < len(PATTERNS[k]) for i, k in zip(indices, further)), "an index out of its list")
+            patterns = [PATTERNS[k][i] for i, k in zip(indices, further)]
             nodes = [
                 tuple(2 * v + (child >> axis & 1) for axis, v in enumerate(node))
                 for node, pattern in zip(nodes, patterns)

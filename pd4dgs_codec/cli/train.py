@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import shlex
 from dataclasses import fields, replace
@@ -405,8 +406,11 @@ def _text(result: dict[str, Any]) -> str:
     if result["skipped"]:
         lines.append(f"{result['skipped']} steps skipped for non-finite gradients")
     for row in result["left_out"]:
-        gain = f"{row['gain']:+.2f} dB over level {row['level'] - 1} in the pixels that it changes"
-        lines.append(f"level {row['level']} left out: {gain}, on {row['views']} held-back views")
+        dB = [-10 * math.log10(max(row[name], 1e-9)) for name in ("error", "instead")]
+        lines.append(
+            f"left out above level {row['kept']}: {dB[0]:.2f} dB on {row['views']} held-back views, "
+            f"{dB[1]:.2f} once level {row['kept']} had trained in its place"
+        )
     if result["levels"]:
         split = "held-out" if result["split"] == "test" else "training-view"
         rows = zip(result["levels"], result["active_anchors"], strict=False)

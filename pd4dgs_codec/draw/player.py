@@ -5,6 +5,7 @@ Pictures of the two agree up to rounding: activations differ in the last bit.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -118,9 +119,8 @@ class Player(Drawer):
         self._anchor = np.ascontiguousarray(scene.anchor[: len(codes)], np.float32)
         self.slots = scene.widths.slots  #: Gaussians of an anchor
         #: float32 [N, 9 + D + 3 G]: rows of the kernels, to which the deformation adds
-        self._table = np.concatenate(
-            [self._anchor, scene.feature, scene.offset.reshape(len(codes), 3 * self.slots), scene.scaling_log], axis=1
-        )
+        flat = [scene.attributes[name].reshape(-1, math.prod(shape)) for name, shape in scene.widths.attributes.items()]
+        self._table = np.concatenate([self._anchor, *flat], axis=1)
         extent = np.exp(scene.scaling_log)
         self._radius = OFFSET_REACH * extent[:, :3].max(axis=1) + SIGMA_REACH * extent[:, 3:].max(axis=1)
         motion = scene.motion(scene.level)

@@ -113,7 +113,7 @@ def _write_channel(out: bytearray, fitted: Fitted, exceptions: _Exceptions, know
     """Writes a channel's record. If it defines its prior, this is appended to `known`."""
     prior = fitted.prior
     back = next((i for i, other in enumerate(reversed(known)) if other.prior is prior), None)
-    family = prior.id if back is None else FIRST_REUSE + back
+    family = prior.family if back is None else FIRST_REUSE + back
     put_varint(out, 2 * family + (len(exceptions.positions) > 0))
     if back is None:
         prior.write(out)

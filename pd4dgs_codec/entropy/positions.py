@@ -6,25 +6,25 @@ Codes before the channels (clause 10; the decoder knows N)
     Morton order.
 
 Channels
-    Per level of fewer than N nodes two channels, the numbers of children less one: of the nodes whose parent has one
-    child, then of the others. From a level of N nodes on, all nodes have one child. Then eight channels per level, by
-    number of children: which ones, as the index of the occupancy byte among the bytes with as many bits.
+    Per level of fewer than N nodes a channel, the numbers of children less one. From a level of N nodes on, all nodes
+    have one child. Then eight channels per level, by number of children: which ones, as the index of the occupancy byte
+    among the bytes with as many bits.
 
 Every table is static, so a level is one vectorised step.
 """
 
 import numpy as np
 
-from pd4dgs_codec.entropy.channels import ChannelReader, ChannelWriter, split
+from pd4dgs_codec.entropy.channels import ChannelReader, ChannelWriter, Places, split
 from pd4dgs_codec.entropy.varint import put_zigzag
 from pd4dgs_codec.errors import EncodeError, Malformed
 from pd4dgs_codec.morton import AXIS_BITS, MAX_VOXEL, join_bits, morton_codes
 
 _CHILDREN = np.array([value.bit_count() for value in range(256)])  # by occupancy byte
-_PATTERNS = [np.flatnonzero(_CHILDREN == k) for k in range(9)]  #: bytes with k children, ascending
-_INDEX = np.zeros(256, dtype=np.int32)  # of a byte among the bytes with as many children
-for _patterns in _PATTERNS:
-    _INDEX[_patterns] = np.arange(len(_patterns))
+_COUNTS = np.bincount(_CHILDREN)  # bytes with k children
+_BYTES = np.argsort(_CHILDREN, kind="stable").astype(np.uint8)  # by number of children, each ascending
+_FIRST = np.cumsum(_COUNTS) - _COUNTS  # of the bytes with k children among those
+_INDEX = np.argsort(_BYTES) - _FIRST[_CHILDREN]  # of a byte among the bytes with as many children
 
 
 def encode_positions(cells: np.ndarray, writer: ChannelWriter) -> None:
@@ -56,13 +56,8 @@ def position_channels(cells: np.ndarray) -> tuple[bytes, list[np.ndarray]]:
         put_zigzag(out, value)
     depth = -(-int(codes[-1]).bit_length() // 3)
     out.append(depth)
-    channels, only_child = list[np.ndarray](), np.zeros(1, dtype=bool)
     levels = _occupancies(codes, depth)
-    for occupancy in levels:
-        if len(occupancy) < len(codes):
-            children = _CHILDREN[occupancy]
-            channels += [children[only_child] - 1, children[~only_child] - 1]
-            only_child = np.repeat(children == 1, children)
+    channels = [_CHILDREN[level] - 1 for level in levels if len(level) < len(codes)]
     channels += [_INDEX[level[_CHILDREN[level] == k]] for level in levels for k in range(1, 9)]
     return bytes(out), channels
 
@@ -86,7 +81,7 @@ def decode_positions(channels: ChannelReader, count: int) -> np.ndarray:
     reader = channels.codes
     low = [reader.zigzag(MAX_VOXEL, "the smallest cell") for _ in range(3)]
     depth = reader.byte("the octree's depth", AXIS_BITS)
-    codes = _grow(channels, _read_levels(channels, depth, count))
+    codes = _grow(channels, _read_levels(channels, depth, count), depth, count)
     offsets = np.stack([join_bits(codes >> axis) for axis in range(3)], axis=1)
     if offsets.min(axis=0).any() or int(offsets.max()).bit_length() != depth:
         raise Malformed("positions: the minimum or the depth does not fit the cells")
@@ -97,42 +92,35 @@ def decode_positions(channels: ChannelReader, count: int) -> np.ndarray:
 
 
 def _read_levels(channels: ChannelReader, depth: int, count: int) -> list[np.ndarray]:
-    """Decodes the numbers of children uint8 [nodes] of each level, from the root on."""
-    levels, only_child = list[np.ndarray](), np.zeros(1, dtype=bool)
-    for _ in range(depth):
-        nodes = len(only_child)
-        if nodes == count:
-            levels.append(np.ones(nodes, np.uint8))
-            continue
-        alone, children = int(np.count_nonzero(only_child)), np.empty(nodes, np.uint8)
-        found = _within(channels.read([alone, nodes - alone]), 8) + 1
-        children[only_child], children[~only_child] = found[:alone], found[alone:]
-        if (after := int(found.sum())) > count:
-            raise Malformed(f"positions: {after} nodes after {len(levels) + 1} levels, expected at most {count}")
-        levels.append(children)
-        only_child = np.repeat(children == 1, children)
-    if len(only_child) != count:
-        raise Malformed(f"positions: {len(only_child)} nodes after {depth} levels, expected {count}")
+    """Decodes the numbers of children less one, uint8 [nodes], of each level of fewer than `count` nodes, from the root
+    on."""
+    levels, nodes = list[np.ndarray](), 1
+    while nodes < count and len(levels) < depth:
+        further = channels.read([nodes])
+        if further.view(np.uint32).max() >= 8:
+            raise Malformed(f"positions: {1 + further.min()}..{1 + further.max()} children of a node, expected 1..8")
+        levels.append(further.astype(np.uint8))
+        if (nodes := nodes + int(further.sum())) > count:
+            raise Malformed(f"positions: {nodes} nodes after {len(levels)} levels, expected at most {count}")
+    if nodes != count:
+        raise Malformed(f"positions: {nodes} nodes after {depth} levels, expected {count}")
     return levels
 
 
-def _grow(channels: ChannelReader, levels: list[np.ndarray]) -> np.ndarray:
+def _grow(channels: ChannelReader, levels: list[np.ndarray], depth: int, count: int) -> np.ndarray:
     """Expands the octree to the Morton codes int64 [count] of its cells, ascending. levels: of _read_levels."""
-    sizes = [size for children in levels for size in np.bincount(children, minlength=9)[1:].tolist()]
-    parts, codes = iter(split(channels.read(sizes), sizes)), np.zeros(1, dtype=np.int64)
-    for children in levels:
-        occupancy = np.empty(len(children), np.uint8)
-        for k in range(1, 9):
-            if len(part := next(parts)):
-                occupancy[children == k] = _PATTERNS[k][_within(part, len(_PATTERNS[k]))]
+    sizes, single = [len(further) for further in levels], depth - len(levels)
+    children = np.concatenate([*levels, np.zeros(0, np.uint8)]) + 1
+    places = Places.by(np.repeat(np.arange(len(levels), dtype=np.uint8) * 8, sizes) + children - 1, 8 * len(levels))
+    several, alone = split(channels.read([*places.sizes, *[count] * single]), [sum(sizes), single * count])
+    indices = np.empty((1, len(children)), np.int32)
+    places.put(several, indices)
+    if np.any(indices.view(np.uint32) >= _COUNTS[children]) or np.any(alone.view(np.uint32) >= 8):
+        raise Malformed("positions: a symbol of children that do not exist")
+    codes = np.zeros(1, dtype=np.int64)
+    for occupancy in split(_BYTES[_FIRST[children] + indices[0]], sizes):
         child = np.flatnonzero(np.unpackbits(occupancy, bitorder="little").view(bool))  # and eight times its parent
         codes = codes[child >> 3] << 3 | child & 7
+    for only in alone.reshape(single, count):
+        codes = codes << 3 | only
     return codes
-
-
-def _within(symbols: np.ndarray, size: int) -> np.ndarray:
-    """Returns the symbols. Raises Malformed unless all are in 0 .. size - 1."""
-    if symbols.size and not (int(symbols.min()) >= 0 and int(symbols.max()) < size):
-        found = f"{int(symbols.min())}..{int(symbols.max())}"
-        raise Malformed(f"positions: symbols in {found}, expected 0..{size - 1}")
-    return symbols

@@ -151,20 +151,24 @@ def _check_over(scene: AnyScene, base: Base) -> None:
 
 
 def _predicted(table: RowTable, values: Sequence[np.ndarray], classes: np.ndarray) -> RowTable:
-    """Returns the table with the predictor of each tensor that takes the fewest bits by order-0 entropy. values:
+    """Returns the table with the predictor of each tensor that takes the fewest bits by order-0 entropy, of those that
+    leave values as they are if one does: rows of a decoded file, whose predictors have lattices of their own. values:
     float32 [n, any] of each, in coding order."""
 
-    def bits(tensor: Rows, x: np.ndarray, centre: np.ndarray | None) -> float:
+    def cost(tensor: Rows, x: np.ndarray, centre: np.ndarray | None) -> tuple[bool, float]:
         alone = RowTable((tensor,), centre)
-        symbols = alone.symbols(alone.quantise([x], classes, [f"rows {tensor.id}"]), classes)
-        parts = Places.by(classes, MAX_CLASS + 1).parts(symbols) if alone.graded else symbols
-        return sum(map(entropy_bits, parts))
+        v = alone.quantise([x], classes, [f"rows {tensor.id}"])
+        symbols = alone.symbols(v, classes)
+        if not alone.graded:
+            return False, sum(map(entropy_bits, symbols))
+        moved = not np.array_equal(alone.dequantise(v)[0], x.reshape(-1, tensor.channels))
+        return moved, sum(map(entropy_bits, Places.by(classes, MAX_CLASS + 1).parts(symbols)))
 
     centres = [None] * len(values) if table.centre is None else [m for _, m in table.of_each(table.centre)]
     chosen = [
         tensor
         if tensor.predictor == WHOLE
-        else min((replace(tensor, predictor=p) for p in (0, 1)), key=lambda one: bits(one, x, m))  # noqa: B023
+        else min((replace(tensor, predictor=p) for p in (0, 1)), key=lambda one: cost(one, x, m))  # noqa: B023
         for tensor, x, m in zip(table.tensors, values, centres, strict=True)
     ]
     return RowTable(tuple(chosen), table.centre)

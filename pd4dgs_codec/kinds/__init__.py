@@ -5,8 +5,9 @@ functions here document.
 
 Both roles have `check`, of the tensors of a file, `check_arrays`, of those that users give, `tensors_of`, `array_names`
 and `json_of_layer`. A kind of scene also has SCENE, its class; TENSORS, the names of rows by number; `widths_of` a
-header, `kind_of`, `scene_of` and `json`. A kind of deformation also has OF, the name of the scenes that it moves;
-DEFORMATION, its class; `deformation_of` and, if it has layer rows, `rows_of`.
+header, `kind_of`, `scene_of` and `json`; without tensors in layer 0, neither `check_arrays`, `tensors_of` nor
+`array_names`. A kind of deformation also has OF, the name of the scenes that it moves; DEFORMATION, its class;
+`deformation_of` and, if it has layer rows, `rows_of`.
 """
 
 from __future__ import annotations
@@ -141,10 +142,10 @@ def row_table(scene: AnyScene) -> RowTable:
 
 def _part(scene: AnyScene, layer: int) -> ModuleType | None:
     """Returns the kind of what a layer has besides masks and rows, None if it has nothing."""
-    given = scene.deformation(layer) if layer else None
-    if layer and given is None:
-        return None
-    return next(kind for kind in DEFORMATIONS.values() if isinstance(given, kind.DEFORMATION)) if layer else _of(scene)
+    if layer == 0:
+        return _of(scene) if hasattr(_of(scene), "tensors_of") else None
+    given = scene.deformation(layer)
+    return next((kind for kind in DEFORMATIONS.values() if isinstance(given, kind.DEFORMATION)), None)
 
 
 def layer_name(scene: AnyScene, layer: int) -> str:

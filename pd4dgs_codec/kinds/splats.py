@@ -15,7 +15,7 @@ import numpy as np
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.scene import MASK_STEP, MIN_OPACITY, Gaussians, Grading, LayeredScene, SceneInfo, relative_area
 from pd4dgs_codec.tensors.quantise import RowTable, dequantise
-from pd4dgs_codec.tensors.tables import NOTHING, Kind, Tables, Tensors
+from pd4dgs_codec.tensors.tables import Kind, Tables, Tensors
 
 NUMBER, NAME = 1, "splats"
 
@@ -228,10 +228,9 @@ class SplatScene(LayeredScene):
         return self.tracks.get(layer)
 
     def of_anchors(self, rows: np.ndarray | slice) -> dict[str, Any]:
-        grading = None if self.grading is None else replace(self.grading, classes=self.grading.classes[rows])
         tensors = {name: values[rows] for name, values in self.tensors.items()}
         tracks = {layer: own.of_rows(rows) for layer, own in self.tracks.items()}
-        return {"anchor_q": self.anchor_q[rows], "tensors": tensors, "tracks": tracks, "grading": grading}
+        return super().of_anchors(rows) | {"tensors": tensors, "tracks": tracks}
 
     def of_layers(self) -> dict[str, Any]:
         return {"tracks": {layer: own for layer, own in self.tracks.items() if layer in self.layers}}
@@ -376,20 +375,6 @@ def check(tables: Tables, widths: None) -> None:
     """Raises Malformed if layer 0 breaks the rules of the kind."""
     if tables != Tables():
         raise Malformed("layer 0: grids, chains, layer rows or a deformation, expected none")
-
-
-def check_arrays(scene: SplatScene, layer: int, own: str) -> None:
-    """Layer 0 has nothing beside rows."""
-
-
-def tensors_of(scene: SplatScene, layer: int) -> Tensors:
-    """Returns the grids and chains of layer 0, none."""
-    return NOTHING
-
-
-def array_names(tables: Tables) -> list[str]:
-    """Returns the names of those, none."""
-    return []
 
 
 def json_of_layer(tables: Tables, layer: int) -> dict[str, Any]:

@@ -184,15 +184,11 @@ class Model(nn.Module):
 
     def _picked(self, rows: Tensor, rounding: Rounding) -> tuple[Any, ...]:
         """Returns the arguments of `pick` for the anchors `rows`: attributes, positions, rows and quantisation."""
-        steps, centres, names = self.steps.attributes, self.centres, ("feature", "offset", "scaling_log")
-        noise = None
+        steps, centres, noise = [*self.steps.attributes.values()], [*self.centres.values()], None
         if rounding.noise is not None and not rounding.attributes:
-            draws = {n: rounding.noise.draw(len(rows), centres[n].numel()) for n in ATTRIBUTES}
-            noise = [draws[name] for name in names]
-        quantisation = Quantisation(
-            [steps[n] for n in names], [centres[n] for n in names], self.spacing, noise, rounding.attributes
-        )
-        return [getattr(self, name) for name in names], self.anchor, rows, quantisation
+            noise = [rounding.noise.draw(len(rows), centre.numel()) for centre in centres]
+        quantisation = Quantisation(steps, centres, self.spacing, noise, rounding.attributes)
+        return [getattr(self, name) for name in ATTRIBUTES], self.anchor, rows, quantisation
 
     def _moved(self, level: int, rows: Tensor, t: float, rounding: Rounding, kernels: bool) -> Tensor:
         """Returns the rows of anchors plus the residuals of the deformation of `level`."""

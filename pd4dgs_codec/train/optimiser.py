@@ -34,8 +34,8 @@ class Optimiser:
     def __init__(self, model: Model, rates: LearningRates, cooldown: float, exposures: Iterable[nn.Parameter] = ()):
         self.model, self.rates, self.cooldown = model, rates, cooldown
         groups: dict[str, list[nn.Parameter]] = {name: [getattr(model, name)] for name in PER_ANCHOR}
-        networks = {} if model.frozen else model.networks
-        groups |= {name: list(net.parameters()) for name, net in networks.items()}
+        if not model.frozen:
+            groups |= {name: list(net.parameters()) for name, net in model.networks.items()}
         fields = model.deformations.values()
         groups["planes"] = [f.planes.grid for f in fields]
         groups["deformation"] = [p for f in fields for p in f.weights]

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
-from pd4dgs_codec.train.phases.levels import other_views
-from pd4dgs_codec.train.phases.opening import window, within
+from pd4dgs_codec.train.phases.levels import MIN_VIEWS, other_views
+from pd4dgs_codec.train.phases.opening import NEAR_SHARE, window, within
 from pd4dgs_codec.train.ssim import REACH
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
@@ -33,9 +33,9 @@ LOWEST: Probabilities = (1.0, 0.0, 0.0)
 RHO_DECAY = 0.95
 #: Share of the steps after the coarse phase that train level 0, and the share of these near the key instant.
 STILL_ODDS, NEAR_ODDS = 0.15, 1 / 3
-#: The views near the key instant: a share of all, the fewest and the most. Where many cameras show each instant, more
-#: would be of instants at which what moves is elsewhere.
-NEAR_SHARE, NEAR_VIEWS, MOST_NEAR = 1 / 12, 4, 60
+#: Most views near the key instant, otherwise NEAR_SHARE of all. Where many cameras show each instant, more would be of
+#: instants at which what moves is elsewhere.
+MOST_NEAR = 60
 #: Motion has changed a pixel if a colour differs by at least this between level 0 and the training image.
 STILL_CONTRAST = 0.15
 #: A base does not train pixels that show what moves: the mean difference of a patch of REACH pixels a side, in which
@@ -97,7 +97,7 @@ def _near(state: TrainState, level: int) -> list[int]:
     among = _shown(state)
     if level > 0:
         views = within(state, among)
-        return [] if len(views) == len(among) or len(views) < NEAR_VIEWS else views
+        return [] if len(views) == len(among) or len(views) < MIN_VIEWS else views
     if state.practising:
         return []
     still = state.position < state.schedule.coarse_end or state.guiding
@@ -116,7 +116,7 @@ def near_key(state: TrainState, among: list[int]) -> list[int]:
     """The training views in `among` that are nearest to the key instant, the nearest first."""
     key, views = state.key or 0.0, state.views.views
     nearest = sorted(among, key=lambda index: abs(views[index].time - key))
-    return nearest[: min(max(NEAR_VIEWS, round(len(among) * NEAR_SHARE)), MOST_NEAR)]
+    return nearest[: min(max(MIN_VIEWS, round(len(among) * NEAR_SHARE)), MOST_NEAR)]
 
 
 def without_motion(state: TrainState, shown: TrainingView, image: Tensor) -> TrainingView:

@@ -33,7 +33,8 @@ from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.initialise import fresh_mask_logits, fresh_model, nearest_distances
 from pd4dgs_codec.train.loop import Progress, Trainer
 from pd4dgs_codec.train.phases.grow import contained
-from pd4dgs_codec.train.phases.matching import KEY_VIEWS, Points, moving_points
+from pd4dgs_codec.train.phases.levels import MIN_VIEWS
+from pd4dgs_codec.train.phases.matching import Points, moving_points
 from pd4dgs_codec.train.schedule import Schedule
 from pd4dgs_codec.train.state import TrainState
 
@@ -145,7 +146,7 @@ def continued(config: TrainConfig, dataset: Dataset, base: Scene) -> Model:
     state.iteration = 1
     points, _ = moving_points(state)
     apart = (points.time - config.key_instant).abs()
-    near = torch.unique(apart)[:KEY_VIEWS]
+    near = torch.unique(apart)[:MIN_VIEWS]
     return joined(_anchors_at(state, points.at(torch.isin(apart, near))))
 
 

@@ -21,7 +21,7 @@ from pd4dgs_codec.scene import MASK_THRESHOLD, instant
 from pd4dgs_codec.train.config import MOST_STEPS, TrainConfig
 from pd4dgs_codec.train.initialise import check_visible, fresh_model
 from pd4dgs_codec.train.optimiser import PER_ANCHOR, Optimiser
-from pd4dgs_codec.train.schedule import GUIDED_SHARE, Schedule
+from pd4dgs_codec.train.schedule import Schedule
 from pd4dgs_codec.train.ssim import Part, pixel_weights, within_reach
 
 #: Bytes of images on the device, weights included, beyond which the least recently used are dropped.
@@ -211,7 +211,7 @@ class TrainState:
     @property
     def guiding(self) -> bool:
         """Whether pictures of motion train nothing but motion at this step."""
-        return self.guided and self.schedule.progress(self.position) < GUIDED_SHARE
+        return self.guided and self.position < self.schedule.progressive
 
     def rounding(self, *, noisy: bool = True) -> Rounding:
         """How the steps at this position simulate quantisation; without noise if not `noisy`."""

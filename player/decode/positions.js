@@ -1,6 +1,6 @@
 // Clause 10: positions, an octree, level by level.
 
-import { checkRange, groupByClass } from "./channels.js";
+import { groupByClass } from "./channels.js";
 import { limitExceeded, malformed } from "./errors.js";
 import { MAX_VOXEL } from "./limits.js";
 /** @import { ChannelReader } from "./channels.js" */
@@ -9,12 +9,12 @@ const MAX_DEPTH = 21;
 /** Children of a full node. */
 const ALL = 8;
 
-/** PATTERNS[k]: the bytes with k bits set, ascending. @type {number[][]} */
-const PATTERNS = Array.from({ length: ALL + 1 }, () => []);
-for (let byte = 0; byte < 256; byte++) {
-  let bits = 0;
-  for (let rest = byte; rest; rest >>= 1) bits += rest & 1;
-  PATTERNS[bits].push(byte);
+/** PATTERNS[k]: the bytes with k + 1 bits set, ascending. @type {number[][]} */
+const PATTERNS = Array.from({ length: ALL }, () => []);
+for (let byte = 1; byte < 256; byte++) {
+  let further = -1;
+  for (let rest = byte; rest; rest >>= 1) further += rest & 1;
+  PATTERNS[further].push(byte);
 }
 
 /**
@@ -34,24 +34,14 @@ export function decodePositions(reader, rows) {
  * @param {number} depth @param {number} rows */
 function readLevels(reader, depth, rows) {
   const levels = [];
-  let siblings = Uint8Array.of(1); // by node, 0 for the only child of its parent
+  let nodes = 1;
   for (let level = depth; level > 0; level--) {
-    const nodes = siblings.length;
-    const children = new Int32Array(nodes);
-    levels.push(children);
-    if (nodes === rows) continue;
-    reader.fill(children, groupByClass(siblings, 2));
-    checkRange(children, 0, ALL - 1, "a number of children less one");
-    const next = children.reduce((sum, count) => sum + count, nodes);
-    if (next > rows) throw malformed(`${next} nodes below level ${level} of the octree, of ${rows} anchors`);
-    siblings = new Uint8Array(next);
-    let at = 0;
-    for (const count of children) {
-      if (count) siblings.fill(1, at, at + count + 1);
-      at += count + 1;
-    }
+    const further = nodes < rows ? reader.read(nodes, 0, ALL - 1, "a number of children less one") : new Int32Array(rows);
+    levels.push(further);
+    nodes = further.reduce((sum, more) => sum + more, nodes);
+    if (nodes > rows) throw malformed(`${nodes} nodes below level ${level} of the octree, of ${rows} anchors`);
   }
-  if (siblings.length !== rows) throw malformed(`${siblings.length} nodes after ${depth} levels, expected ${rows}`);
+  if (nodes !== rows) throw malformed(`${nodes} nodes after ${depth} levels, expected ${rows}`);
   return levels;
 }
 
@@ -60,13 +50,13 @@ function readLevels(reader, depth, rows) {
 function grow(reader, levels, rows) {
   let parents = [0, 1, 2].map(() => new Int32Array(rows));
   let nodes = [0, 1, 2].map(() => new Int32Array(rows));
-  for (const children of levels) {
-    const indices = new Int32Array(children.length);
-    reader.fill(indices, groupByClass(children, ALL));
+  for (const further of levels) {
+    const indices = new Int32Array(further.length);
+    reader.fill(indices, groupByClass(further, ALL));
     let made = 0;
     for (let i = 0; i < indices.length; i++) {
-      const pattern = PATTERNS[children[i] + 1][indices[i]];
-      if (pattern === undefined) throw malformed(`pattern ${indices[i]} of a node with ${children[i] + 1} children`);
+      const pattern = PATTERNS[further[i]][indices[i]];
+      if (pattern === undefined) throw malformed(`pattern ${indices[i]} of a node with ${further[i] + 1} children`);
       for (let child = 0; child < ALL; child++) {
         if (!((pattern >> child) & 1)) continue;
         for (let axis = 0; axis < 3; axis++) nodes[axis][made] = 2 * parents[axis][i] + ((child >> axis) & 1);

@@ -7,11 +7,6 @@ import { splats } from "./splats.js";
 /** @import { Header } from "../decode/header.js" */
 /** @import { Rules } from "../decode/reader.js" */
 /** @import { Tensors } from "../decode/tensors.js" */
-/** @import { CpuEvaluator } from "../render/cpu.js" */
-/** @import { Evaluated, Splats } from "../render/evaluator.js" */
-/** @import { Gpu } from "../render/gl.js" */
-/** @import { Texels } from "../render/level.js" */
-/** @import { Lister } from "../render/sort.js" */
 /** @import { Anchors } from "./scaffold.js" */
 /** @import { ExplicitGaussians } from "./splats.js" */
 
@@ -42,17 +37,8 @@ import { splats } from "./splats.js";
 
 const SCENES = [scaffold, splats];
 
-/** What draws a scene, by its name in `kind`.
- *
- * @typedef {{evaluate: (level: number, t: number, eye: number[], spare: Texels | null) => Texels}} OnCpu
- * @typedef {{scene: Scene, free: () => void, evaluate: (level: number, t: number, eye: number[], into: Splats | null,
- *   lister: Lister) => Promise<Evaluated>}} OnGpu
- * @typedef {{cpu: (scene: Scene) => OnCpu, few: (scene: Scene) => boolean,
- *   gpu?: (gpu: Gpu, scene: Scene, cpu: CpuEvaluator) => OnGpu}} Drawing
- *
- * @param {Scene} scene @returns {Drawing} gpu: missing where shaders cannot draw it
- */
-export const drawing = (scene) => /** @type {any} */ (SCENES.find(({ name }) => name === scene.kind));
+/** The kind of a scene. @param {Scene} scene */
+export const kindOf = (scene) => SCENES.find(({ name }) => name === scene.kind);
 
 /** @template {{name: string}} K @param {K[]} kinds @param {string} what @param {number[]} kind */
 function registered(kinds, what, [number]) {

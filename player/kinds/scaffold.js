@@ -1,14 +1,10 @@
 // Scene kind 0 (clause 13.2), scaffold: anchors that spawn G Gaussians each, by three networks.
 
 import { malformed } from "../decode/errors.js";
-import { texelsOf } from "../render/evaluate.js";
-import { GpuEvaluator } from "../render/evaluator.js";
 import { chainOf, checkAlike, described, describedRows, rowsOf } from "./rules.js";
 /** @import { Header } from "../decode/header.js" */
 /** @import { LayerTensors, Network, Tensors } from "../decode/tensors.js" */
-/** @import { Gpu } from "../render/gl.js" */
-/** @import { Texels } from "../render/level.js" */
-/** @import { AnchorScene, Deformation } from "./index.js" */
+/** @import { Deformation } from "./index.js" */
 
 /** D, scalars of a feature, G, Gaussians of an anchor, and V, bit i: network i of layer 0 takes the view direction.
  * @typedef {{feature: number, slots: number, views: number}} Widths */
@@ -31,9 +27,6 @@ import { chainOf, checkAlike, described, describedRows, rowsOf } from "./rules.j
 const MAX_FEATURE = 64;
 const MAX_SLOTS = 16;
 const MAX_VIEWS = 7;
-/** Up to so many anchors a machine without a GPU uses the CPU evaluator: its shaders take seconds to compile and are
- * hardly faster. */
-const SOFTWARE_ANCHORS = 30_000;
 /** Outputs of the networks opacity, covariance and color for one Gaussian. */
 const OUTPUTS = [1, 7, 3];
 
@@ -70,16 +63,4 @@ export const scaffold = {
   /** What moves the next level: the deformation of its own layer alone. @param {unknown} _below
    * @param {Deformation} own */
   moved: (_below, own) => own,
-
-  /** @param {AnchorScene} scene */
-  cpu: (scene) => ({
-    /** See `texelsOf`. @param {number} level @param {number} t @param {number[]} eye @param {Texels | null} spare */
-    evaluate: (level, t, eye, spare) => texelsOf(scene, level, t, eye, spare),
-  }),
-
-  /** Whether a GPU of software evaluates a scene more slowly than the CPU does. @param {AnchorScene} scene */
-  few: ({ anchor }) => anchor.length <= 3 * SOFTWARE_ANCHORS,
-
-  /** @param {Gpu} gpu @param {AnchorScene} scene */
-  gpu: (gpu, scene) => new GpuEvaluator(gpu, scene),
 };

@@ -1,14 +1,10 @@
 // Scene kind 1 (clause 13.7), splats: Gaussians as they are, one in each voxel.
 
 import { malformed } from "../decode/errors.js";
-import { SplatPass } from "../render/splat-pass.js";
-import { SplatEvaluator } from "../render/splats.js";
 import { checkAlike, describedRows, rowsOf } from "./rules.js";
 /** @import { Header } from "../decode/header.js" */
 /** @import { LayerTensors, Tensors } from "../decode/tensors.js" */
-/** @import { CpuEvaluator } from "../render/cpu.js" */
-/** @import { Gpu } from "../render/gl.js" */
-/** @import { SplatScene, Tracks } from "./index.js" */
+/** @import { Tracks } from "./index.js" */
 
 /**
  * What N Gaussians hold.
@@ -64,13 +60,4 @@ export const splats = {
 
   /** What moves the next level: deformations add up. @param {Tracks[] | null} below @param {Tracks} own */
   moved: (below, own) => [...(below ?? []), own],
-
-  /** @param {SplatScene} scene */
-  cpu: (scene) => new SplatEvaluator(scene),
-
-  /** Whether a GPU of software evaluates a scene more slowly than the CPU does. */
-  few: () => true,
-
-  /** @param {Gpu} gpu @param {SplatScene} scene @param {CpuEvaluator} cpu */
-  gpu: (gpu, scene, cpu) => new SplatPass(gpu, scene, cpu),
 };

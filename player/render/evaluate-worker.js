@@ -1,6 +1,6 @@
 // The worker of the evaluator without a GPU.
 
-import { drawing } from "../kinds/index.js";
+import { drawing } from "../kinds/drawing.js";
 import { packed } from "./ext-splats.js";
 import { serve } from "./remote.js";
 /** @import { Scene } from "../kinds/index.js" */

@@ -1,6 +1,6 @@
 // A player on a canvas. It loads, evaluates, sorts and draws, each step only when its inputs have changed.
 
-import { drawing } from "../kinds/index.js";
+import { drawing } from "../kinds/drawing.js";
 import { centreOf, defaultCamera, fitted } from "./camera.js";
 import { CpuEvaluator } from "./cpu.js";
 import { SPLAT_BLOCKS } from "./evaluator.js";
@@ -92,7 +92,7 @@ export class Player extends Clip {
     this._gpu = null;
     /** @type {Painter | null} */
     this._painter = null;
-    /** @type {import("../kinds/index.js").OnGpu | null} */
+    /** @type {import("../kinds/drawing.js").OnGpu | null} */
     this._evaluator = null;
     /** @type {CpuEvaluator | null} */
     this._cpu = null;
@@ -511,7 +511,7 @@ export class Player extends Clip {
     const { evaluator } = this._options;
     const kind = drawing(scene);
     if (evaluator === "cpu" || this._unfit || !gpu.floats || !kind.gpu) return true;
-    return evaluator !== "gpu" && gpu.software && kind.few(scene);
+    return evaluator !== "gpu" && gpu.software && scene.anchor.length <= 3 * kind.few;
   }
 
   /** @param {Gpu} gpu @param {State} state @param {Splats | null} into what may be overwritten

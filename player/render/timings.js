@@ -4,7 +4,7 @@
 import { readFileSync } from "node:fs";
 
 import { decode } from "../decode/index.js";
-import { drawing } from "../kinds/index.js";
+import { drawing } from "../kinds/drawing.js";
 import { COMPONENTS } from "../kinds/rules.js";
 import { centreOf, defaultCamera } from "./camera.js";
 import { packed } from "./ext-splats.js";

@@ -127,7 +127,7 @@ CASES = [
     (2, "export SCENE -o a.PLY --to spz", "-o a.PLY ends in .ply, but --to is spz"),
     (2, "export SCENE -o a.pt --to ply", "-o a.pt ends in .pt, but --to is ply"),
     (2, "export SCENE -o frames.spz --to ply-seq", "-o frames.spz ends in .spz, but --to is ply-seq"),
-    (2, "export SCENE -o frames", "found -o frames, expected a name that ends in .ply, .spz, .glb or .4dgs, or --to"),
+    (2, "export SCENE -o frames", "found -o frames, expected a name that ends in .ply, .spz, "),
     *((2, f"decode s.pd4 --max-bytes {text}", "such as 50k or 1.5MB") for text in ("0", "5kb", "1kBB", "B", "2KiB")),
     (1, "view empty --no-browser", "empty: found no .pd4 file in this folder"),
     (1, "view . --no-browser", "cut.pd4: "),

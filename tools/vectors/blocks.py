@@ -242,16 +242,13 @@ def octree(cells: np.ndarray) -> tuple[bytes, list[np.ndarray]]:
     codes = [morton(cell) for cell in (cells - low).tolist()]
     patterns = {k: [byte for byte in range(256) if byte.bit_count() == k] for k in range(1, 9)}
     out, channels = zigzag(*low.tolist()) + bytes([depth]), list[list[int]]()
-    only, indices = {0: False}, list[list[int]]()
+    indices = list[list[int]]()
     for level in range(depth - 1, -1, -1):
         children = dict[int, list[int]]()
         for node in sorted({code >> 3 * level for code in codes}):
             children.setdefault(node >> 3, []).append(node & 7)
         if len(children) < len(codes):
-            channels += [
-                [len(children[node]) - 1 for node in children if only[node] == alone] for alone in (True, False)
-            ]
-        only = {8 * node + c: len(own) == 1 for node, own in children.items() for c in own}
+            channels.append([len(own) - 1 for own in children.values()])
         for k, alike in patterns.items():
             indices.append([alike.index(sum(1 << c for c in own)) for own in children.values() if len(own) == k])
     return out, [np.array(channel, np.int64) for channel in channels + indices]

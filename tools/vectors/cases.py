@@ -366,7 +366,7 @@ def symbols_at_limit(over: int = 0, count: int = 0, graded: bool = False) -> Fil
 
 def rows_at_limit(over: int = 0) -> File:
     """As many anchors as clause 6.5 allows a payload of 600 bytes, or `over` more."""
-    layer = make_layer(0, line((1 << 13) + 2 * 600 + over))
+    layer = make_layer(0, line((1 << 13) + 2 * 600 + over), choose=lambda piece, number, k: Prior(k[0]))
     size = len(pack(layer.parameters())) + 600 - len(layer.payload())
     return make_file(layer).with_chunk(0, payload=layer.padded(size))
 

@@ -8,13 +8,12 @@ similar colour attracts each (iterative closest points: Besl and McKay, A method
 Large surfaces slide along themselves in such matches, so the term ends early. `opening` finds steady motion better.
 
 If most of what the views show is elsewhere in level 0, bodies would fade before their motion is learnt. Points then
-guide the run: matching is stronger and longer, pictures of levels 1 and 2 train motion alone at first, and level 0 is
+guide the run: matching is stronger, pictures of levels 1 and 2 train motion alone at first, and level 0 is
 trained near the key instant alone. Where much stands still, it would learn too little from so few pictures.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -26,24 +25,16 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 
 from pd4dgs_codec.data.view import View
 from pd4dgs_codec.train import phases, workers
-from pd4dgs_codec.train.phases.levels import images, other_views
+from pd4dgs_codec.train.phases.levels import MIN_VIEWS, images, other_views
+from pd4dgs_codec.train.schedule import OPENING_SHARE
 from pd4dgs_codec.train.state import TrainState
 from pd4dgs_codec.train.stereo import LEAST_FOUND, pixel_rays
 
-
-class Strength(NamedTuple):
-    """weight: of the loss term at the start of a run; it falls to 0 at the share `until` of the run. instants: that a
-    step matches, each with `sample` points of the key instant. reach: the largest distance of a match that attracts."""
-
-    weight: float
-    until: float
-    instants: int
-    sample: int
-    reach: float
-
-
-#: True: if points guide the run (`TrainState.guided`). Otherwise other bodies may be nearer than the right one.
-STRENGTH = {False: Strength(0.4, 0.35, 1, 600, 0.8), True: Strength(2.0, 0.5, 8, 150, math.inf)}
+#: Weights of the loss term at the start of a run, by whether points guide it (`TrainState.guided`). They fall to 0 at
+#: OPENING_SHARE of the run.
+WEIGHT = {False: 0.4, True: 2.0}
+#: Instants that a step matches with the key instant, and points of the key instant for each.
+INSTANTS, SAMPLE = 4, 150
 #: Training views that are searched at most; more views are searched in groups of three, evenly spread.
 MOST_VIEWS = 240
 #: Pixels of a view that are searched, at random, and depths on the ray of each.
@@ -55,8 +46,6 @@ MOVED, CONSISTENT, AMBIGUOUS = 0.12, 0.16, 0.3
 #: Most of what the views show is elsewhere in level 0 if such pixels are at least this share of those that differ from
 #: the background: a body that has moved away changes the pixels that it had and those that it has.
 ELSEWHERE = 1.0
-#: Points of the key instant are those of KEY_VIEWS views around it.
-KEY_VIEWS = 5
 #: A match has the least distance, to which a difference in colour adds COLOUR_WEIGHT times. It attracts if the colours
 #: differ by at most SAME_COLOUR. Distances are in units of the deformation, colour differences are means over RGB.
 COLOUR_WEIGHT, SAME_COLOUR = 4.0, 0.1
@@ -105,8 +94,7 @@ class Match(phases.Phase):
 
     def weight(self, state: TrainState) -> float:
         """The weight of `term` at this step."""
-        strength = STRENGTH[state.guided]
-        return strength.weight * max(0.0, 1 - state.schedule.progress(state.position) / strength.until)
+        return WEIGHT[state.guided] * max(0.0, 1 - state.schedule.progress(state.position) / OPENING_SHARE)
 
     def term(self, state: TrainState, level: int) -> Tensor | None:
         """The mean `attraction` of points of the key instant that `level` moves to other instants; None if there are no
@@ -118,10 +106,10 @@ class Match(phases.Phase):
             return None
         if self._here is None:
             nearest = sorted(self._instants, key=lambda points: abs(float(points.time[0]) - key))
-            self._here = Points.joined(nearest[:KEY_VIEWS])
-        strength, pulls = STRENGTH[state.guided], []
-        for k in torch.randint(len(self._instants), (strength.instants,), generator=generator).tolist():
-            drawn = torch.randint(len(self._here.time), (strength.sample,), generator=generator)
+            self._here = Points.joined(nearest[:MIN_VIEWS])
+        pulls = []
+        for k in torch.randint(len(self._instants), (INSTANTS,), generator=generator).tolist():
+            drawn = torch.randint(len(self._here.time), (SAMPLE,), generator=generator)
             pulls.append(attraction(state, level, self._here.at(drawn), self._instants[k]))
         return torch.stack(pulls).mean()
 
@@ -149,8 +137,7 @@ def attraction(state: TrainState, level: int, here: Points, there: Points) -> Te
         match = (torch.cdist(moved, place) + COLOUR_WEIGHT * contrast).argmin(1)
         alike = contrast.gather(1, match[:, None])[:, 0] <= SAME_COLOUR
     distance = (moved - place[match]).norm(dim=1)
-    near = distance.detach() <= STRENGTH[state.guided].reach
-    found: Tensor = (distance * (alike & near)).mean()
+    found: Tensor = (distance * alike).mean()
     return found
 
 

@@ -27,7 +27,7 @@ from pd4dgs_codec.train.phases.prune import added_error, relative_error
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
 #: Training views in which the error of a step is measured.
-VIEWS = 16
+VIEWS = 8
 #: Halvings of the interval in which the threshold of the classes is searched.
 HALVINGS = 40
 
