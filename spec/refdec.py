@@ -7,7 +7,7 @@ prints the hashes of clause 12.4 as JSON. BASE is the base of FILE (5.6), if it 
 what`, and exit code 1. Above the functions stand the clauses they follow, in the specification's words. It is meant to
 be read, not to be fast. One file, so that it can be carried alone. It yields tensors and knows no kinds (clause 13).
 """
-# ruff: noqa: B905  (lengths agree by construction; strict= would only lengthen the lines)
+# ruff: noqa: B905, B020  (lengths agree by construction; loops fill self.steps)
 
 import hashlib
 import json
@@ -17,12 +17,12 @@ import struct
 import sys
 import zlib
 from bisect import bisect_right
+from pathlib import Path
 
 SIGNATURE = bytes.fromhex("89504434 0D0A1A0A")
 K = 1 << 24  # clause 14: coded symbols
 MAX_SYMBOL = 1 << 23  # clause 14: symbols of rows, plane samples, weights and biases
 MAX_VOXEL = 1 << 20
-MAX_COUNT = 1 << 26
 MAX_LENGTH = (1 << 31) - 1
 VARINT_MAX = (1 << 35) - 1  # clause 7.1: five bytes of seven bits
 TOTAL = 1 << 24
@@ -218,19 +218,18 @@ def read_preamble(data):
 
 
 # 5.1 Header map: "The time at 1 MUST NOT precede the time at 0, the background MUST lie in 0..1"
-# 5.5 Digest: "The first 16 bytes of the SHA-256 of the payloads of all critical chunks that were encoded together"
 def read_header(data):
     header = fields(unpack(data), range(1, 16), (1, 2, 3, 4, *range(6, 13), 14), "header")
     read_chunk_list(header[1], registered(header[2], "the coding mode"))
     read_kind(header[3])
     read_scalars(header)
     a_step(header[6])
-    box, (start, end) = reals(header[7], 6, "the box"), reals(header[8], 2, "the times")
-    need(all(a <= b for a, b in zip(box[:3], box[3:])), "a lower corner of the box above the upper one")
-    need(start <= end, f"time range {start}..{end}, expected it to ascend")
-    reals(header[9], 3, "the background", 0, 1)
-    near, far = reals(header[10], 2, "near and far", 0)
+    x0, y0, z0, x1, y1, z1 = reals(header[7], 6, "the box")
+    (start, end), (near, far) = reals(header[8], 2, "the times"), reals(header[10], 2, "near and far", 0)
+    for low, high in ((x0, x1), (y0, y1), (z0, z1), (start, end)):
+        need(low <= high, f"the box or the times: {low} above {high}")
     need(near < far, f"near {near} and far {far}, expected near < far")
+    reals(header[9], 3, "the background", 0, 1)
     reals(header[11], 3, "up")
     reals([header[12]], 1, "the unit", 0)
     if 13 in header:
@@ -266,15 +265,26 @@ def read_kind(value):
     integers(a_list(value, "a kind", 1, 16), 65535, "a number of a kind")
 
 
+# 5.4 Rows: "ids ascend strictly"
+# 6.3 Grids and chains: "Ids of grids ascend strictly, and so do those of chains."
+def table(tensors, what, *lengths):
+    """Yields the tensors, lists of these lengths that begin with an id."""
+    last = -1
+    for tensor in tensors:
+        identity = limited(a_list(tensor, what, *lengths)[0], 255, "an id")
+        need(identity > last, f"id {identity} after {last}, expected ascending ids")
+        last = identity
+        yield tensor
+
+
 # 5.4 Rows: "Each tensor is [id, C, Q, p] with an id 0..255, C = 1..256 channels, a step Q and a predictor p"
 # 6.2 Layer parameters: "tensors that only this layer has, with the rules and limits of 5.4 but no centres"
 def read_rows(value, form):
     """[(name, channels, step, predictor)] and the number of all channels."""
-    result, last = [], -1
-    for tensor in a_list(value, "the rows", 1, 32):
-        last = read_id(a_list(tensor, "a tensor of rows", 4), last)
+    result = []
+    for tensor in table(a_list(value, "the rows", 1, 32), "a tensor of rows", 4):
         channels = limited(tensor[1], 256, "the number of channels", 1)
-        result.append((f"{form}.{last}", channels, a_step(tensor[2]), registered(tensor[3], "a predictor", 3)))
+        result.append((f"{form}.{tensor[0]}", channels, a_step(tensor[2]), registered(tensor[3], "a predictor", 3)))
     return result, limited(sum(row[1] for row in result), 512, "the number of channels of all rows")
 
 
@@ -284,14 +294,6 @@ def read_scalars(header):
     header["graded"] = 5 in header
     header["centres"] = a_list(header.get(5, [0] * width), "the centres", width)
     integers(header["centres"], MAX_SYMBOL, "a centre", -MAX_SYMBOL)
-
-
-# 5.4 Rows: "ids ascend strictly"
-# 6.2 Layer parameters: "with the rules and limits of 5.4 but no centres"
-# 6.3 Grids and chains: "Ids of grids ascend strictly, and so do those of chains."
-def read_id(tensor, last):
-    need(limited(tensor[0], 255, "an id") > last, f"id {tensor[0]} after {last}, expected ascending ids")
-    return tensor[0]
 
 
 # 5.3 Camera map: "fx and fy MUST be positive" "All four are required."
@@ -360,12 +362,9 @@ class Layer:
             integers(a_list(parameters[3], "the fill", 3), 255, "a colour of the fill")
         bare = self.later or (self.number == 0 and 15 in self.header)
         need(not (bare and {4, 5, 6, 7} & set(parameters)), "tables or a kind in a later slice, or over a base")
-        if 4 in parameters:
-            self.read_grids(parameters[4])
-        if 5 in parameters:
-            self.read_chains(parameters[5])
-        if 6 in parameters:
-            read_kind(parameters[6])
+        for key, read in ((4, self.read_grids), (5, self.read_chains), (6, read_kind)):
+            if key in parameters:
+                read(parameters[key])
         if 7 in parameters:
             self.layer_rows = read_rows(parameters[7], "layerrow")
         return length
@@ -373,31 +372,28 @@ class Layer:
     # 6.3 Grids and chains: "one plane for each pair (i, j), i < j, in lexicographic order" "its columns follow side i"
     def read_grids(self, value):
         step, *grids = a_list(value, "the grids", 2, 17)
-        self.steps["plane"], last = a_step(step), -1
-        for grid in grids:
-            last = read_id(a_list(grid, "a grid", 4), last)
+        for grid in table(grids, "a grid", 4):
             limited(grid[1], 256, "the number of channels", 1)
             sides = integers(a_list(grid[2], "the sides", 1, 4), 4096, "a side", 1)
             shapes = [(h, w) for i, w in enumerate(sides) for h in sides[i + 1 :]] or [(1, sides[0])]
             for i, predictor in enumerate(a_list(grid[3], "the predictors", len(shapes))):
                 registered(predictor, "a predictor")
-                self.planes.append((f"plane.{last}.{i}", predictor, (grid[1], *shapes[i])))
+                self.planes.append((f"plane.{grid[0]}.{i}", predictor, (grid[1], *shapes[i]), a_step(step)))
 
     # 6.3 Grids and chains: "Linear layer i, 1..m, has a weight [o_i, o_{i−1}] and a bias [o_i]."
     def read_chains(self, value):
         step, *chains = a_list(value, "the chains", 2, 65)
-        self.steps["weight"], last = a_step(step), -1
-        for chain in chains:
-            last = read_id(a_list(chain, "a chain", 3, 18), last)
+        for chain in table(chains, "a chain", 3, 18):
             widths = integers(chain[1:], 4096, "a width", 1)
             for i, (inputs, outputs) in enumerate(zip(widths, widths[1:])):
-                self.weights += [(f"weight.{last}.{i}", outputs * inputs), (f"bias.{last}.{i}", outputs)]
+                sizes = {f"weight.{chain[0]}.{i}": outputs * inputs, f"bias.{chain[0]}.{i}": outputs}
+                self.weights += [(name, size, a_step(step)) for name, size in sizes.items()]
 
     # 6.5 Declared sizes: "c MUST NOT exceed 2^28, N MUST NOT exceed 2^13 + 2·B, and S MUST NOT exceed 2^22 + 256·B."
     def check_sizes(self, payload_bytes, before):
-        samples = sum(c * h * w for _, _, (c, h, w) in self.planes)
+        samples = sum(c * h * w for _, _, (c, h, w), _ in self.planes)
         need(samples <= 1 << 28, f"{samples} plane samples, limit 2^28", "LimitExceeded")
-        samples_and_weights = samples + sum(size for _, size in self.weights)
+        samples_and_weights = samples + sum(size for _, size, _ in self.weights)
         row, e = len(self.header["centres"]) + 4 + self.header["graded"], len(self.earlier)
         count = e + row * self.rows + self.layer_rows[1] * (e + self.rows) + samples_and_weights
         self.declared = [a + b for a, b in zip(before, (self.rows, count, payload_bytes))]
@@ -407,7 +403,6 @@ class Layer:
 
     # 6.4 Channels: "In mode ans a slice codes the channels in this order:"
     # 8.5 Rows by step class: "the base's rows come first, by class, then all others"
-    # 11.2 Rows: "A step class MUST lie in 0..6, else Malformed."
     def decode_ans(self, codes, stream):
         """The voxels and the channels of items 2 to 8, none split."""
         n, graded = self.rows, self.header["graded"]
@@ -419,18 +414,18 @@ class Layer:
         groups = [c + 7 * (row >= base_rows) for row, c in enumerate(self.earlier + classes)]
         for rows, width in ((classes, len(self.header["centres"])), (groups, self.layer_rows[1])):
             channels += [coder.split(rows, 14) for _ in range(width)]
-        channels += coder.decode_grids([shape for _, _, shape in self.planes])
-        channels += [coder.channel(size) for _, size in self.weights]
+        channels += coder.decode_grids([shape for _, _, shape, _ in self.planes])
+        channels += [coder.channel(size) for _, size, _ in self.weights]
         coder.stream.finish()
         return cells, channels
 
     # 9.1 Channels and codes: "the symbol is base + v, which MUST lie in −K..K (8.2), else Malformed"
-    # 11.2 Rows: "A step class MUST lie in 0..6, else Malformed."
     def decode_lzma(self, codes, stream):
         """As decode_ans."""
         n, e, graded = self.rows, len(self.earlier), self.header["graded"]
         counts = [n, n, n, e] + [n] * (1 + graded + len(self.header["centres"])) + [e + n] * self.layer_rows[1]
-        counts += [h * w for _, _, (c, h, w) in self.planes for _ in range(c)] + [size for _, size in self.weights]
+        counts += [h * w for _, _, (c, h, w), _ in self.planes for _ in range(c)]
+        counts += [size for _, size, _ in self.weights]
         heads = [(codes.varint(8 * K + 3) if count else 0, count) for count in counts]
         need(all(code & 3 < 3 for code, _ in heads), "a channel of 8-byte symbols")
         size = sum(count << (code & 3) for code, count in heads)
@@ -440,7 +435,6 @@ class Layer:
             ranged(take_numbers(reader, count, code & 3, unzigzag(code >> 2)), -K, K, "a symbol")
             for code, count in heads
         ]
-        ranged(channels[5] if graded else [], 0, 6, "a step class")
         return voxels_in_order(zip(*channels[:3])), channels[3:]
 
     # 11.1 Masks: "Layer ℓ codes a rise 0..255 for each earlier row and a code 3..255 for each own row."
@@ -448,30 +442,28 @@ class Layer:
     # 11.2 Rows: "Symbols of rows and layer rows, plane samples (11.3), weights and biases MUST lie in −2^23..2^23"
     def name_channels(self, channels):
         """The symbols: of rows their v (11.2), of planes their samples (11.3)."""
-        ranges = (("rise", 0, 255 if self.number else 1), ("own", 3, 255))
+        ranges = (("rise", 0, 255 if self.number else 1), ("own", 3, 255), ("class", 0, 6))[: 2 + self.header["graded"]]
         self.symbols = {name: [ranged(next(channels), low, high, name)] for name, low, high in ranges}
-        if self.header["graded"]:
-            self.symbols["class"] = [next(channels)]
         centres = iter(self.header["centres"])
         for tables, classes in ((self.header["rows"], self.classes), (self.layer_rows[0], self.earlier + self.classes)):
             for name, width, self.steps[name], predictor in tables:
                 self.symbols[name] = [
                     row_values(next(channels), classes, next(centres, 0), predictor) for _ in range(width)
                 ]
-        for name, predictor, (c, _, w) in self.planes:
+        for name, predictor, (c, _, w), self.steps[name] in self.planes:
             self.symbols[name] = [restore(next(channels), predictor, w) for _ in range(c)]
-        self.symbols |= {name: [next(channels)] for name, _ in self.weights}
+        for name, _, self.steps[name] in self.weights:
+            self.symbols[name] = [next(channels)]
         for name, *_ in self.planes + self.weights:
             ranged((k for channel in self.symbols[name] for k in channel), -MAX_SYMBOL, MAX_SYMBOL, "a symbol")
 
     # 11.5 Dequantisation: "An anchor's position is dequantised from its voxel index with the voxel size as Q."
     def dequantise(self):
         self.tensors = {"position": dequantise([v for cell in self.cells for v in cell], self.header[6])}
-        for name, *_ in self.header["rows"] + self.layer_rows[0]:  # [C, n] -> [n, C]
-            self.tensors[name] = dequantise([v for row in zip(*self.symbols[name]) for v in row], self.steps[name])
-        for name, *_ in self.planes + self.weights:
-            step = self.steps["plane" if name.startswith("plane") else "weight"]
-            self.tensors[name] = dequantise([k for channel in self.symbols[name] for k in channel], step)
+        rows = {name for name, *_ in self.header["rows"] + self.layer_rows[0]}
+        for name, step in self.steps.items():
+            channels = zip(*self.symbols[name]) if name in rows else self.symbols[name]  # [C, n] -> [n, C]
+            self.tensors[name] = dequantise([v for channel in channels for v in channel], step)
 
     # 12.2 Prefixes: "sorted by the Morton code (10.1) of the voxel index less the minimum over these rows"
     def add_slice(self, part):
@@ -511,8 +503,7 @@ def restore(residuals, predictor, w):
 
 
 # 7.3 NormTable: "T[257] = T[256] = 2^27 M[j] = round(2^(31 − j/64)) for j = 0..63"
-T = [round(2**27 * math.erf(i / (32 * math.sqrt(2)))) for i in range(257)]
-T.append(T[-1])
+T = [round(2**27 * math.erf(min(i, 256) / (32 * math.sqrt(2)))) for i in range(258)]
 M = [round(2 ** (31 - j / 64)) for j in range(64)]
 
 
@@ -615,16 +606,15 @@ class Coder:
 
     # 8 Coded channels: "Channels of length 0 leave no trace."
     # 8.1 Tokens: "the prior F − 8 places before the last one of the prior list"
-    # 8.2 Priors: "The entries of all windows of the prior list, n each, MUST NOT exceed S (6.5) plus 2^18"
+    # 8.2 Priors: "The entries of all windows of the prior list, n each, MUST NOT exceed the S of the slice (6.5)"
     # 8.4 Symbols: "The symbol is kmin + s. Exceptions are then put in their places."
     def channel(self, count):
         if count == 0:
             return []
-        token = self.codes.varint(2 * (MAX_COUNT + 8))
+        token = self.codes.varint(2 * ((1 << 26) + 8))
         if token >> 1 < 8:
             self.priors.append(read_prior(self.codes, token >> 1))
-            entries = sum(n for _, n, _ in self.priors)
-            need(entries <= self.most_entries, f"{entries} entries of windows", "LimitExceeded")
+            need(sum(n for _, n, _ in self.priors) <= self.most_entries, "too many entries", "LimitExceeded")
         back = max(token >> 1, 8) - 8
         need(back < len(self.priors), "a channel reuses a prior before the first")
         kmin, n, cum = self.priors[-1 - back]
@@ -661,7 +651,6 @@ class Coder:
         return cells
 
     # 10.2 Octree: "From a level of n nodes on, every node has one child, which is not coded."
-    # 10.2 Octree: "The symbol is an index into the ascending list of the bytes in which as many bits are 1"
     def grow(self, depth, count):
         """The relative indices (x, y, z) of the anchors, in Morton order."""
         levels, size = [], 1
@@ -749,8 +738,8 @@ def unpack_lzma(data, size):
         out = decoder.decompress(data, max_length=size + 1)
     except lzma.LZMAError as error:
         raise Fault("Malformed", f"LZMA: {error}") from None
-    need(len(out) == size, f"an LZMA stream of {len(out)} bytes or more, expected {size}")
-    need(decoder.eof and not decoder.unused_data, "an LZMA stream does not end where the payload does")
+    ends = decoder.eof and not decoder.unused_data
+    need(ends and len(out) == size, f"an LZMA stream of {len(out)} bytes or more, expected {size} and the end")
     return out
 
 
@@ -851,11 +840,8 @@ def main(arguments):
     if len(arguments) not in (1, 2):
         return "usage: refdec.py FILE [BASE]"
     try:
-        files = []
-        for path in arguments:
-            with open(path, "rb") as stream:
-                files.append(stream.read())
-        print(json.dumps(hashes(files[0], base=files[1] if files[1:] else None)))
+        file, base = [*(Path(path).read_bytes() for path in arguments), None][:2]
+        print(json.dumps(hashes(file, base=base)))
     except (Fault, OSError) as error:
         return f"refdec: {arguments[0]}: {error}"
 

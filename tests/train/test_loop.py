@@ -18,7 +18,6 @@ from pd4dgs_codec.model.model import to_scene
 from pd4dgs_codec.train import loop, phases
 from pd4dgs_codec.train.config import ABLATIONS, TrainConfig
 from pd4dgs_codec.train.loop import RecordLog, Trainer
-from pd4dgs_codec.train.phases import opening
 from pd4dgs_codec.train.phases.prune import Prune
 from pd4dgs_codec.train.schedule import PRUNING_ROUNDS, Schedule
 
@@ -95,7 +94,6 @@ def timed(dataset, monkeypatch, clock, machine, limit: float = LIMIT) -> Trainer
     """A timed run whose steps and evaluations take the clock's time, and which is never too short to prune."""
     monkeypatch.setattr(loop, "TIMED_STEPS", 6)
     monkeypatch.setattr(phases, "MIN_ITERATIONS", 0)
-    monkeypatch.setattr(opening, "MIN_TRIAL", 6)
     trainer = trainer_of(dataset, None, max_seconds=limit)
     step, level_psnr, begun = trainer.learner.step, trainer.learner.level_psnr, clock.now
 

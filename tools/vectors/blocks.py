@@ -1,6 +1,7 @@
 """Writes `.pd4` structures from explicit choices, right or wrong.
 
-This is written from the specification and shares no code with the package, so that a misreading of either is found.
+This is written from the specification and shares no code with the package but the library that packs msgpack, so that
+a misreading of either is found.
 Nothing here searches, fits or rounds: the caller names every prior, predictor and field, or it follows from the symbols
 by a rule on integers, so the bytes are the same on every machine. Lengths, scene ids and CRCs are right unless the
 caller asks for others.
@@ -18,6 +19,7 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import Any
 
+import msgpack
 import numpy as np
 
 from . import lzma2
@@ -69,33 +71,9 @@ def words(*values: int) -> bytes:
 
 
 def pack(value: Any) -> bytes:
-    """Canonical msgpack (clause 4). struct.error for a number that has no form."""
-    if isinstance(value, bool):
-        return b"\xc3" if value else b"\xc2"
-    if isinstance(value, float):
-        return b"\xca" + struct.pack(">f", value)
-    if isinstance(value, int):
-        if -32 <= value < 128:
-            return bytes([value & 255])
-        wide = max(0, math.ceil(math.log2((value if value >= 0 else -2 * value - 1).bit_length() / 8)))
-        return bytes([(0xCC if value > 0 else 0xD0) + wide]) + struct.pack(
-            ">" + ("BHIQ" if value > 0 else "bhiq")[wide], value
-        )
-    if isinstance(value, str):
-        return _head(len(value.encode()), 0xA0, 32, 0xD9) + value.encode()
-    if isinstance(value, bytes):
-        return _head(len(value), 0, 0, 0xC4) + value
-    if isinstance(value, dict):
-        return _head(len(value), 0x80, 16, 0xDD) + b"".join(pack(x) for pair in value.items() for x in pair)
-    return _head(len(value), 0x90, 16, 0xDB) + b"".join(map(pack, value))
-
-
-def _head(size: int, fix: int, below: int, code: int) -> bytes:
-    """code: of the form with a u8, which lists and maps do not have: they are below 16 or take a u16."""
-    if size < below:
-        return bytes([fix | size])
-    wide = (size > 0xFF or below == 16) + (size > 0xFFFF)
-    return bytes([code + wide]) + struct.pack(">" + "BHI"[wide], size)
+    """Canonical msgpack (clause 4), if the keys of maps ascend. ValueError for a number that has no form."""
+    data: bytes = msgpack.packb(value, use_single_float=True)
+    return data
 
 
 def pattern(*shape: int, low: int = -3, high: int = 3, seed: int = 0) -> np.ndarray:
