@@ -325,7 +325,7 @@ def _initial_points(
 
 
 @lru_cache(maxsize=4)
-def _dataset(take: Take, later: bool) -> Dataset:
+def _dataset(take: Take, later: bool = False) -> Dataset:  # `later`: as LATER, of views that differ by it
     stage, lens, scene = take.stage, take.lens, take.bodies()
     times = take.times
     moments = [take.clock(time) for time in times]

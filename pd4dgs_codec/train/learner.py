@@ -20,6 +20,7 @@ from pd4dgs_codec.train import workers
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.losses import ModelLoss
 from pd4dgs_codec.train.phases import Phase
+from pd4dgs_codec.train.phases.follow import Follow
 from pd4dgs_codec.train.phases.grow import Grow
 from pd4dgs_codec.train.phases.levels import SelectLevels
 from pd4dgs_codec.train.phases.matching import Match
@@ -62,6 +63,7 @@ class Learner(TrainState):
         self.before_practice: Callable[[int, int], None] = lambda done, steps: None
         pruning = (Prune(turn) for turn in range(PRUNING_ROUNDS))
         self.before_step: list[Phase] = [
+            Follow(),
             OpenTime(self.practise),
             self.match,
             self.levels,

@@ -17,8 +17,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
+from pd4dgs_codec.data.view import View
 from pd4dgs_codec.train.phases.levels import MIN_VIEWS, other_views
-from pd4dgs_codec.train.phases.opening import NEAR_SHARE, window, within
+from pd4dgs_codec.train.phases.opening import window, within
+from pd4dgs_codec.train.schedule import NEAR_SHARE
 from pd4dgs_codec.train.ssim import REACH
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
@@ -119,14 +121,22 @@ def near_key(state: TrainState, among: list[int]) -> list[int]:
     return nearest[: min(max(MIN_VIEWS, round(len(among) * NEAR_SHARE)), MOST_NEAR)]
 
 
+def _is_near(state: TrainState, view: View) -> bool:
+    """Whether a view is as near to the key instant as those of `near_key`."""
+    key, farthest = state.key or 0.0, near_key(state, other_views(state))[-1]
+    return abs(view.time - key) <= abs(state.views.views[farthest].time - key)
+
+
 def without_motion(state: TrainState, shown: TrainingView, image: Tensor) -> TrainingView:
     """The view with the pixel weights that train level 0, of which `image` [H, W, 3] is its picture. In a scene with a
-    key instant, pixels that motion has changed have weight 0. In scenes of little else (`TrainState.guided`) those
-    around them have, too, whose SSIM depends on them: otherwise the faint edge of a body that has moved away would be
-    erased, then the next edge, until the body is gone."""
+    key instant, pixels that motion has changed have weight 0, but views near it count whole: a body that level 0 lacks
+    there could never return. In scenes of little else (`TrainState.guided`) the pixels around them have weight 0, too,
+    since their SSIM depends on them: otherwise the faint edge of a body that has moved away would be erased, then the
+    next edge, until the body is gone."""
     if state.config.still:
         return at_rest(shown, image) if state.schedule.opening(state.position) >= 1 else shown
-    if state.key is None or state.practising or state.position < state.schedule.coarse_end:
+    whole = state.key is None or state.practising or state.position < state.schedule.coarse_end
+    if whole or _is_near(state, shown.view):
         return shown
     change = (image.detach() - shown.image).abs().amax(-1)
     if state.guided:

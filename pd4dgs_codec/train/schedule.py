@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 
+#: The views near the key instant: a share of all, and of the longest time from the key instant, which is the window of
+#: `phases.opening` at first. Its trial has twice this window.
+NEAR_SHARE = 1 / 12
 #: Share of a run in which level 0 alone is trained, at first and before it is compared with higher levels.
 COARSE_SHARE = 1 / 10
 #: Share of a run with a key instant after which views of all times train motion, see `phases.opening`.

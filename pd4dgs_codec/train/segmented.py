@@ -219,9 +219,9 @@ def base_config(config: TrainConfig) -> TrainConfig:
 
 
 def train_part(part: Part, dataset: Dataset, progress: Progress | None) -> dict[str, Any]:
-    """Trains a part of a dataset from its checkpoint on, if there is one, and writes its file, or nothing if a signal
-    or the time limit ended it early. Returns numbers: steps done, whether `finished` and `interrupted`, psnr in dB by
-    level. Raises DataError and TrainError."""
+    """Trains a part of a dataset from its checkpoint on, if there is one, to its end or its time limit, and writes its
+    file, unless a signal ended it early. Returns numbers: steps done, whether `finished` and `interrupted`, psnr in dB
+    by level. Raises DataError and TrainError."""
     own, base, start = part_of(dataset, part.times), None, None
     if part.base is not None:
         data = part.base.read_bytes()

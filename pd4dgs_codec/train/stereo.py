@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -30,6 +31,8 @@ DEPTHS, NEAREST = 100, 0.2
 NEIGHBOURS, AGREE, LEAST_BASE = 4, 2, 0.05
 #: A depth is taken if its correlation is ALIKE, and CLEAR above that of depths a patch or more away.
 ALIKE, CLEAR = 0.8, 0.05
+#: Depths on a ray within the box. A pixel's colour tells its depth if a share of at most AMBIGUOUS of them agrees.
+DEPTH_STEPS, AMBIGUOUS = 64, 0.3
 #: Points are used if at least so many of the searched pixels have one, here and in `phases.matching`: otherwise the
 #: cameras are too near to each other, or move too little between views, for depths to be trusted.
 LEAST_FOUND = 1 / 6
@@ -58,6 +61,26 @@ def pixel_rays(rotation: Tensor, K: Tensor, rows: Tensor, columns: Tensor) -> Te
     """[..., 3]: the rays of pixels, in world axes, of depth 1. rotation: [3, 3], world to camera. K: [3, 3]."""
     x, y = (columns + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1]
     return torch.stack([x, y, torch.ones_like(x)], -1) @ rotation
+
+
+class Rays(NamedTuple):
+    """Rays of n pixels, cut by a box. eye: [3]. places: [n, DEPTH_STEPS, 3], world, at depths that are evenly
+    spread. inside: bool [n], whether the ray meets the box."""
+
+    eye: Tensor
+    places: Tensor
+    inside: Tensor
+
+
+def rays_of(view: View, pixels: Tensor, low: Tensor, high: Tensor, near: float) -> Rays:
+    """The rays of `pixels` (int64 [n, 2], row and column), beyond the depth `near` and in the box `low` to `high`."""
+    viewmat, K = (torch.from_numpy(np.array(matrix, np.float32)) for matrix in (view.viewmat, view.K))
+    eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    rays = pixel_rays(viewmat[:3, :3], K, *pixels.unbind(1))
+    bounds = torch.stack([(low - eye) / rays, (high - eye) / rays])
+    first, last = bounds.amin(0).amax(1).clamp(min=near), bounds.amax(0).amin(1)
+    depths = first[:, None] + (last - first)[:, None] * ((torch.arange(DEPTH_STEPS) + 0.5) / DEPTH_STEPS)
+    return Rays(eye, eye + depths[..., None] * rays[:, None], first < last)
 
 
 class Eye:

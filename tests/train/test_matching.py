@@ -75,7 +75,7 @@ def test_few_points_are_not_trusted(monkeypatch):
 
 
 def test_views_that_show_nothing_moving_have_no_points(dataset, monkeypatch):
-    monkeypatch.setattr(matching, "MOVED", 2.0)
+    monkeypatch.setattr(matching, "ALIKE", 2.0)
     found, share = moving_points(trainer_of(dataset).learner)
     assert share == 0 and [value.shape for value in found] == [(0,), (0, 3), (0, 3)]
 

@@ -17,11 +17,9 @@ import torch
 from pd4dgs_codec.data.view import thinned
 from pd4dgs_codec.train import phases, workers
 from pd4dgs_codec.train.phases.levels import error, larger
+from pd4dgs_codec.train.schedule import NEAR_SHARE
 from pd4dgs_codec.train.state import TrainState
 
-#: The views near the key instant: a share of all, and of the longest time from the key instant, which is the window at
-#: first. The trial has twice this window.
-NEAR_SHARE = 1 / 12
 #: The planes' instants double from 3 to 17 while the window grows, at each of so many parts of it.
 DOUBLINGS = 5
 #: Share of the run for which each branch trains.
