@@ -16,8 +16,7 @@ SHORT = 0.5
 PUBLISHED_METHOD = (*ALL_VIEW, "--rollout")
 #: What a training leaves out or does instead; "full" is the method as it is.
 COMPONENTS = {
-    f"without {part}": (*PUBLISHED_METHOD, "adaptive", "--without", part)
-    for part in ("rate", "binary", "smooth", "tmc", "whitening")
+    f"without {part}": (*PUBLISHED_METHOD, "adaptive", "--without", part) for part in ("rate", "binary", "whitening")
 }
 ROLLOUTS = {f"{name} rollout": (*PUBLISHED_METHOD, name) for name in ("uniform", "fixed")}
 FULL = "full (adaptive rollout)"
@@ -36,8 +35,6 @@ TRAININGS = {
 PUBLISHED = {
     "without rate": (14.48, 7.49),
     "without binary": (14.48, 6.88),
-    "without smooth": (14.58, 6.89),
-    "without tmc": (14.52, 6.81),
     "uniform rollout": (15.01, 7.03),
     "fixed rollout": (14.94, 7.18),
     FULL: (14.54, 6.90),

@@ -29,7 +29,7 @@ from pd4dgs_codec.bench.report import drawing
 
 #: A model that is trained as a whole: the highest level in every step, nothing spent on bytes, levels or quantisation.
 MONOLITH = ("--rollout", "top", "--prune", "0", "--grading", "0")
-MONOLITH += tuple(word for part in ("rate", "tmc", "noise", "whitening") for word in ("--without", part))
+MONOLITH += tuple(word for part in ("rate", "binary", "noise", "whitening") for word in ("--without", part))
 #: What papers report, see OFFICIAL_TEXT: method, PSNR, SSIM, MB.
 PUBLISHED: dict[str, tuple[tuple[str, float, float | None, float | None], ...]] = {
     "mutant": (

@@ -27,7 +27,7 @@ import torch
 from common import ROOT, peak_bytes
 from PIL import Image
 
-from pd4dgs_codec import decode
+from pd4dgs_codec import decode, segments
 from pd4dgs_codec.archives import read_tensors
 from pd4dgs_codec.batch.job import OPS, read_manifest
 from pd4dgs_codec.data import colmap
@@ -165,6 +165,29 @@ def equal_gaussians(count: int) -> bytes:
     return fourdgs_bytes([(0.0, Splats(*ones), np.arange(count))], 1.0)
 
 
+def sog(side: int) -> bytes:
+    """A SOG file of side x side equal Gaussians, whose images are of one colour."""
+    picture, stream = io.BytesIO(), io.BytesIO()
+    Image.new("RGBA", (side, side), (1, 2, 3, 252)).save(picture, "webp", lossless=True)
+    meta = {
+        "version": 2, "count": side**2, "means": {"mins": [0] * 3, "maxs": [1] * 3, "files": ["x", "x"]},
+        "quats": {"files": ["x"]}, **{part: {"codebook": [0] * 256, "files": ["x"]} for part in ("scales", "sh0")},
+    }  # fmt: skip
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as made:
+        made.writestr("meta.json", json.dumps(meta))
+        made.writestr("x", picture.getvalue())
+    return stream.getvalue()
+
+
+def splatv(rows: int) -> bytes:
+    """A .splatv file of equal Gaussians, 64 bytes each."""
+    camera = {"position": [0, 0, -4], "rotation": np.eye(3).tolist(), "fx": 60, "fy": 60, "width": 64, "height": 64}
+    part = {"type": "splat", "size": 64 * rows, "texwidth": 4096, "texheight": 1, "cameras": [camera]}
+    head = json.dumps([part]).encode()
+    row = np.ones(3, "<f4").tobytes() + np.ones(26, "<f2").tobytes()
+    return np.array([0x674B, len(head)], "<u4").tobytes() + head + row * rows
+
+
 def npy(head: str) -> bytes:
     """A .npy file that says what it holds, and 8 bytes."""
     head = f"{head:<117}\n"
@@ -268,6 +291,8 @@ CASES: dict[str, tuple[str, Callable[[], bytes], Callable[[Path], object]]] = {
     ),
     "Gaussians (gsplat): stride 0": ("ckpt.pt", lambda: stretched(50_000_000), read_splats),
     "Gaussians (.compressed.ply): zeros": ("x.compressed.ply", lambda: compressed_ply(MEGABYTE // 16), read_splats),
+    "Gaussians (SOG): pictures of one colour": ("x.sog", lambda: sog(220), read_splats),
+    "Gaussians (.splatv)": ("x.splatv", lambda: splatv(MEGABYTE // 64), read_teacher),
     "Gaussians (.4dgs): equal ones": ("x.4dgs", lambda: equal_gaussians(45_000), read_teacher),
     "Gaussians (.4dgs): too many equal ones": ("x.4dgs", lambda: equal_gaussians(300_000), read_teacher),
     "run of another trainer: cameras.json": (
@@ -299,6 +324,11 @@ CASES: dict[str, tuple[str, Callable[[], bytes], Callable[[Path], object]]] = {
     "mask: 16 megapixels (PNG)": ("x.png", lambda: blank_png(4096, 4096), lambda path: read_mask(path, (4096, 4096))),
     "picture: 16 megapixels in 100 scans (JPEG)": ("x.jpg", lambda: many_scans(4096), read_picture),
     "video: 30 blank frames of 2048 x 2048": ("x.mp4", lambda: blank_film(2048, 30), read_film),
+    "segments.json: empty lists": (
+        segments.INDEX,
+        lambda: b'{"segments_version": 1, "bases": [], "segments": [], "x": [' + b"[]," * (MEGABYTE // 3) + b"0]}",
+        segments.read_index,
+    ),
     "library: lists in lists": ("a/index.json", lambda: b"[" * MEGABYTE, lambda path: library(path.parent.parent)),
     "manifest: broken lines": (
         "m.jsonl",

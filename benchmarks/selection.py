@@ -1,14 +1,11 @@
-"""Which levels runs keep: the measured gain of each level, and its quality on held-out views."""
+"""Which levels runs keep, and their quality on held-out views."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 
 from common import QUICK, Benchmark, Row, Run, Scene, Training, number, table
 from quality import packed_levels
-
-from pd4dgs_codec.train.phases.levels import MIN_GAIN_2, SHARE_2, motion_gain
 
 MOTIONS, SEEDS = ("static", "global", "local", "fast"), range(5)
 #: Half of what other tiny scenes get: twenty trainings have to end.
@@ -26,38 +23,29 @@ def scenes(run: Run) -> dict[tuple[str, int], Scene]:
 
 
 def measure(run: Run, _: None) -> list[Row]:
-    """A row per training. gains: of the levels that were tested, the highest first; by level, held-out quality."""
-    rows = []
+    """A row per training: by level, held-out quality."""
+    rows: list[Row] = []
     run.train(map(Training, scenes(run).values()))
     for (motion, seed), scene in scenes(run).items():
         model, _training = run.trained(scene)
-        log = map(json.loads, model.with_suffix(".jsonl").read_text().splitlines())
         found = packed_levels(scene, model, run.folder(scene) / "scene.pd4")
-        told: Row = {"motion": motion, "seed": seed, "gains": [g for r in log for g in r.get("level_gains", [])]}
-        rows.append(told | {key: [row[key] for row in found if key in row] for key in BY_LEVEL})
+        by_level = {key: [row[key] for row in found if key in row] for key in BY_LEVEL}
+        rows.append({"motion": motion, "seed": seed, **by_level})
     return rows
 
 
 def text(rows: Sequence[Row]) -> str:
     """A row per training."""
     cells = [
-        (row["motion"], row["seed"], len(row["bytes"]) - 1, gain(row, 1), gain(row, 2))
+        (row["motion"], row["seed"], len(row["bytes"]) - 1)
         + tuple(" / ".join(number(v, digits) for v in row[key]) or "-" for key, digits in BY_LEVEL.items())
         for row in rows
     ]
-    head = ("scene", "seed", "top level", "gain of 1", "gain of 2", "mPSNR dB", "moving dB", "bytes so far")
+    head = ("scene", "seed", "top level", "mPSNR dB", "moving dB", "bytes so far")
     return (
-        f"`pd4dgs-train 'synthetic:SCENE?seed=SEED' --preset tiny --iterations {STEPS}`: the camera sweeps. "
-        "*gain*: dB over the level below, once that has trained alone, in the pixels that the level changes in views "
-        f"held back from training. Level 2 needs {SHARE_2:.0%} of its gain over level 0 and {MIN_GAIN_2:g} dB. The "
-        f"gains of both must sum to {motion_gain(STEPS):.2g} dB; if level 2 alone gains so much, level 1 is not "
-        f"tested (-).\n\n{table(head, cells)}"
+        f"`pd4dgs-train 'synthetic:SCENE?seed=SEED' --preset tiny --iterations {STEPS}`: the camera sweeps. The run "
+        f"removes levels that a lower one replaces.\n\n{table(head, cells)}"
     )
-
-
-def gain(row: Row, level: int) -> str:
-    """The measured gain of `level`; a dash if it was not tested."""
-    return number(dict(zip((2, 1), row["gains"], strict=False)).get(level), 1)
 
 
 BENCHMARK = Benchmark("levels", "Which levels stay", (), measure, text)

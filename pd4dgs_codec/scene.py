@@ -94,12 +94,11 @@ class Widths:
 
     @property
     def head_columns(self) -> dict[str, slice]:
-        """The columns of an anchor's row to which each residual head adds: one run per `Head.unit`, in the order in
-        which HEADS first names them."""
-        columns, end = dict[str, slice](), 0
-        for head in HEADS.values():
-            if head.unit not in columns:
-                columns[head.unit] = slice(end, end := end + head.outputs(self))
+        """The columns of an anchor's row to which each residual head adds: position, then the attributes in their
+        order."""
+        columns, end = {"length": slice(0, 3)}, 3
+        for name, shape in self.attributes.items():
+            columns[name] = slice(end, end := end + math.prod(shape))
         return {name: columns[head.unit] for name, head in HEADS.items()}
 
 
@@ -270,6 +269,13 @@ def _perceptron(network: Network, x: np.ndarray) -> np.ndarray:
     return x
 
 
+def relative_area(logs: np.ndarray) -> np.ndarray:
+    """Returns the largest area that each of n Gaussians may cover, float32 [n], relative to the largest of all. logs:
+    float32 [n, 3], natural logarithms of their standard deviations."""
+    area = np.sort(logs, axis=1)[:, 1:].sum(axis=1)
+    return np.asarray(np.exp(area - area.max(initial=0)))
+
+
 def _unit(vectors: np.ndarray) -> np.ndarray:
     """Returns vectors [n, any] divided by their lengths."""
     unit: np.ndarray = vectors / np.linalg.norm(vectors, axis=1, keepdims=True).clip(min=1e-12)
@@ -369,13 +375,19 @@ class LayeredScene:
         """Quantisation steps by attribute name."""
         raise NotImplementedError
 
+    @property
+    def all_steps(self) -> dict[str, float]:
+        """Quantisation steps of attributes and of what layers share, by name."""
+        return self.row_steps
+
     def scaled(self: S, factor: float) -> S:
         """Returns the scene with every step times `factor`, rounded to binary32."""
         raise NotImplementedError
 
     def of_anchors(self, rows: np.ndarray | slice) -> dict[str, Any]:
         """Returns the fields of the anchors `rows`, without masks, as arguments of `dataclasses.replace`."""
-        raise NotImplementedError
+        grading = None if self.grading is None else replace(self.grading, classes=self.grading.classes[rows])
+        return {"anchor_q": self.anchor_q[rows], "grading": grading}
 
     def of_layers(self) -> dict[str, Any]:
         """Returns the deformations without those of absent layers, as arguments of `dataclasses.replace`."""
@@ -395,6 +407,12 @@ class LayeredScene:
         fill = [fill for layer, fill in zip(self.layers, self.fills, strict=False) if layer <= level][-1:]
         red, green, blue = [code / 255 for code in fill[0]] if fill and fill[0] else self.info.background
         return red, green, blue
+
+    @property
+    def utility(self) -> np.ndarray:
+        """Estimates each anchor's utility without views, float32 [N]: its mask code in the highest layer, times what
+        its kind knows."""
+        return self.mask[-1].astype(np.float32)
 
     @property
     def level(self) -> int:
@@ -500,9 +518,7 @@ class Scene(LayeredScene):
         return {name: getattr(self, name) for name in ATTRIBUTES}
 
     def of_anchors(self, rows: np.ndarray | slice) -> dict[str, Any]:
-        grading = None if self.grading is None else replace(self.grading, classes=self.grading.classes[rows])
-        attributes = {name: values[rows] for name, values in self.attributes.items()}
-        return {"anchor_q": self.anchor_q[rows], **attributes, "grading": grading}
+        return super().of_anchors(rows) | {name: values[rows] for name, values in self.attributes.items()}
 
     def deformation(self, layer: int) -> Deformation | None:
         """Returns the deformation of layer 1 or 2, None if it is left out; None for layer 0, which has none."""
@@ -517,7 +533,8 @@ class Scene(LayeredScene):
     def _evaluated(self, t: float, eye: np.ndarray) -> Gaussians:
         slots, rows = self.widths.slots, self.active
         mask, values = self.mask[-1][rows] * MASK_STEP, {"length": self.anchor_at(rows)}
-        values |= {name: array[rows].reshape(len(rows), -1) for name, array in self.attributes.items()}
+        for name, shape in self.widths.attributes.items():
+            values[name] = self.attributes[name][rows].reshape(-1, math.prod(shape))
         if motion := self.motion(self.level):
             for unit, added in motion.residuals(values["length"], t, self.info.box).items():
                 values[unit] = values[unit] + added
@@ -528,7 +545,7 @@ class Scene(LayeredScene):
         opacity = np.tanh(outputs[0])
         seen = opacity * mask[:, None] >= np.float32(MIN_OPACITY)
         owner, slot = np.nonzero(seen)
-        shape, color = (values.reshape(*seen.shape, -1)[seen] for values in outputs[1:])
+        shape, color = (values.reshape(*seen.shape, n)[seen] for values, n in zip(outputs[1:], (7, 3), strict=True))
         offset = values["offset"].reshape(*seen.shape, 3)[seen]
         return Gaussians(
             means=position[owner] + offset * extent[owner, :3],
@@ -538,6 +555,10 @@ class Scene(LayeredScene):
             colors=1 / (1 + np.exp(-color)),
             slots=rows[owner] * slots + slot,
         )
+
+    @property
+    def utility(self) -> np.ndarray:
+        return np.asarray(super().utility * relative_area(self.scaling_log[:, 3:]))
 
     def with_deformation(self, layer: int, deformation: Deformation | None) -> Scene:
         """Returns the scene with this deformation in layer 1 or 2."""
@@ -552,6 +573,10 @@ class Scene(LayeredScene):
     @property
     def row_steps(self) -> dict[str, float]:
         return self.steps.attributes
+
+    @property
+    def all_steps(self) -> dict[str, float]:
+        return vars(self.steps)
 
     def scaled(self, factor: float) -> Scene:
         return replace(self, steps=self.steps.scaled(factor))

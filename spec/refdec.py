@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The reference decoder of the `.pd4` format 4.0-draft, written from spec/format.md with the standard library alone.
+"""The reference decoder of the `.pd4` format 5.0-draft, written from spec/format.md with the standard library alone.
 
     python -I -S spec/refdec.py FILE [BASE]
 
@@ -7,22 +7,22 @@ prints the hashes of clause 12.4 as JSON. BASE is the base of FILE (5.6), if it 
 what`, and exit code 1. Above the functions stand the clauses they follow, in the specification's words. It is meant to
 be read, not to be fast. One file, so that it can be carried alone. It yields tensors and knows no kinds (clause 13).
 """
-# ruff: noqa: B905  (lengths agree by construction; strict= would only lengthen the lines)
+# ruff: noqa: B905, B020  (lengths agree by construction; loops fill self.steps)
 
 import hashlib
 import json
+import lzma
 import math
 import struct
 import sys
 import zlib
 from bisect import bisect_right
-from itertools import repeat
+from pathlib import Path
 
 SIGNATURE = bytes.fromhex("89504434 0D0A1A0A")
 K = 1 << 24  # clause 14: coded symbols
 MAX_SYMBOL = 1 << 23  # clause 14: symbols of rows, plane samples, weights and biases
 MAX_VOXEL = 1 << 20
-MAX_COUNT = 1 << 26
 MAX_LENGTH = (1 << 31) - 1
 VARINT_MAX = (1 << 35) - 1  # clause 7.1: five bytes of seven bits
 TOTAL = 1 << 24
@@ -204,7 +204,7 @@ def read_preamble(data):
     need(SIGNATURE.startswith(data[:8]), "not a .pd4 file", "BadSignature")
     need(len(data) >= 20, "the file ends in the preamble", "Truncated")
     major, _, size, crc = struct.unpack_from("<HHII", data, 8)
-    need(major == 4, f"major version {major}, expected 4", "UnsupportedVersion")
+    need(major == 5, f"major version {major}, expected 5", "UnsupportedVersion")
     limited(size, 1 << 14, "the header's length")
     need(len(data) >= 20 + size, "the file ends in the header", "Truncated")
     header = data[20 : 20 + size]
@@ -218,19 +218,18 @@ def read_preamble(data):
 
 
 # 5.1 Header map: "The time at 1 MUST NOT precede the time at 0, the background MUST lie in 0..1"
-# 5.5 Digest: "The first 16 bytes of the SHA-256 of the payloads of all critical chunks that were encoded together"
 def read_header(data):
     header = fields(unpack(data), range(1, 16), (1, 2, 3, 4, *range(6, 13), 14), "header")
     read_chunk_list(header[1], registered(header[2], "the coding mode"))
     read_kind(header[3])
     read_scalars(header)
     a_step(header[6])
-    box, (start, end) = reals(header[7], 6, "the box"), reals(header[8], 2, "the times")
-    need(all(a <= b for a, b in zip(box[:3], box[3:])), "a lower corner of the box above the upper one")
-    need(start <= end, f"time range {start}..{end}, expected it to ascend")
-    reals(header[9], 3, "the background", 0, 1)
-    near, far = reals(header[10], 2, "near and far", 0)
+    x0, y0, z0, x1, y1, z1 = reals(header[7], 6, "the box")
+    (start, end), (near, far) = reals(header[8], 2, "the times"), reals(header[10], 2, "near and far", 0)
+    for low, high in ((x0, x1), (y0, y1), (z0, z1), (start, end)):
+        need(low <= high, f"the box or the times: {low} above {high}")
     need(near < far, f"near {near} and far {far}, expected near < far")
+    reals(header[9], 3, "the background", 0, 1)
     reals(header[11], 3, "up")
     reals([header[12]], 1, "the unit", 0)
     if 13 in header:
@@ -266,15 +265,26 @@ def read_kind(value):
     integers(a_list(value, "a kind", 1, 16), 65535, "a number of a kind")
 
 
+# 5.4 Rows: "ids ascend strictly"
+# 6.3 Grids and chains: "Ids of grids ascend strictly, and so do those of chains."
+def table(tensors, what, *lengths):
+    """Yields the tensors, lists of these lengths that begin with an id."""
+    last = -1
+    for tensor in tensors:
+        identity = limited(a_list(tensor, what, *lengths)[0], 255, "an id")
+        need(identity > last, f"id {identity} after {last}, expected ascending ids")
+        last = identity
+        yield tensor
+
+
 # 5.4 Rows: "Each tensor is [id, C, Q, p] with an id 0..255, C = 1..256 channels, a step Q and a predictor p"
 # 6.2 Layer parameters: "tensors that only this layer has, with the rules and limits of 5.4 but no centres"
 def read_rows(value, form):
     """[(name, channels, step, predictor)] and the number of all channels."""
-    result, last = [], -1
-    for tensor in a_list(value, "the rows", 1, 32):
-        last = read_id(a_list(tensor, "a tensor of rows", 4), last)
+    result = []
+    for tensor in table(a_list(value, "the rows", 1, 32), "a tensor of rows", 4):
         channels = limited(tensor[1], 256, "the number of channels", 1)
-        result.append((f"{form}.{last}", channels, a_step(tensor[2]), registered(tensor[3], "a predictor", 3)))
+        result.append((f"{form}.{tensor[0]}", channels, a_step(tensor[2]), registered(tensor[3], "a predictor", 3)))
     return result, limited(sum(row[1] for row in result), 512, "the number of channels of all rows")
 
 
@@ -284,14 +294,6 @@ def read_scalars(header):
     header["graded"] = 5 in header
     header["centres"] = a_list(header.get(5, [0] * width), "the centres", width)
     integers(header["centres"], MAX_SYMBOL, "a centre", -MAX_SYMBOL)
-
-
-# 5.4 Rows: "ids ascend strictly"
-# 6.2 Layer parameters: "with the rules and limits of 5.4 but no centres"
-# 6.3 Grids and chains: "Ids of grids ascend strictly, and so do those of chains."
-def read_id(tensor, last):
-    need(limited(tensor[0], 255, "an id") > last, f"id {tensor[0]} after {last}, expected ascending ids")
-    return tensor[0]
 
 
 # 5.3 Camera map: "fx and fy MUST be positive" "All four are required."
@@ -334,7 +336,7 @@ class Layer:
         self.number, self.header, self.later, self.slices = number, header, first is not None, 1
         self.earlier, self.layer_rows = earlier, first.layer_rows if first else ([], 0)
         self.planes, self.weights, self.steps = [], [], {}
-        self.priors = first.priors if first else ([], [])
+        self.priors = first.priors if first else []
         reader = Reader(payload)
         parameters = reader.take(limited(reader.number("<I"), 4096, "the parameters' length"))
         codes = self.read_parameters(parameters, before[0])
@@ -360,12 +362,9 @@ class Layer:
             integers(a_list(parameters[3], "the fill", 3), 255, "a colour of the fill")
         bare = self.later or (self.number == 0 and 15 in self.header)
         need(not (bare and {4, 5, 6, 7} & set(parameters)), "tables or a kind in a later slice, or over a base")
-        if 4 in parameters:
-            self.read_grids(parameters[4])
-        if 5 in parameters:
-            self.read_chains(parameters[5])
-        if 6 in parameters:
-            read_kind(parameters[6])
+        for key, read in ((4, self.read_grids), (5, self.read_chains), (6, read_kind)):
+            if key in parameters:
+                read(parameters[key])
         if 7 in parameters:
             self.layer_rows = read_rows(parameters[7], "layerrow")
         return length
@@ -373,68 +372,60 @@ class Layer:
     # 6.3 Grids and chains: "one plane for each pair (i, j), i < j, in lexicographic order" "its columns follow side i"
     def read_grids(self, value):
         step, *grids = a_list(value, "the grids", 2, 17)
-        self.steps["plane"], last = a_step(step), -1
-        for grid in grids:
-            last = read_id(a_list(grid, "a grid", 4), last)
+        for grid in table(grids, "a grid", 4):
             limited(grid[1], 256, "the number of channels", 1)
             sides = integers(a_list(grid[2], "the sides", 1, 4), 4096, "a side", 1)
             shapes = [(h, w) for i, w in enumerate(sides) for h in sides[i + 1 :]] or [(1, sides[0])]
             for i, predictor in enumerate(a_list(grid[3], "the predictors", len(shapes))):
                 registered(predictor, "a predictor")
-                self.planes.append((f"plane.{last}.{i}", predictor, (grid[1], *shapes[i])))
+                self.planes.append((f"plane.{grid[0]}.{i}", predictor, (grid[1], *shapes[i]), a_step(step)))
 
     # 6.3 Grids and chains: "Linear layer i, 1..m, has a weight [o_i, o_{i−1}] and a bias [o_i]."
     def read_chains(self, value):
         step, *chains = a_list(value, "the chains", 2, 65)
-        self.steps["weight"], last = a_step(step), -1
-        for chain in chains:
-            last = read_id(a_list(chain, "a chain", 3, 18), last)
+        for chain in table(chains, "a chain", 3, 18):
             widths = integers(chain[1:], 4096, "a width", 1)
             for i, (inputs, outputs) in enumerate(zip(widths, widths[1:])):
-                self.weights += [(f"weight.{last}.{i}", outputs * inputs), (f"bias.{last}.{i}", outputs)]
+                sizes = {f"weight.{chain[0]}.{i}": outputs * inputs, f"bias.{chain[0]}.{i}": outputs}
+                self.weights += [(name, size, a_step(step)) for name, size in sizes.items()]
 
     # 6.5 Declared sizes: "c MUST NOT exceed 2^28, N MUST NOT exceed 2^13 + 2·B, and S MUST NOT exceed 2^22 + 256·B."
     def check_sizes(self, payload_bytes, before):
-        samples = sum(c * h * w for _, _, (c, h, w) in self.planes)
+        samples = sum(c * h * w for _, _, (c, h, w), _ in self.planes)
         need(samples <= 1 << 28, f"{samples} plane samples, limit 2^28", "LimitExceeded")
-        samples_and_weights = samples + sum(size for _, size in self.weights)
+        samples_and_weights = samples + sum(size for _, size, _ in self.weights)
         row, e = len(self.header["centres"]) + 4 + self.header["graded"], len(self.earlier)
-        self.count = e + row * self.rows + self.layer_rows[1] * (e + self.rows) + samples_and_weights
-        self.declared = [a + b for a, b in zip(before, (self.rows, self.count, payload_bytes))]
+        count = e + row * self.rows + self.layer_rows[1] * (e + self.rows) + samples_and_weights
+        self.declared = [a + b for a, b in zip(before, (self.rows, count, payload_bytes))]
         rows, symbols, size = self.declared
         need(rows <= (1 << 13) + 2 * size, f"{rows} rows", "LimitExceeded")
         need(symbols <= (1 << 22) + 256 * size, f"{symbols} symbols", "LimitExceeded")
 
     # 6.4 Channels: "In mode ans a slice codes the channels in this order:"
-    # 8 Coded channels: "one for item 1 of 6.4, one for items 2 to 6, one for items 7 and 8"
     # 8.5 Rows by step class: "the base's rows come first, by class, then all others"
-    # 11.2 Rows: "A step class MUST lie in 0..6, else Malformed."
     def decode_ans(self, codes, stream):
         """The voxels and the channels of items 2 to 8, none split."""
         n, graded = self.rows, self.header["graded"]
-        coder = Coder(codes, stream, self.count + (1 << (10 if self.later else 18)))
-        coder.priors = self.priors[0]
+        coder = Coder(codes, stream, self.priors, self.declared[1] + (1 << 18))
         cells = coder.decode_positions(n) if n else []
-        coder.priors = self.priors[1]
         channels = [coder.channel(size) for size in (len(self.earlier), n, *[n] * graded)]
         classes = ranged(channels[2], 0, 6, "a step class") if graded else [0] * n
         base_rows = self.header[15][2] if 15 in self.header and not self.later else 0
         groups = [c + 7 * (row >= base_rows) for row, c in enumerate(self.earlier + classes)]
         for rows, width in ((classes, len(self.header["centres"])), (groups, self.layer_rows[1])):
             channels += [coder.split(rows, 14) for _ in range(width)]
-        coder.priors = []
-        channels += coder.decode_grids([shape for _, _, shape in self.planes])
-        channels += [coder.channel(size) for _, size in self.weights]
+        channels += coder.decode_grids([shape for _, _, shape, _ in self.planes])
+        channels += [coder.channel(size) for _, size, _ in self.weights]
         coder.stream.finish()
         return cells, channels
 
     # 9.1 Channels and codes: "the symbol is base + v, which MUST lie in −K..K (8.2), else Malformed"
-    # 11.2 Rows: "A step class MUST lie in 0..6, else Malformed."
     def decode_lzma(self, codes, stream):
         """As decode_ans."""
         n, e, graded = self.rows, len(self.earlier), self.header["graded"]
         counts = [n, n, n, e] + [n] * (1 + graded + len(self.header["centres"])) + [e + n] * self.layer_rows[1]
-        counts += [h * w for _, _, (c, h, w) in self.planes for _ in range(c)] + [size for _, size in self.weights]
+        counts += [h * w for _, _, (c, h, w), _ in self.planes for _ in range(c)]
+        counts += [size for _, size, _ in self.weights]
         heads = [(codes.varint(8 * K + 3) if count else 0, count) for count in counts]
         need(all(code & 3 < 3 for code, _ in heads), "a channel of 8-byte symbols")
         size = sum(count << (code & 3) for code, count in heads)
@@ -444,7 +435,6 @@ class Layer:
             ranged(take_numbers(reader, count, code & 3, unzigzag(code >> 2)), -K, K, "a symbol")
             for code, count in heads
         ]
-        ranged(channels[5] if graded else [], 0, 6, "a step class")
         return voxels_in_order(zip(*channels[:3])), channels[3:]
 
     # 11.1 Masks: "Layer ℓ codes a rise 0..255 for each earlier row and a code 3..255 for each own row."
@@ -452,30 +442,28 @@ class Layer:
     # 11.2 Rows: "Symbols of rows and layer rows, plane samples (11.3), weights and biases MUST lie in −2^23..2^23"
     def name_channels(self, channels):
         """The symbols: of rows their v (11.2), of planes their samples (11.3)."""
-        ranges = (("rise", 0, 255 if self.number else 1), ("own", 3, 255))
+        ranges = (("rise", 0, 255 if self.number else 1), ("own", 3, 255), ("class", 0, 6))[: 2 + self.header["graded"]]
         self.symbols = {name: [ranged(next(channels), low, high, name)] for name, low, high in ranges}
-        if self.header["graded"]:
-            self.symbols["class"] = [next(channels)]
         centres = iter(self.header["centres"])
         for tables, classes in ((self.header["rows"], self.classes), (self.layer_rows[0], self.earlier + self.classes)):
             for name, width, self.steps[name], predictor in tables:
                 self.symbols[name] = [
                     row_values(next(channels), classes, next(centres, 0), predictor) for _ in range(width)
                 ]
-        for name, predictor, (c, _, w) in self.planes:
+        for name, predictor, (c, _, w), self.steps[name] in self.planes:
             self.symbols[name] = [restore(next(channels), predictor, w) for _ in range(c)]
-        self.symbols |= {name: [next(channels)] for name, _ in self.weights}
+        for name, _, self.steps[name] in self.weights:
+            self.symbols[name] = [next(channels)]
         for name, *_ in self.planes + self.weights:
             ranged((k for channel in self.symbols[name] for k in channel), -MAX_SYMBOL, MAX_SYMBOL, "a symbol")
 
     # 11.5 Dequantisation: "An anchor's position is dequantised from its voxel index with the voxel size as Q."
     def dequantise(self):
         self.tensors = {"position": dequantise([v for cell in self.cells for v in cell], self.header[6])}
-        for name, *_ in self.header["rows"] + self.layer_rows[0]:  # [C, n] -> [n, C]
-            self.tensors[name] = dequantise([v for row in zip(*self.symbols[name]) for v in row], self.steps[name])
-        for name, *_ in self.planes + self.weights:
-            step = self.steps["plane" if name.startswith("plane") else "weight"]
-            self.tensors[name] = dequantise([k for channel in self.symbols[name] for k in channel], step)
+        rows = {name for name, *_ in self.header["rows"] + self.layer_rows[0]}
+        for name, step in self.steps.items():
+            channels = zip(*self.symbols[name]) if name in rows else self.symbols[name]  # [C, n] -> [n, C]
+            self.tensors[name] = dequantise([v for channel in channels for v in channel], step)
 
     # 12.2 Prefixes: "sorted by the Morton code (10.1) of the voxel index less the minimum over these rows"
     def add_slice(self, part):
@@ -515,8 +503,7 @@ def restore(residuals, predictor, w):
 
 
 # 7.3 NormTable: "T[257] = T[256] = 2^27 M[j] = round(2^(31 − j/64)) for j = 0..63"
-T = [round(2**27 * math.erf(i / (32 * math.sqrt(2)))) for i in range(257)]
-T.append(T[-1])
+T = [round(2**27 * math.erf(min(i, 256) / (32 * math.sqrt(2)))) for i in range(258)]
 M = [round(2 ** (31 - j / 64)) for j in range(64)]
 
 
@@ -606,29 +593,28 @@ def read_exceptions(codes, count, kmin, n):
     return result
 
 
-# 10.3 Channels: "an index into the ascending list of the bytes in which k bits are 1"
-PATTERNS = [[byte for byte in range(256) if bin(byte).count("1") == k] for k in range(9)]
+# 10.2 Octree: "an index into the ascending list of the bytes in which as many bits are 1"
+PATTERNS = [[byte for byte in range(256) if bin(byte).count("1") == k] for k in range(1, 9)]
 
 
 # 8 Coded channels: "Mode ans reads a slice with two cursors, one in the codes and one in the ANS stream."
 class Coder:
-    """The two cursors of a slice, in its codes and its stream; priors: the prior list in use."""
+    """The two cursors of a slice, in its codes and its stream; priors: the prior list of its layer."""
 
-    def __init__(self, codes, stream, most_entries):
-        self.codes, self.stream, self.entries, self.priors = codes, Ans(stream), most_entries, []
+    def __init__(self, codes, stream, priors, most_entries):
+        self.codes, self.stream, self.priors, self.most_entries = codes, Ans(stream), priors, most_entries
 
     # 8 Coded channels: "Channels of length 0 leave no trace."
     # 8.1 Tokens: "the prior F − 8 places before the last one of the prior list"
-    # 8.2 Priors: "The entries of all windows that a slice defines, n each, MUST NOT exceed the symbols that 6.5 counts"
+    # 8.2 Priors: "The entries of all windows of the prior list, n each, MUST NOT exceed the S of the slice (6.5)"
     # 8.4 Symbols: "The symbol is kmin + s. Exceptions are then put in their places."
     def channel(self, count):
         if count == 0:
             return []
-        token = self.codes.varint(2 * (MAX_COUNT + 8))
+        token = self.codes.varint(2 * ((1 << 26) + 8))
         if token >> 1 < 8:
             self.priors.append(read_prior(self.codes, token >> 1))
-            self.entries -= self.priors[-1][1]
-            need(self.entries >= 0, "too many entries of windows", "LimitExceeded")
+            need(sum(n for _, n, _ in self.priors) <= self.most_entries, "too many entries", "LimitExceeded")
         back = max(token >> 1, 8) - 8
         need(back < len(self.priors), "a channel reuses a prior before the first")
         kmin, n, cum = self.priors[-1 - back]
@@ -654,41 +640,31 @@ class Coder:
         return [channel for e in planes for channel in e]
 
     # 10.1 Head: "The smallest relative index along each axis MUST be 0, the largest along any axis MUST have R bits"
-    # 10.2 Counts: "Their sum MUST NOT exceed the number of nodes with more than one child, else Malformed."
     def decode_positions(self, count):
         codes = self.codes
         low, depth = [codes.zigzag(MAX_VOXEL) for _ in range(3)], limited(codes.number("B"), 21, "the depth")
-        levels = read_levels(codes, depth, count)
-        sizes = [codes.varint(MAX_COUNT) for _ in range(2, 8)] if count > 1 else []
-        several = sum(nodes - single for nodes, single in levels)
-        need(sum(sizes) <= several, f"{sum(sizes)} nodes with 2 to 7 children, expected at most {several}")
-        nodes = self.grow(levels, count, sizes)
+        nodes = self.grow(depth, count)
         need(nodes == less_minimum(nodes), "no anchor at the minimum")
         need(max(v for node in nodes for v in node).bit_length() == depth, "another depth than declared")
         cells = [tuple(p + m for p, m in zip(node, low)) for node in nodes]
         need(all(v <= MAX_VOXEL for cell in cells for v in cell), "a voxel index over 2^20")
         return cells
 
-    # 10.3 Channels: "The numbers of children MUST agree with 10.2, else Malformed"
-    def grow(self, levels, count, sizes):
+    # 10.2 Octree: "From a level of n nodes on, every node has one child, which is not coded."
+    def grow(self, depth, count):
         """The relative indices (x, y, z) of the anchors, in Morton order."""
-        steps, only_child = [], [False]
-        for (nodes, single), (after, _) in zip(levels, [*levels[1:], (count, 0)]):
-            children = [1] * nodes
-            if nodes < count:
-                only = sum(only_child)
-                of_one, of_more = self.indices_of(only, 8), self.indices_of(nodes - only, 8)
-                children = [1 + next(of_one if only else of_more) for only in only_child]
-                need(children.count(1) == single, f"{children.count(1)} nodes with one child, expected {single}")
-                need(sum(children) == after, f"{sum(children)} children, expected {after}")
-            only_child = [k == 1 for k in children for _ in range(k)]
-            steps.append((children, self.indices_of(single, 8)))
-        numbers = [k for children, _ in steps for k in children]
-        need(not sizes or sizes == [numbers.count(k) for k in range(2, 8)], "other numbers of children than stated")
-        indices = {k: self.indices_of(size, len(PATTERNS[k])) for k, size in enumerate(sizes, 2)} | {8: repeat(0)}
+        levels, size = [], 1
+        for _ in range(depth):
+            coded = self.channel(size) if size < count else [0] * size
+            levels.append(ranged(coded, 0, 7, "a number of children less 1"))
+            size += sum(coded)
+            need(size <= count, f"{size} nodes, expected at most {count}")
+        need(size == count, f"{size} nodes at the end, expected {count}")
         nodes = [(0, 0, 0)]
-        for children, indices[1] in steps:
-            patterns = [PATTERNS[k][next(indices[k])] for k in children]
+        for further in levels:
+            indices = self.split(further, 8)
+            need(all(0 <= i < len(PATTERNS[k]) for i, k in zip(indices, further)), "an index out of its list")
+            patterns = [PATTERNS[k][i] for i, k in zip(indices, further)]
             nodes = [
                 tuple(2 * v + (child >> axis & 1) for axis, v in enumerate(node))
                 for node, pattern in zip(nodes, patterns)
@@ -696,9 +672,6 @@ class Coder:
                 if pattern >> child & 1
             ]
         return nodes
-
-    def indices_of(self, count, size):
-        return iter(ranged(self.channel(count), 0, size - 1, "a symbol of the octree"))
 
 
 # 8.6 Grids in stages: "over the nine cells (clip(i + a, 0, H − 1), clip(j + b, 0, W − 1)) with a and b in −1..1"
@@ -757,146 +730,17 @@ def morton_code(offset):
     return sum((v >> i & 1) << 3 * i + axis for axis, v in enumerate(offset) for i in range(22))
 
 
-# 9.3 LZMA2: "A stream is a list of chunks, each behind its control byte, and ends with the control byte 0."
+# 9.3 LZMA2: "It MUST unpack to exactly the bytes of all channels, at most 2^31, and end at the payload's last byte."
 def unpack_lzma(data, size):
     need(size <= 1 << 31, f"{size} bytes uncompressed, limit 2^31", "LimitExceeded")
-    reader, out, start, lzma = Reader(data), bytearray(), None, None
-    while control := reader.number("B"):
-        need(control <= 2 or control >= 0x80, f"LZMA2 control byte {control:#x}")
-        if control == 1 or control >= 0xE0:
-            start, lzma = len(out), None
-        need(start is not None, "the first LZMA2 chunk does not reset the dictionary")
-        stored = control < 0x80
-        end = len(out) + 1 + (reader.number(">H") | (0 if stored else control & 31) << 16)
-        need(end <= size, f"an LZMA stream of more than {size} bytes")
-        if stored:
-            out += reader.take(end - len(out))
-            continue
-        length = 1 + reader.number(">H")
-        if control >= 0xC0:
-            lzma = Lzma(reader.number("B"))
-        need(lzma, "an LZMA2 chunk without properties")
-        if control >= 0xA0:
-            lzma.probabilities, lzma.state, lzma.distances = {}, 0, [1] * 4
-        lzma.unpack(reader.take(length), out, start, end)
-    need(len(out) >= size, f"an LZMA stream of {len(out)} bytes, expected {size}")
-    need(not reader.left, "bytes after the end of an LZMA stream")
-    return bytes(out)
-
-
-# 9.3 LZMA2: "Symbols, contexts and the range decoder are those of the LZMA specification"
-class Lzma:
-    def __init__(self, properties):
-        need(properties <= 224, f"LZMA properties {properties}")
-        self.lc, self.lp, self.pb = properties % 9, properties // 9 % 5, properties // 45
-        need(self.lc + self.lp <= 4, f"LZMA properties lc {self.lc}, lp {self.lp}")
-
-    # 9.3 LZMA2: "A match MUST NOT reach back over the dictionary's reset nor beyond its chunk."
-    def unpack(self, data, out, start, end):
-        """Appends the bytes of a chunk to `out`, up to `end`; the dictionary begins at `start`."""
-        self.reader = Reader(data)
-        need(self.reader.number("B") == 0, "an LZMA2 chunk does not begin with 0")
-        self.code, self.range = self.reader.number(">I"), 0xFFFFFFFF
-        while len(out) < end:
-            place = len(out) - start
-            length = self.take_symbol(out, place)
-            need(len(out) + length <= end, "a match beyond its chunk")
-            need(not length or self.distances[0] <= min(place, 1 << 26), "a match before the dictionary")
-            for _ in range(length):
-                out.append(out[-self.distances[0]])
-        need(self.code == 0, "an LZMA2 chunk does not end in code 0")
-        need(not self.reader.left, "bytes left in an LZMA2 chunk")
-
-    def take_symbol(self, out, place):
-        """Length of the next match, whose distance is the first of `distances`, or 0 after a literal."""
-        state, low = self.state, place & (1 << self.pb) - 1
-        if not self.bit("match", state, low):
-            self.take_literal(out, place)
-            self.state = 0 if state < 4 else state - (3 if state < 10 else 6)
-            return 0
-        if not self.bit("repeated", state):
-            self.state = 7 if state < 7 else 10
-            length = self.take_length("new", low)
-            self.distances = [self.take_distance(min(length - 2, 3)), *self.distances[:3]]
-            return length
-        if self.bit("other", state):
-            which = 1 if not self.bit("not 1", state) else 2 if not self.bit("not 2", state) else 3
-            self.distances.insert(0, self.distances.pop(which))
-        elif not self.bit("long", state, low):
-            self.state = 9 if state < 7 else 11
-            return 1
-        self.state = 8 if state < 7 else 11
-        return self.take_length("repeated", low)
-
-    def take_literal(self, out, place):
-        before = out[-1] if place else 0
-        context = (place & (1 << self.lp) - 1) << self.lc | before >> 8 - self.lc
-        symbol, expected = 1, out[-self.distances[0]] if self.state >= 7 else None
-        for place in reversed(range(8)):  # behind a match: as long as the byte is the one that would go on with it
-            guess = None if expected is None else expected >> place & 1
-            bit = self.bit("literal", context, guess, symbol)
-            symbol, expected = symbol << 1 | bit, expected if bit == guess else None
-        out.append(symbol & 255)
-
-    def take_length(self, kind, low):
-        if not self.bit(kind, "choice", 0):
-            return 2 + self.take_tree(3, kind, 0, low)
-        if not self.bit(kind, "choice", 1):
-            return 10 + self.take_tree(3, kind, 1, low)
-        return 18 + self.take_tree(8, kind, 2)
-
-    def take_distance(self, length):
-        slot = self.take_tree(6, "slot", length)
-        if slot < 4:
-            return 1 + slot
-        bits, distance = (slot >> 1) - 1, 2 | slot & 1
-        if slot < 14:
-            return 1 + (distance << bits) + self.take_reverse(bits, "distance", slot)
-        for _ in range(bits - 4):  # bits of even probability
-            self.range >>= 1
-            bit = int(self.code >= self.range)
-            self.code -= bit * self.range
-            self.normalise()
-            distance = distance << 1 | bit
-        return 1 + (distance << 4) + self.take_reverse(4, "align")
-
-    def take_tree(self, bits, *context):
-        symbol = 1
-        for _ in range(bits):
-            symbol = symbol << 1 | self.bit(*context, symbol)
-        return symbol - (1 << bits)
-
-    def take_reverse(self, bits, *context):
-        return int(f"{self.take_tree(bits, *context):0{bits}b}"[::-1], 2)
-
-    def bit(self, *context):
-        p = self.probabilities.get(context, 1 << 10)
-        bound = (self.range >> 11) * p
-        bit = int(self.code >= bound)
-        self.probabilities[context] = p - (p >> 5) if bit else p + ((1 << 11) - p >> 5)
-        self.code, self.range = (self.code - bound, self.range - bound) if bit else (self.code, bound)
-        self.normalise()
-        return bit
-
-    def normalise(self):
-        if self.range < 1 << 24:
-            self.range, self.code = self.range << 8, self.code << 8 | self.reader.number("B")
-
-
-# 10.2 Counts: "s ≤ N, e ≤ 6·(N − s) and 2·N − s + e ≤ n MUST hold, and after level 1 there MUST be n nodes"
-def read_levels(codes, depth, count):
-    """Per level, from the root's on: (number of nodes, number of nodes with one child)."""
-    levels, nodes = [], 1
-    for _ in range(depth):
-        single, more = nodes, 0
-        if nodes < count:
-            single, more = codes.varint(MAX_COUNT), codes.varint(MAX_COUNT)
-        need(single <= nodes and more <= 6 * (nodes - single), f"{nodes} nodes, {single} with one child, e is {more}")
-        levels.append((nodes, single))
-        nodes = 2 * nodes - single + more
-        need(nodes <= count, f"{nodes} nodes, expected at most {count}")
-    need(nodes == count, f"{nodes} nodes at the end, expected {count}")
-    return levels
+    decoder = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=[{"id": lzma.FILTER_LZMA2, "dict_size": 1 << 26}])
+    try:
+        out = decoder.decompress(data, max_length=size + 1)
+    except lzma.LZMAError as error:
+        raise Fault("Malformed", f"LZMA: {error}") from None
+    ends = decoder.eof and not decoder.unused_data
+    need(ends and len(out) == size, f"an LZMA stream of {len(out)} bytes or more, expected {size} and the end")
+    return out
 
 
 # 11.5 Dequantisation: "the product is exact, and the one rounding is to nearest, ties to even"
@@ -996,11 +840,8 @@ def main(arguments):
     if len(arguments) not in (1, 2):
         return "usage: refdec.py FILE [BASE]"
     try:
-        files = []
-        for path in arguments:
-            with open(path, "rb") as stream:
-                files.append(stream.read())
-        print(json.dumps(hashes(files[0], base=files[1] if files[1:] else None)))
+        file, base = [*(Path(path).read_bytes() for path in arguments), None][:2]
+        print(json.dumps(hashes(file, base=base)))
     except (Fault, OSError) as error:
         return f"refdec: {arguments[0]}: {error}"
 

@@ -17,7 +17,6 @@ from hypothesis import strategies as st
 
 from pd4dgs_codec import encode
 from pd4dgs_codec.entropy.channels import ChannelReader, ChannelWriter, split
-from pd4dgs_codec.entropy.fitting import Fitted
 from pd4dgs_codec.entropy.priors import norm_cdf28_of_each, tables_of_each
 from pd4dgs_codec.format.info import info as info_of
 from pd4dgs_codec.scene import (
@@ -262,17 +261,17 @@ def assert_same_symbols(found: Sequence[np.ndarray], expected: Sequence[np.ndarr
         np.testing.assert_array_equal(a, b)
 
 
-def coded(channels: Sequence[np.ndarray], known: list[Fitted] | None = None, **options: Any) -> tuple[bytes, bytes]:
-    """(codes, stream) of channels in one batch. known: the prior list. options: of ChannelWriter."""
+def coded(channels: Sequence[np.ndarray], **options: Any) -> tuple[bytes, bytes]:
+    """(codes, stream) of channels in one batch. options: of ChannelWriter."""
     writer = ChannelWriter(**options)
-    writer.write(channels, [] if known is None else known)
+    writer.write(channels)
     return writer.finish()[:2]
 
 
 def decoded(codes: bytes, stream: bytes, counts: Sequence[int]) -> list[np.ndarray]:
     """The channels of these lengths, the inverse of `coded`."""
     reader = ChannelReader(codes, stream, sum(counts))
-    symbols = reader.read(counts, [])
+    symbols = reader.read(counts)
     reader.finish()
     return split(symbols, counts)
 

@@ -6,10 +6,12 @@ import re
 import subprocess
 import sys
 import weakref
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from explicit import visible_splats
 from strategies import small_file
 from tiny import camera_around, trained_like_scene
 
@@ -78,6 +80,10 @@ def test_levels_times_and_eyes(scene):
     assert len(scene.gaussians(0.5, 0).means) < len(usual.means)
     assert np.array_equal(scene.prefix(1).gaussians(0.5).means, scene.gaussians(0.5, 1).means)
     assert not np.array_equal(scene.gaussians(0.5, eye=[3, 0, 0]).colors[:9], usual.colors[:9])
+    hidden = replace(scene, mask=tuple(np.zeros_like(codes) for codes in scene.mask))
+    assert (
+        len(hidden.gaussians(0.5).means) == 0 and np.ptp(render(hidden, scene.info.camera, 0.5), axis=(0, 1)).max() == 0
+    )
     for call in (scene.gaussians, lambda *given: render(scene, scene.info.camera, *given)):
         with pytest.raises(RenderError, match=r"time is 1.5, expected 0 to 1, from 0 to 2 s of the scene"):
             call(1.5)
@@ -96,10 +102,12 @@ def test_pictures_of_levels_are_drawn_and_nothing_of_a_scene_stays(scene):
     assert not np.array_equal(pictures[0], pictures[2])
     assert np.array_equal(render(own, own.info.camera, 0.5), pictures[2])
     assert len(drawing._players[own]) == 3
-    kept = weakref.ref(own)
-    del own
+    explicit = visible_splats()
+    render(explicit, explicit.info.camera, 0.5)
+    kept = [weakref.ref(one) for one in (own, explicit)]
+    del own, explicit
     gc.collect()
-    assert kept() is None
+    assert [one() for one in kept] == [None, None]
 
 
 def test_a_camera_that_looks_at_a_point():

@@ -142,4 +142,4 @@ def test_decoding_needs_no_torch():
     data = small_file()
     done = subprocess.run([sys.executable, "-c", SCRIPT], input=data, capture_output=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr.decode()
-    assert done.stdout.decode().split() == ["(0,", "1,", "2)", str(len(pd4dgs_codec.decode(data).anchor_q)), "4.0"]
+    assert done.stdout.decode().split() == ["(0,", "1,", "2)", str(len(pd4dgs_codec.decode(data).anchor_q)), "5.0"]

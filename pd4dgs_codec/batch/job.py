@@ -49,24 +49,30 @@ class Op:
 
 OPS = {
     "prepare": Op("", (".mp4", ".mov", ".mkv", ".webm", ".avi")),
-    "train": Op(".pt"),
+    "train": Op(".pt", inputs=("base",)),
     "encode": Op(".pd4", (".pt",), inputs=("data",)),
     "eval": Op(".json", (".pd4",), stdout=True, inputs=("data",)),
     "package": Op("", (".pd4",)),
 }
 #: Options that the batch sets for every command, or that make no sense for one scene of many.
 RESERVED = {"output", "overwrite", "threads", "json", "help", "version", "verbose", "resume", "log"}
-KEYS = ("source", "output", "options")
+KEYS = ("source", "output", "options", "needs")
 
 
 @dataclass(frozen=True)
 class Line:
-    """A valid line. number: from 1 on. output: a path below the root of the batch."""
+    """A valid line. number: from 1 on. output: a path below the root of the batch. needs: options that name the output
+    of another line, which is made first."""
 
     number: int
     source: str
     output: str
     options: dict[str, Any] = field(default_factory=dict)
+    needs: dict[str, str] = field(default_factory=dict)
+
+    def at(self, root: str) -> "Line":
+        """The line of a batch below `root`, with what it needs among its options."""
+        return replace(self, options=self.options | {name: posixpath.join(root, o) for name, o in self.needs.items()})
 
 
 def read_manifest(place: str, op: Op, check: Check) -> tuple[list[Line], list[tuple[int, str]]]:
@@ -102,19 +108,23 @@ def _line(number: int, raw: bytes, op: Op, check: Check) -> Line:
     if not isinstance(content, dict) or not set(content) <= set(KEYS):
         found = ", ".join(map(str, content)) if isinstance(content, dict) else type(content).__name__
         raise DataError(f"found {found}, expected an object with {', '.join(KEYS)}")
-    source, options = content.get("source"), content.get("options", {})
+    source, options, needs = content.get("source"), content.get("options", {}), content.get("needs", {})
     if not isinstance(source, str) or not source:
         raise DataError(f"found source {source!r}, expected a path or a URI")
     if not isinstance(options, dict):
         raise DataError(f"found options {options!r}, expected an object")
+    if not isinstance(needs, dict) or not all(name in op.inputs and isinstance(needs[name], str) for name in needs):
+        raise DataError(
+            f"found needs {needs!r}, expected outputs of other lines for {' and '.join(op.inputs) or 'none'}"
+        )
     output = content.get("output", default_output(source, op))
     plain = isinstance(output, str) and output.isprintable() and "\\" not in output
     if not plain or {"", ".", ".."} & set(output.split("/")) or output.endswith(store.RECORD):
         raise DataError(f"found output {output!r}, expected a path relative to -o without the suffix {store.RECORD}")
     source = _absolute(source)
-    check(source, options)
+    check(source, options | needs)
     inputs = {name: _absolute(options[name]) for name in op.inputs if name in options}
-    return Line(number, source, output, options | inputs)
+    return Line(number, source, output, options | inputs, needs)
 
 
 def _absolute(place: Any) -> str:
@@ -297,6 +307,8 @@ def _run(
 ) -> tuple[dict[str, Path], dict[str, Any], float]:
     """Runs the command and returns (output files by name, numbers that it reported, CPU seconds)."""
     op, output = OPS[job.verb], Path("output") / ("result" + OPS[job.verb].suffix)
+    if job.verb == "train" and job.line.output.endswith(".pd4"):  # a part of a folder of segments
+        output = output.with_suffix(".pd4")
     output.parent.mkdir()
     options = job.line.options | {name: text for name, text in sources.items() if name}
     argv = [*arguments(job.verb, sources[""], str(output), options), "--json", f"--threads={job.threads}"]

@@ -26,7 +26,9 @@ MANIFEST has one JSON object per line:
   {"source": "s3://films/kitchen.pt", "output": "kitchen.pd4", "options": {"effort": 3}}
 source is the input, a path or a URI (s3, gs, https, ...). output is a path relative to -o (default: named after the
 source). options are the command's options without dashes: true for a flag, a list for several values. For eval, the
-option data names the dataset. `pd4dgs-batch scan FOLDER` writes a manifest of the sources in a folder.
+option data names the dataset. "needs": {"base": "base-0000.pd4"} gives as an option the output of another line, which
+needs nothing and is made first. `pd4dgs-batch scan FOLDER` writes a manifest of the sources in a folder, and
+`pd4dgs-train --segments --manifest` one of the parts of a long capture.
 
 OUTPUT.done.json beside each output records its inputs, options, version and checksums. Scenes with a matching record
 are skipped, so the same command resumes an interrupted batch. A scene that still fails after its retries is reported
@@ -134,7 +136,6 @@ def _batch(args: argparse.Namespace, console: Console) -> int:
     if lines:  # the check makes the output folder
         store.Root(output).check()
     failures = [_failed(args.input, number, None, message) for number, message in faults]
-    jobs = (Job(line, args.op, output, threads, args.overwrite) for line in lines)
     settings = Settings(
         workers, threads, args.gpus, args.timeout or None, args.address, Path(args.logs), dict(args.slurm)
     )
@@ -146,7 +147,14 @@ def _batch(args: argparse.Namespace, console: Console) -> int:
                 failures.append(_failed(args.input, job.line.number, job.line.output, outcome.message + again, log))
             step()
 
-        summary = run(jobs, command, args.on, settings, args.retries, told)
+        summary = dict[str, Any]()
+        for needy in (False, True):
+            stage = [line.at(output) for line in lines if bool(line.needs) == needy]
+            jobs = (Job(line, args.op, output, threads, args.overwrite) for line in stage)
+            if stage or not needy:
+                for name, n in run(jobs, command, args.on, settings, args.retries, told).items():
+                    had = summary.get(name, 0)
+                    summary[name] = max(had, n) if name == "peak_memory" else round(had + n, 3)
     found = {"failed": len(failures), "failures": failures}
     result = {"output": args.output, "op": args.op, "on": args.on, **summary, **found}
     console.result(result, _text(result))

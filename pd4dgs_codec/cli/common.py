@@ -151,7 +151,7 @@ def progress_bar(total: int | None, unit: str, label: str) -> Iterator[Callable[
         done += 1
         if time.monotonic() - told > LINE_SECONDS:
             told = time.monotonic()
-            say(f"{label}: {done}{f' of {total}' if total else ''} {unit}")
+            say(f"{label}: {done} of {total} {unit}" if total else f"{label}: {unit.removesuffix('s')} {done}")
 
     yield count_one
 

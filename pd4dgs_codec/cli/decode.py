@@ -57,7 +57,7 @@ def _decode(args: argparse.Namespace, console: Console) -> int:
         data, max_layer=args.level, max_bytes=args.max_bytes, allow_partial=args.allow_partial, base=base
     )
     seconds = time.perf_counter() - start
-    console.detail(f"steps {scene.steps}")
+    console.detail(f"steps {scene.all_steps}")
     if kind == ".pt":
         common.write_checkpoint(args.output, scene, args.overwrite)
     elif kind == ".npz":

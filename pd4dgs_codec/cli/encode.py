@@ -127,7 +127,7 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
     common.check_output(args.output, args.overwrite)
     scene, viewpoints, metadata = _load(args)
     size = f"{len(scene.anchor_q)} anchors, layers {list(scene.layers)}"
-    console.detail(f"{shown_name(args.input)}: {size}, steps {scene.steps}")
+    console.detail(f"{shown_name(args.input)}: {size}, steps {scene.all_steps}")
     from pd4dgs_codec.quality.packing import Views, pack
     from pd4dgs_codec.scene import Scene
 

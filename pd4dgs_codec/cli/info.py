@@ -135,14 +135,13 @@ def _parts_table(result: dict[str, Any]) -> str:
 
 def _left_out(layers: list[dict[str, Any]]) -> list[dict[str, str]]:
     """Lists layers, deformations and residual heads of known kinds that this file does not have."""
-    from pd4dgs_codec.kinds import NAMES
     from pd4dgs_codec.scene import HEADS
 
     why = "without visible effect, or above --layers"
     rows = {row["layer"]: row for row in layers}
     missing = []
-    for layer, name in enumerate(NAMES[1:], 1):
-        row = rows.get(layer)
+    for layer in (1, 2):
+        row, name = rows.get(layer), f"hexplane of layer {layer}"
         if row is None:
             missing.append(f"layer {layer}")
         elif "networks" in row:  # known only if the whole chunk is present

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import shlex
 from dataclasses import fields, replace
@@ -36,8 +37,14 @@ level. The other values are the paper's, with the mean over time as level 0: ada
 the more the layers differ; uniform samples all levels equally; fixed samples them with probabilities 0.15, 0.30 and
 0.55; top trains only the highest level; all trains every level in every step, at about three times the cost. The first
 tenth of every run trains level 0.
---without turns off: rate, the bitrate terms; planes, the bitrate term of the planes; binary and smooth, the two mask
-terms; tmc, both mask terms; noise, the simulated quantisation; whitening, the transform of the feature channels.
+--without turns off: rate, the bitrate terms; planes, the bitrate term of the planes; binary, the term of the
+masks; noise, the simulated quantisation; whitening, the transform of the feature channels.
+
+--segments 10s writes a folder, -o DIR, for a long SOURCE: a base, of what stands still all the time, and a file for
+each ten seconds that continues it. pd4dgs-info, -render, -eval, -export, -package and -view take the folder as one
+scene. --iterations and --max-seconds are those of the base and of each segment; as many segments train at a time as
+-j has threads. The same command goes on where it was interrupted. --manifest writes the lines by which pd4dgs-batch
+trains base and segments, each by --part; the same command without --manifest then adds the index.
 
 torchrun starts several workers for one scene: they share the V views of a step and average their gradients, and the
 first worker writes the files. Their number must divide V and may change when a run is resumed.
@@ -48,6 +55,7 @@ examples:
   pd4dgs-train synthetic:local -o local.pt --preset tiny --max-seconds 300
   pd4dgs-train recordings/kitchen -o kitchen.pt --downscale 2 --iterations 10000
   pd4dgs-train recordings/kitchen -o kitchen.pt --resume kitchen.pt
+  pd4dgs-train recordings/lesson -o lesson --segments 10s --iterations 3000
   torchrun --nproc-per-node=2 -m -- pd4dgs_codec train synthetic:local -o local.pt --views-per-step 2"""
 
 VIEW_PORT = 8080
@@ -72,8 +80,21 @@ def parser() -> options.Parser:
     add("--view", type=options.port, nargs="?", const=VIEW_PORT, metavar="PORT", help=what)
     what = f"turn off a part of the method, see below (repeatable): {', '.join(ABLATIONS)}"
     add("--without", action="append", choices=tuple(ABLATIONS), metavar="PART", default=[], help=what)
+    parts = p.add_argument_group("segments", "a long capture as a folder of files, see below").add_argument
+    parts("--segments", type=options.duration, metavar="T", help="write segments of about this length, such as 10s")
+    what = "seconds that neighbouring segments share (default: 0s)"
+    parts("--overlap", type=options.duration, metavar="T", help=what)
+    what = "train only the base (base) or segment N, from 0 on, into -o FILE.pd4"
+    parts("--part", type=options.checked(_part, lambda _: True, "base or a number"), metavar="N", help=what)
+    parts("--base", type=options.named, metavar="FILE.pd4", help="with --part N, the trained base")
+    what = "write a manifest of base and segments for pd4dgs-batch, and train nothing"
+    parts("--manifest", type=options.named, metavar="FILE.jsonl", help=what)
     p.add_common()
     return p
+
+
+def _part(text: str) -> int | str:
+    return text if text == "base" else options.count(text)
 
 
 def _add_fields(p: options.Parser) -> None:
@@ -97,6 +118,8 @@ def _add_fields(p: options.Parser) -> None:
 
 def _train(args: argparse.Namespace, console: Console) -> int:
     check_usage(args)
+    if args.segments is not None:
+        return _train_segments(args, console)
     in_place = args.resume is not None and common.same_file(args.resume, args.output)
     check_output(args.output, args.overwrite or in_place)
     if args.log:
@@ -142,12 +165,50 @@ def _train(args: argparse.Namespace, console: Console) -> int:
     return OK
 
 
+def _train_segments(args: argparse.Namespace, console: Console) -> int:
+    """Trains a folder of segments, or one part of it, or writes a manifest of its parts."""
+    from pd4dgs_codec.cli import train_segments as segmented
+
+    config = _fresh_config(args)
+    reading = {name: getattr(config, name) for name in ("downscale", "holdout", "background", "fps")}
+    capture = segmented.Capture(config, reading, args.segments, args.overlap, _device(args.device), args.threads)
+    if args.manifest:
+        check_output(args.manifest, args.overwrite)
+        common.write_bytes(args.manifest, data := segmented.manifest(capture), args.overwrite)
+        lines = data.count(b"\n")
+        console.result({"manifest": args.manifest, "lines": lines}, f"{args.manifest}: {lines} lines")
+        return OK
+    if args.part is None:
+        result = segmented.train_folder(capture, args.output, args.overwrite)
+        console.result(result, _segments_text(result))
+        return OK
+    check_output(args.output, args.overwrite)
+    k, base = (None, None) if args.part == "base" else (args.part, Path(args.base))
+    result = segmented.train_one(capture, k, Path(args.output), base)
+    console.result({"output": args.output, **result}, f"{args.output}: {'' if result['finished'] else 'not '}finished")
+    return OK
+
+
+def _segments_text(result: dict[str, Any]) -> str:
+    sizes = f"{result['base_bytes']:,} bytes of the base, {result['bytes'] - result['base_bytes']:,} of segments"
+    text = f"{result['output']}: {result['segments']} segments, {result['kept']} of them kept; {sizes}"
+    return text if result["finished"] else f"{text}\nnot finished; to go on: the same command"
+
+
 main = command(parser, _train)
 
 
 def check_usage(args: argparse.Namespace) -> None:
     """Raises UsageError for options that do not fit together."""
     options.conditional(args, args.rollout in (None, "key"), "needs --rollout key", key_instant=None)
+    segments = args.segments is not None
+    options.conditional(args, segments, "needs --segments", overlap=0.0, part=None, base=None, manifest=None)
+    if segments:
+        options.conditional(args, False, "has no effect with --segments", log=None, view=None)
+        if (args.base is None) == isinstance(args.part, int):
+            raise UsageError("expected --part N and --base FILE.pd4 together, or neither")
+        if args.resume and not common.same_file(args.resume, args.output):
+            raise UsageError(f"found --resume {args.resume}, expected the folder of -o {args.output}")
     if args.rate_scale and "rate" in args.without:
         raise UsageError(f"found --rate-scale {args.rate_scale:g} and --without rate, expected one of them")
     for option, name in (("-o", args.output), ("--resume", args.resume)):
@@ -345,8 +406,11 @@ def _text(result: dict[str, Any]) -> str:
     if result["skipped"]:
         lines.append(f"{result['skipped']} steps skipped for non-finite gradients")
     for row in result["left_out"]:
-        gain = f"{row['gain']:+.2f} dB over level {row['level'] - 1} in the pixels that it changes"
-        lines.append(f"level {row['level']} left out: {gain}, on {row['views']} held-back views")
+        dB = [-10 * math.log10(max(row[name], 1e-9)) for name in ("error", "instead")]
+        lines.append(
+            f"left out above level {row['kept']}: {dB[0]:.2f} dB on {row['views']} held-back views, "
+            f"{dB[1]:.2f} once level {row['kept']} had trained in its place"
+        )
     if result["levels"]:
         split = "held-out" if result["split"] == "test" else "training-view"
         rows = zip(result["levels"], result["active_anchors"], strict=False)

@@ -1,10 +1,11 @@
-"""`synthetic:NAME[?seed=n&size=WxH&frames=N&path=PATH]`: ray-cast dynamic scenes, named in STAGES, and RANDOM, which
-draws bodies, background and camera path from its seed.
+"""`synthetic:NAME[?seed=n&size=WxH&frames=N&seconds=S&path=PATH]`: ray-cast dynamic scenes, named in STAGES, and
+RANDOM, which draws bodies, background and camera path from its seed.
 
 In a room one camera moves along an arc (60 training frames); two fixed cameras off that arc give the test views, with
 exact covisibility masks. On white the camera jumps on the upper hemisphere, as D-NeRF's does (150 frames without
 points); two fixed cameras see all instants, of the dancer 15. Another size keeps the vertical field of view; more
-frames repeat the same motion more densely. The content depends on the source string alone.
+frames repeat the same motion more densely, and in a room more seconds go on with it. The content depends on the source
+string alone.
 """
 
 import re
@@ -21,17 +22,19 @@ from pd4dgs_codec.data.dancer import DANCER, Dancer
 from pd4dgs_codec.data.dataset import SYNTHETIC
 from pd4dgs_codec.data.files import check_downscale, split_options
 from pd4dgs_codec.data.random_bodies import RANDOM, random_scene
-from pd4dgs_codec.data.view import Dataset, Lens, View, shrunk_view, world_to_camera
+from pd4dgs_codec.data.view import LATER, Dataset, Lens, View, later_view, shrunk_view, world_to_camera
 from pd4dgs_codec.errors import DataError
 
 SUPERSAMPLING = 2
 SECONDS = 59 / 12
 #: Allowed values of the options.
-SIZES, FRAMES = range(8, 8193), range(3, 10_001)
+SIZES, FRAMES, LENGTHS = range(8, 8193), range(3, 10_001), range(1, 3601)
+FPS = 12  #: of a scene whose seconds are given, and its frames are not
 EXAMPLES = {
     "seed": "seed=1",
     "size": f"size=960x540, each {SIZES[0]} to {SIZES[-1]}",
     "frames": f"frames=300, {FRAMES[0]} to {FRAMES[-1]}",
+    "seconds": f"seconds=60, {LENGTHS[0]} to {LENGTHS[-1]}",
     "path": "path=pass, sweeps, orbit, jump or still",
 }
 STILL, STANDS, CAMERAS = "still", 0.5, 6
@@ -142,7 +145,8 @@ Shot = tuple[np.ndarray, int, int]
 
 @dataclass(frozen=True)
 class Take:
-    """A parsed source. size: (width, height) of the pictures; frames: of the moving camera; path: its name in PATHS."""
+    """A parsed source. size: (width, height) of the pictures; frames: of the moving camera; path: its name in PATHS.
+    seconds: of the scene."""
 
     name: str
     stage: Stage = field(compare=False)  # the name decides it
@@ -150,6 +154,7 @@ class Take:
     frames: int
     path: str
     seed: int = 0
+    seconds: float = SECONDS
 
     @property
     def lens(self) -> Lens:
@@ -162,6 +167,10 @@ class Take:
     def times(self) -> list[float]:
         """The instants of the training frames."""
         return [i / (self.frames - 1) for i in range(self.frames)]
+
+    def clock(self, time: float) -> float:
+        """The time by which bodies and camera move, of a normalised time: 1 after the usual length."""
+        return time * (self.seconds / SECONDS)
 
     def bodies(self) -> list[Body]:
         """All bodies of the scene."""
@@ -176,7 +185,7 @@ class Take:
             places = enumerate(rng.uniform(size=CAMERAS).tolist())
             return [self.stage.viewmat(STANDS * (k + 0.5) / CAMERAS, s) for k, s in places]
         if turns is not None:
-            return [self.stage.viewmat(turns * t, t) for t in self.times]
+            return [self.stage.viewmat(turns * t, t) for t in map(self.clock, self.times)]
         return [self.stage.viewmat(phase, s) for phase, s in rng.uniform(size=(self.frames, 2)).tolist()]
 
     def shots(self) -> tuple[list[Shot], list[Shot]]:
@@ -198,6 +207,10 @@ def parse(source: str) -> Take:
     if stage is None:
         expected = f"{SYNTHETIC}{'|'.join((*STAGES, RANDOM))}[?seed=n&size=WxH&frames=N&path={'|'.join(PATHS)}]"
         raise DataError(f"{source}: unknown synthetic scene, expected {expected}")
+    if "seconds" in options:
+        if name not in MOTIONS:
+            raise DataError(f"{source}: found seconds, expected them of {SYNTHETIC}{'|'.join(MOTIONS)} alone")
+        options.setdefault("frames", max(FPS * options["seconds"], FRAMES[0]))
     usual: dict[str, Any] = {"size": (stage.lens.width, stage.lens.height), "frames": stage.frames, "path": stage.path}
     return Take(name, stage, **(usual | options))
 
@@ -211,7 +224,8 @@ def _value(key: str, text: str) -> Any:
     numbers = tuple(map(int, text.split("x")))
     if key == "size" and len(numbers) == 2 and all(v in SIZES for v in numbers):
         return numbers
-    if key == "seed" and len(numbers) == 1 or key == "frames" and len(numbers) == 1 and numbers[0] in FRAMES:
+    allowed = {"frames": FRAMES, "seconds": LENGTHS}.get(key)
+    if len(numbers) == 1 and (key == "seed" or allowed and numbers[0] in allowed):
         return numbers[0]
     raise ValueError(text)
 
@@ -311,22 +325,28 @@ def _initial_points(
 
 
 @lru_cache(maxsize=4)
-def _dataset(take: Take) -> Dataset:
-    stage, lens, times, scene = take.stage, take.lens, take.times, take.bodies()
+def _dataset(take: Take, later: bool = False) -> Dataset:  # `later`: as LATER, of views that differ by it
+    stage, lens, scene = take.stage, take.lens, take.bodies()
+    times = take.times
+    moments = [take.clock(time) for time in times]
     shots, tested = take.shots()
-    eyes = [Eye(place(scene, times[i]), viewmat) for viewmat, _, i in shots]
+    eyes = [Eye(place(scene, moments[i]), viewmat) for viewmat, _, i in shots]
 
     def view(viewmat: np.ndarray, camera: int, i: int, *, masked: bool = False) -> View:
-        image, K = _render(scene, viewmat, times[i], lens, stage.background), lens.matrix()
-        mask = _covisible(scene, eyes, viewmat, times[i], lens) if masked else None
-        return View(viewmat.astype(np.float32), K, *take.size, times[i], image, mask, f"{camera}_{i:05d}", camera)
+        def pixels() -> tuple[np.ndarray, np.ndarray | None]:
+            image = _render(scene, viewmat, moments[i], lens, stage.background)
+            return image, _covisible(scene, eyes, viewmat, moments[i], lens) if masked else None
+
+        fields = {"viewmat": viewmat.astype(np.float32), "K": lens.matrix(), "width": lens.width, "height": lens.height}
+        fields |= {"time": times[i], "name": f"{camera}_{i:05d}", "camera_id": camera}
+        return later_view(pixels, fields)
 
     train = tuple(view(*shot) for shot in shots)
     test = tuple(view(*shot, masked=stage.capture) for shot in tested)
     points = None
     if stage.capture:
         points = _initial_points(scene, take.viewmats(), lens, stage.box, np.random.default_rng([take.seed, 1]))
-    fields = stage.background, (0.0, SECONDS), (0.0, 0.0, 1.0), stage.capture
+    fields = stage.background, (0.0, float(take.seconds)), (0.0, 0.0, 1.0), stage.capture
     return Dataset(f"synthetic-{take.name}", train, test, points, stage.box, NEAR, FAR, *fields)
 
 
@@ -334,7 +354,7 @@ def read_synthetic(source: str, downscale: int = 1) -> Dataset:
     """The scene that `source` names, rendered once per process and kept in memory."""
     take = parse(source)
     check_downscale(take.size, downscale, source)
-    full = _dataset(take)
+    full = _dataset(take, LATER.get())
     if downscale == 1:
         return full
     K = take.lens.matrix(downscale)
@@ -361,12 +381,12 @@ def movers(source: str, views: Sequence[View]) -> list[Mover]:
     """All bodies of a synthetic scene that move, in some of its views."""
     take = parse(source)
     scene, lens = take.bodies(), take.lens
-    cameras = [(view.viewmat.astype(np.float64), view.time) for view in views]
+    cameras = [(view.viewmat.astype(np.float64), take.clock(view.time)) for view in views]
     hits = [Eye(place(scene, t), viewmat).first_hits(*_grid(lens))[1] for viewmat, t in cameras]
     valid = [True if view.mask is None else view.mask for view in views]
     found = []
     for k, body in enumerate(scene):
-        A, c = (np.stack(parts) for parts in zip(*map(body.pose, take.times), strict=True))
+        A, c = (np.stack(parts) for parts in zip(*map(body.pose, map(take.clock, take.times)), strict=True))
         if np.ptp(A, axis=0).max() + np.ptp(c, axis=0).max() == 0:
             continue
         others = scene[:k] + scene[k + 1 :]

@@ -2,9 +2,11 @@
 lens distortion; for all readers, a dataset of frames: split, times, scene box, depth range and background."""
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -60,6 +62,10 @@ BAND_PIXELS = 1 << 18  #: resampled at once, some 100 bytes each
 USES = 4  #: of a picture at most, such as for training and for testing
 #: Views whose pixels count in a fingerprint, evenly spread, and how many such pixels the shorter side has about.
 SAMPLED, PER_SIDE = 16, 64
+#: Views whose borders decide a background where pixels are read later.
+BORDERS = 40
+#: Whether readers leave the pixels of views to their accesses, see `pixels_later`.
+LATER: ContextVar[bool] = ContextVar("LATER", default=False)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,6 +105,44 @@ class View:
         inside = (z > 0) & (column >= 0) & (column < self.width) & (line >= 0) & (line < self.height)
         line, column = (np.where(inside, part, 0).astype(np.int64) for part in (line, column))
         return line, column, inside
+
+
+class LaterView(View):
+    """A view whose pixels are read at each access to its image or mask. read: returns both."""
+
+    def __init__(self, read: Callable[[], tuple[np.ndarray, np.ndarray | None]], **fields: Any) -> None:
+        """fields: all fields of a View but `image` and `mask`."""
+        self.read: Callable[[], tuple[np.ndarray, np.ndarray | None]]
+        for name, value in {**fields, "read": read}.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def image(self) -> np.ndarray:
+        """uint8 [H, W, 3]."""
+        return self.read()[0]
+
+    @property
+    def mask(self) -> np.ndarray | None:
+        """bool [H, W], or None."""
+        return self.read()[1]
+
+
+def later_view(read: Callable[[], tuple[np.ndarray, np.ndarray | None]], fields: dict[str, Any]) -> View:
+    """The view of these fields, with its pixels within `pixels_later` at each access, else now."""
+    if LATER.get():
+        return LaterView(read, **fields)
+    image, mask = read()
+    return View(image=image, mask=mask, **fields)
+
+
+@contextmanager
+def pixels_later() -> Iterator[None]:
+    """Within the block, readers check the pictures of long recordings, and leave their pixels to `LaterView`."""
+    before = LATER.set(True)
+    try:
+        yield
+    finally:
+        LATER.reset(before)
 
 
 @dataclass(frozen=True)
@@ -402,6 +446,15 @@ def shrunk_view(view: View, k: int) -> View:
 
 def read_view(frame: UnreadView, time: float, downscale: int, under: Color | None) -> View:
     """The frame with its pixels, undistorted and downscaled. time: normalised. under: as in `read_image`."""
+    lens = frame.lens
+    fields = {"viewmat": frame.viewmat.astype(np.float32), "K": lens.matrix(downscale), "time": time}
+    fields |= {"width": lens.width // downscale, "height": lens.height // downscale}
+    fields |= {"name": frame.name, "camera_id": frame.camera_id}
+    return later_view(partial(_pixels, frame, downscale, under), fields)
+
+
+def _pixels(frame: UnreadView, downscale: int, under: Color | None) -> tuple[np.ndarray, np.ndarray | None]:
+    """(image, mask) of a frame, as a View has them."""
     lens, size = frame.lens, (frame.lens.width, frame.lens.height)
     if lens.is_pinhole:
         image = read_image(frame.image, size, downscale=downscale, under=under)
@@ -413,9 +466,7 @@ def read_view(frame: UnreadView, time: float, downscale: int, under: Color | Non
             valid = np.where(read_mask(frame.mask, size), 255, 0)[..., None].astype(np.uint8)
             whole = rectify(valid, lens)[0][..., 0] == 255  # all pixels between which a place lies
             mask &= shrink_mask(whole, downscale)
-    height, width = image.shape[:2]
-    viewmat = frame.viewmat.astype(np.float32)
-    return View(viewmat, lens.matrix(downscale), width, height, time, image, mask, frame.name, frame.camera_id)
+    return image, mask
 
 
 # -- datasets ----------------------------------------------------------------------------------------------------------
@@ -480,11 +531,12 @@ def posed_dataset(
     pictures = sum(len(files_of(place, PICTURES)) for place in {frame.image.parent for frame in frames})
     posed = origin.posed or f"{len(files)} of {pictures} pictures have a pose"
     views = [read_view(f, t, downscale, under) for f, t in zip(frames, times, strict=True)]
+    bordering = thinned(views[: len(train)], BORDERS if LATER.get() else len(train))
     return Dataset(
         name=folder.resolve().name,
         train=tuple(views[: len(train)]),
         test=tuple(views[len(train) :]),
-        background=background or (WHITE if alpha else border_color(views[: len(train)])),
+        background=background or (WHITE if alpha else border_color(bordering)),
         time_range=seconds_range(start, stop),
         origin=replace(origin, posed=posed, alpha=alpha),
         **shape,
@@ -663,5 +715,10 @@ def depth_range(views: Sequence[np.ndarray], box: np.ndarray, points: np.ndarray
     if not len(ahead):
         side = float((box[1] - box[0]).max())
         return 0.01 * side, 100.0 * side
-    near, far = np.percentile(ahead, [0.5, 99.5])
+    return depth_bounds(ahead)
+
+
+def depth_bounds(depths: np.ndarray) -> tuple[float, float]:
+    """(near, far): half the nearest and 1.5 times the farthest of some depths, without strays as in `points_box`."""
+    near, far = np.percentile(depths, [0.5, 99.5])
     return float(0.5 * near), float(1.5 * far)

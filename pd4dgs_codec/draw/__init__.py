@@ -4,6 +4,7 @@
 `pd4dgs_codec.threads.configure` sets the number of threads.
 """
 
+from dataclasses import replace
 from threading import Lock
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -32,6 +33,6 @@ def render(scene: AnyScene, camera: Camera, t: float, level: int | None = None) 
     with _one:
         players = _players.setdefault(scene, {})
         if part.level not in players:
-            players[part.level] = drawer(part)
+            players[part.level] = drawer(replace(part))  # a copy: a value that held its key would keep it forever
         picture: np.ndarray = players[part.level].picture(camera, t)
     return picture

@@ -4,9 +4,9 @@ Playback and training on the CPU share these functions; `model.reference` has th
 slots of one Gaussian each. About one in six is drawn, so all networks but opacity are evaluated for kept slots only.
 
 Common arguments, floats of one dtype: keep int64 [K], ascending, anchor * G + offset of each kept Gaussian; anchors
-[n, 9 + D + 3 G], per row position, feature [D], offsets [G, 3] and log scalings [6], the residual heads in the
-registry's order; gaussians [K, 14], per row mean, scales, quaternion, opacity and colour; hidden [n, columns], of
-which a layer reads H, a multiple of LANES, from `column` on. Backward passes split the Gaussians over threads between
+[n, 9 + D + 3 G], per row position, feature [D], log scalings [6] and offsets [G, 3], the attributes in their order;
+gaussians [K, 14], per row mean, scales, quaternion, opacity and colour; hidden [n, columns], of which a layer reads H,
+a multiple of LANES, from `column` on. Backward passes split the Gaussians over threads between
 anchors, so that each part owns its rows of the result. Sums over all Gaussians are kept per part and added in order:
 results are bitwise reproducible for a fixed number of parts.
 """
@@ -56,7 +56,6 @@ MIN_NORM = 1e-12
 SCALE, QUAT, OPACITY, COLOR = 3, 6, 10, 11
 GAUSSIAN_WIDTH = COLOR + 3
 KEPT = 1024  #: Gaussians that share scratch memory
-SCALING = slice(-SCALING_DIM, None)  #: columns of the log scalings in an anchor's row
 
 
 def near_plane(info: SceneInfo) -> float:
@@ -152,7 +151,8 @@ class Decoders:
         """Evaluates the Gaussians of the kept slots; mask [n] gates the anchors."""
         shape, color = (head(keep, *hidden) for head, hidden in zip(self._heads, look.hidden, strict=True))
         _, sigmoid, exp = self._functions
-        relative, extent = sigmoid(shape), exp(np.ascontiguousarray(anchors[:, SCALING]))
+        scaling = anchors[:, 3 + self._features : 3 + self._features + SCALING_DIM]
+        relative, extent = sigmoid(shape), exp(np.ascontiguousarray(scaling))
         gaussians, gates = np.empty((len(keep), GAUSSIAN_WIDTH), anchors.dtype), np.empty(len(keep), anchors.dtype)
         assemble(gaussians, gates, keep, anchors, extent, look.opacity, mask, shape, relative, sigmoid(color))
         return Made(gaussians, gates, shape, relative, extent)
@@ -437,7 +437,7 @@ def assemble(
     shape [K, 7], its last four the quaternion; relative [K, 7], its first three the sizes within 0..1; color [K, 3].
     """
     slots = opacity.shape[1]
-    offset = anchors.shape[1] - SCALING_DIM - 3 * slots
+    offset = anchors.shape[1] - 3 * slots
     for k in range(tasks[0], tasks[1]):
         n, o = keep[k] // slots, keep[k] % slots
         for i in range(3):
@@ -492,8 +492,9 @@ def assemble_backward(
 ) -> None:
     """The transpose of `assemble`: fills g_shape, g_color and, given zeroed, g_anchors, g_opacity and g_mask. Gradients
     of opacities, sizes and colours are by the values before tanh and sigmoid, those of scalings by the logarithms."""
-    slots, scaling = g_opacity.shape[1], anchors.shape[1] - SCALING_DIM
-    offset = scaling - 3 * slots
+    slots = g_opacity.shape[1]
+    offset = anchors.shape[1] - 3 * slots
+    scaling = offset - SCALING_DIM
     for part in range(tasks[0], tasks[1]):
         begin, end = _part(keep, slots, part, parts)
         for k in range(begin, end):

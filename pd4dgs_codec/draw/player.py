@@ -5,6 +5,7 @@ Pictures of the two agree up to rounding: activations differ in the last bit.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -48,7 +49,7 @@ class Drawer:
     """Draws the highest level of a decoded scene of any kind. Not thread-safe."""
 
     def __init__(self, scene: AnyScene):
-        self.info, self.level, self.background = scene.info, scene.level, scene.background()
+        self.scene, self.info, self.level, self.background = scene, scene.info, scene.level, scene.background()
         self.active = scene.active  #: int64 [n]: the anchors active at this level, ascending
         self.still = scene.still  #: whether all times look alike
 
@@ -57,8 +58,8 @@ class Drawer:
         return self, t
 
     def gaussians(self, camera: Camera, t: float) -> Gaussians:
-        """Returns the Gaussians that the camera may see at normalised time t in 0..1."""
-        raise NotImplementedError
+        """Returns the Gaussians that the camera may see at normalised time t, clamped to 0..1."""
+        return self.scene.gaussians(min(max(t, 0.0), 1.0), eye=camera.eye)
 
     def picture(self, camera: Camera, t: float) -> np.ndarray:
         """Draws float32 [H, W, 3] in 0..1 at normalised time t in 0..1. Raises RenderError unless t is finite."""
@@ -76,8 +77,10 @@ class Drawer:
 
 
 def drawer(scene: AnyScene) -> Drawer:
-    """Returns what draws a scene of this kind."""
-    return SplatPlayer(scene) if isinstance(scene, SplatScene) else Player(scene)
+    """Returns what draws a scene fastest."""
+    if isinstance(scene, Scene):
+        return Player(scene)
+    return SplatPlayer(scene) if isinstance(scene, SplatScene) else Drawer(scene)
 
 
 class SplatPlayer(Drawer):
@@ -85,7 +88,6 @@ class SplatPlayer(Drawer):
 
     def __init__(self, scene: SplatScene):
         super().__init__(scene)
-        self.scene = scene
         self._moving = Moving(scene)
         self._time, self._latest = 0.0, self._moving.at(0.0)
 
@@ -117,9 +119,8 @@ class Player(Drawer):
         self._anchor = np.ascontiguousarray(scene.anchor[: len(codes)], np.float32)
         self.slots = scene.widths.slots  #: Gaussians of an anchor
         #: float32 [N, 9 + D + 3 G]: rows of the kernels, to which the deformation adds
-        self._table = np.concatenate(
-            [self._anchor, scene.feature, scene.offset.reshape(len(codes), 3 * self.slots), scene.scaling_log], axis=1
-        )
+        flat = [scene.attributes[name].reshape(-1, math.prod(shape)) for name, shape in scene.widths.attributes.items()]
+        self._table = np.concatenate([self._anchor, *flat], axis=1)
         extent = np.exp(scene.scaling_log)
         self._radius = OFFSET_REACH * extent[:, :3].max(axis=1) + SIGMA_REACH * extent[:, 3:].max(axis=1)
         motion = scene.motion(scene.level)

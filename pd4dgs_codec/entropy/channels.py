@@ -21,7 +21,6 @@ from pd4dgs_codec.entropy.priors import (
     FIRST_REUSE,
     FREE_ENTRIES,
     K_MAX,
-    MORE_ENTRIES,
     Prior,
     Window,
     make_models,
@@ -56,26 +55,29 @@ class ChannelWriter:
     """Codes the channels of a slice, batch by batch in the order of decoding.
 
     priors: "gauss" allows only const and gauss, the model of R(a). "best" allows every prior. effort: 1..9, time spent
-    on fitting. later: whether earlier slices of the layer have defined priors. Raises EncodeError.
+    on fitting. known: the priors that earlier slices of the layer have defined; new ones are appended. Raises
+    EncodeError.
     """
 
-    def __init__(self, priors: str = "best", effort: int = 5, later: bool = False):
+    def __init__(self, priors: str = "best", effort: int = 5, known: list[Fitted] | None = None):
         if priors not in PRIORS or effort not in EFFORTS:
             raise EncodeError(f"expected priors best or gauss and effort 1..9, found {priors!r} and {effort}")
         self.codes = bytearray()
         self._ends = [(0, 0)]  # of the batches so far: channels and bytes of codes
         self._fit: Fit = (lambda h: fit_best(h, effort)) if priors == "best" and effort > 1 else fit_gauss
         self._share = effort > 2
-        self._spare = MORE_ENTRIES if later else FREE_ENTRIES  # window entries beyond the symbols of the batches
+        self._known = [] if known is None else known
+        # window entries that the batches may have beyond their symbols
+        self._spare = max(FREE_ENTRIES - sum(fitted.prior.window.n for fitted in self._known), 0)
         self._symbols, self._cums = list[np.ndarray](), list[np.ndarray]()
 
-    def write(self, channels: Sequence[np.ndarray], known: list[Fitted], counted: int | None = None) -> float:
+    def write(self, channels: Sequence[np.ndarray], counted: int | None = None) -> float:
         """Codes channels int [any], |k| <= 2**24, as the next batch. Returns the sum of R(a).
 
-        known: the prior list, to which new priors are appended. counted: symbols for which the windows may have an
-        entry each, by default all; of further entries a batch uses at most half of what is left.
+        counted: symbols for which the windows may have an entry each, by default all; of further entries a batch uses
+        at most half of what is left.
         """
-        arrays = [array for array in check_channels(channels) if len(array)]
+        known, arrays = self._known, [array for array in check_channels(channels) if len(array)]
         histograms, first = [histogram(a) for a in arrays], len(known)
         counted = sum(map(len, arrays)) if counted is None else counted
         plan = plan_priors(histograms, self._fit, self._share, known, counted + self._spare // 2)
@@ -111,7 +113,7 @@ def _write_channel(out: bytearray, fitted: Fitted, exceptions: _Exceptions, know
     """Writes a channel's record. If it defines its prior, this is appended to `known`."""
     prior = fitted.prior
     back = next((i for i, other in enumerate(reversed(known)) if other.prior is prior), None)
-    family = prior.id if back is None else FIRST_REUSE + back
+    family = prior.family if back is None else FIRST_REUSE + back
     put_varint(out, 2 * family + (len(exceptions.positions) > 0))
     if back is None:
         prior.write(out)
@@ -146,28 +148,31 @@ def _read_exceptions(reader: ByteReader, count: int, window: Window) -> _Excepti
 class ChannelReader:
     """Decodes the channels of a slice, batch by batch: the inverse of ChannelWriter.
 
-    symbols: number of symbols that the slice declares. later: whether it is a later slice of its layer. The caller has
-    checked the numbers of symbols against its limits. Raises Malformed (cut, trailing or corrupt bytes), LimitExceeded,
-    or UnsupportedFeature (a prior outside the registry).
+    symbols: number of symbols that the slices so far declare, which the caller has checked against its limits. known:
+    the priors that earlier slices of the layer have defined; new ones are appended. Raises Malformed (cut, trailing or
+    corrupt bytes), LimitExceeded, or UnsupportedFeature (a prior outside the registry).
     """
 
-    def __init__(self, codes: bytes | memoryview, stream: bytes | memoryview, symbols: int, later: bool = False):
+    def __init__(
+        self, codes: bytes | memoryview, stream: bytes | memoryview, symbols: int, known: list[Prior] | None = None
+    ):
         self.codes = ByteReader(codes)
         self._stream = AnsDecoder(stream)
-        self._entries = self._most = symbols + (MORE_ENTRIES if later else FREE_ENTRIES)
+        self._known = [] if known is None else known
+        self._most = symbols + FREE_ENTRIES
+        self._entries = sum(prior.window.n for prior in self._known)
 
-    def read(self, counts: Sequence[int], known: list[Prior]) -> np.ndarray:
-        """Decodes channels of these lengths into one array, int32 [sum of counts]. known: the prior list, to which new
-        priors are appended."""
-        first, heads = len(known), list[_Head]()
+    def read(self, counts: Sequence[int]) -> np.ndarray:
+        """Decodes channels of these lengths into one array, int32 [sum of counts]."""
+        known, heads = self._known, list[_Head]()
+        first = len(known)
         for count in filter(None, counts):
             before = len(known)
             head = _read_channel(self.codes, count, known)
             if len(known) > before:
-                self._entries -= known[-1].window.n
-                if self._entries < 0:
-                    found = self._most - self._entries
-                    raise LimitExceeded(f"tables of {found} entries in one slice, limit {self._most}")
+                self._entries += known[-1].window.n
+                if self._entries > self._most:
+                    raise LimitExceeded(f"tables of {self._entries} entries in one layer, limit {self._most}")
             elif heads and head[0] == heads[-1][0] and (longer := _joined(heads[-1], head)):
                 heads[-1] = longer
                 continue

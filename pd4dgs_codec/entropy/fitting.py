@@ -20,9 +20,6 @@ from pd4dgs_codec.entropy.priors import (
     BIT,
     K_MAX,
     MAX_WINDOW,
-    Const,
-    Gauss,
-    Mixture,
     Normal,
     Prior,
     Window,
@@ -126,7 +123,7 @@ def fit_gauss(h: Histogram) -> Fitted:
         return _const(h, 0)
     window = _fullest_window(h)
     mu8, si, cost, costs = loops().gauss(_dense(h, window))
-    found = _fitted(Gauss(window, Normal(mu8, si)), costs, cost + _beside(h, window))
+    found = _fitted(Prior(window, (Normal(mu8, si),)), costs, cost + _beside(h, window))
     mode = int(h.counts.argmax())
     return min(found, _const(h, mode), key=_total) if h.total - int(h.counts[mode]) <= 8 else found
 
@@ -144,7 +141,7 @@ def fit_best(h: Histogram, effort: int) -> Fitted:
     if spare <= 40 + 0.72 * len(seen):  # a mixture takes five more bytes; a sample's entropy is low by log2(e) / 2 each
         return found
     mu1, si1, mu2, si2, weight, cost, costs = loops().mixture(dense, effort)
-    mixture = Mixture(window, Normal(mu1, si1), Normal(mu2, si2), weight)
+    mixture = Prior(window, (Normal(mu1, si1), Normal(mu2, si2)), weight)
     return min(found, _fitted(mixture, costs, cost + beside), key=_total)
 
 
@@ -154,7 +151,7 @@ def _total(fitted: Fitted) -> int:
 
 def _const(h: Histogram, mode: int) -> Fitted:
     window = Window(int(h.values[mode]), 1)
-    return _fitted(Const(window), np.zeros(1, np.int64), _beside(h, window))
+    return _fitted(Prior(window), np.zeros(1, np.int64), _beside(h, window))
 
 
 def _fitted(prior: Prior, costs: np.ndarray, own: int) -> Fitted:
@@ -178,7 +175,7 @@ def _beside(h: Histogram, window: Window) -> int:
     """Cost of the symbols outside the window as exceptions."""
     if window.kmin <= h.values[0] and h.values[-1] < window.end:
         return 0
-    free = Fitted(Const(window), np.zeros(window.n, np.int64), 0, 0)
+    free = Fitted(Prior(window), np.zeros(window.n, np.int64), 0, 0)
     return int(costs_of([h], [free])[0, 0])
 
 
@@ -206,7 +203,7 @@ def plan_priors(
     """Returns the prior of each channel; channels that share one get the same object. share: whether channels may share
     new priors. known: priors that were described earlier, at no cost now. room: most entries of all new tables, at
     least one per channel."""
-    plan = [fit(h) for h in histograms]
+    plan = fits = [fit(h) for h in histograms]
     far = len(known) - NEAR
     free = [replace(fitted, price=0, token=8 * BIT * (i < far)) for i, fitted in enumerate(known)]
     if free and plan:
@@ -218,7 +215,7 @@ def plan_priors(
     narrow = [c for c, h in enumerate(histograms) if len(h.values) <= WIDE]
     for start in range(0, len(narrow) if share else 0, BLOCK):
         block = narrow[start : start + BLOCK]
-        shared = _shared([histograms[c] for c in block], [plan[c] for c in block], free)
+        shared = _shared([histograms[c] for c in block], [fits[c] for c in block], free)
         for c, prior in zip(block, shared, strict=True):
             plan[c] = prior
     return _within(room, histograms, plan, free, fit)

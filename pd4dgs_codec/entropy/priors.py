@@ -6,8 +6,7 @@ A table is ``cum`` int64 [n + 1], strictly increasing from 0 to 2**24; symbol q 
 Tables are the only probabilities in the format. Their rules use integers below 2**53 only, so Python, C and JavaScript
 build the same table on every machine.
 
-A new prior needs a subclass of `_Tabled` with an id, `cum`, `write` and `read`, and its name in `Prior`. `make_models`
-only saves time: a family that it does not list makes its tables one by one.
+A new family needs its fields in `Prior` and `read_prior` and its table in `normal_tables` and `_few_entries`.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, TypeVar, get_args
 
 import numpy as np
 
@@ -26,11 +24,12 @@ from pd4dgs_codec.errors import Malformed, UnsupportedFeature
 
 K_MAX = 1 << 24  #: |k| of any symbol
 MAX_WINDOW = 1 << 14
-#: Most entries of all tables that a slice defines, beyond one per symbol: the first of its layer, and a later one. They
-#: bound memory: eight bytes can define a table of 2**14 entries, 128 KiB.
-FREE_ENTRIES, MORE_ENTRIES = 1 << 18, 1 << 10
+#: Most entries of all tables that a layer defines, beyond one per symbol of the file so far. They bound memory: eight
+#: bytes can define a table of 2**14 entries, 128 KiB.
+FREE_ENTRIES = 1 << 18
 MU8_MAX = 1 << 31
 SI_MIN, SI_MAX = -640, 1280  #: sigma = Q * 2 ** (si / 64)
+FAMILIES = range(3)
 FIRST_REUSE = 8  #: family codes from here on refer to an earlier prior
 
 
@@ -43,19 +42,6 @@ class Window:
     def end(self) -> int:
         """The first symbol above the window."""
         return self.kmin + self.n
-
-    def write(self, out: bytearray) -> None:
-        put_zigzag(out, self.kmin)
-        put_varint(out, self.n - 2)
-
-    @classmethod
-    def read(cls, reader: ByteReader) -> Window:
-        at = reader.offset
-        kmin = reader.zigzag(K_MAX, "the window's first symbol")
-        n = 2 + reader.varint(MAX_WINDOW - 2, "the window's size")
-        if kmin + n - 1 > K_MAX:
-            raise Malformed(f"a window of symbols {kmin}..{kmin + n - 1}, limit {K_MAX}", offset=at)
-        return cls(kmin, n)
 
 
 @dataclass(frozen=True)
@@ -75,96 +61,77 @@ class Normal:
         return cls(mu8, reader.varint(SI_MAX - SI_MIN, "a Gaussian's width") + SI_MIN)
 
 
-class _Tabled:
-    """Base of all priors: the table cum int64 [n + 1] and its model, which `make_models` can set for many at once."""
+_ANY = Normal(0, 0)  # of a table of one entry
+
+
+@dataclass(frozen=True, eq=False)
+class Prior:
+    """A family of priors is numbered by its Gaussians. 0: every symbol is kmin, at no cost. 1: a Gaussian, the model of
+    R(a). 2: a mixture, whose `weight` 1..255 is the second one's share in 1/256."""
+
+    window: Window
+    normals: tuple[Normal, ...] = ()
+    weight: int = 0
+
+    @property
+    def family(self) -> int:
+        """Its number in the bitstream."""
+        return len(self.normals)
 
     @cached_property
-    def cum(self: Any) -> np.ndarray:
-        return normal_tables([self])[0]
+    def cum(self) -> np.ndarray:
+        """The table, int64 [n + 1]."""
+        return np.array(_few_entries(self)) if self.window.n <= FEW else normal_tables([self])[0]
 
     @cached_property
     def model(self) -> Model | None:
+        """The model of the table; `make_models` can set it for many priors at once."""
         return model_of(self.cum)
-
-
-@dataclass(frozen=True, eq=False)
-class Const(_Tabled):
-    """Every symbol is kmin; costs nothing per symbol."""
-
-    id: ClassVar[int] = 0
-    window: Window
 
     def write(self, out: bytearray) -> None:
         put_zigzag(out, self.window.kmin)
-
-    @classmethod
-    def read(cls, reader: ByteReader) -> Const:
-        return cls(Window(reader.zigzag(K_MAX, "a constant"), 1))
-
-
-@dataclass(frozen=True, eq=False)
-class Gauss(_Tabled):
-    """A quantised Gaussian, the model of R(a)."""
-
-    id: ClassVar[int] = 1
-    window: Window
-    normal: Normal
-
-    def write(self, out: bytearray) -> None:
-        self.window.write(out)
-        self.normal.write(out, self.window.n)
-
-    @classmethod
-    def read(cls, reader: ByteReader) -> Gauss:
-        window = Window.read(reader)
-        return cls(window, Normal.read(reader, window.n))
+        if self.normals:
+            put_varint(out, self.window.n - 2)
+        for normal in self.normals:
+            normal.write(out, self.window.n)
+        if self.family == 2:
+            out.append(self.weight)
 
 
-@dataclass(frozen=True, eq=False)
-class Mixture(_Tabled):
-    """Two quantised Gaussians; `weight` 1..255 is the second one's share in 1/256."""
-
-    id: ClassVar[int] = 2
-    window: Window
-    first: Normal
-    second: Normal
-    weight: int
-
-    def write(self, out: bytearray) -> None:
-        self.window.write(out)
-        self.first.write(out, self.window.n)
-        self.second.write(out, self.window.n)
-        out.append(self.weight)
-
-    @classmethod
-    def read(cls, reader: ByteReader) -> Mixture:
-        window = Window.read(reader)
-        first, second = Normal.read(reader, window.n), Normal.read(reader, window.n)
-        weight = reader.byte("a mixture's weight")
-        if weight == 0:
-            raise Malformed("a mixture with a weight of 0", offset=reader.offset)
-        return cls(window, first, second, weight)
-
-
-Prior = Const | Gauss | Mixture
-AnyPrior = TypeVar("AnyPrior", bound=Prior)
-_FAMILIES: dict[int, type[Prior]] = {family.id: family for family in get_args(Prior)}
+def read_prior(reader: ByteReader, family: int) -> Prior:
+    """Reads a prior of a family. Raises UnsupportedFeature for a family outside the registry."""
+    if family not in FAMILIES:
+        raise UnsupportedFeature(f"prior family {family}, expected one of {list(FAMILIES)}", offset=reader.offset)
+    at, kmin = reader.offset, reader.zigzag(K_MAX, "the window's first symbol")
+    n = 2 + reader.varint(MAX_WINDOW - 2, "the window's size") if family else 1
+    if kmin + n - 1 > K_MAX:
+        raise Malformed(f"a window of symbols {kmin}..{kmin + n - 1}, limit {K_MAX}", offset=at)
+    normals, weight = tuple(Normal.read(reader, n) for _ in range(family)), 0
+    if family == 2 and (weight := reader.byte("a mixture's weight")) == 0:
+        raise Malformed("a mixture with a weight of 0", offset=reader.offset)
+    return Prior(Window(kmin, n), normals, weight)
 
 
 #: Table entries made at a time: enough to save numpy calls, few enough to save memory.
 BATCH = 1 << 14
 
 
+#: A table of so few entries takes Python less time than numpy.
+FEW = 16
+
+
 def make_models(priors: Sequence[Prior]) -> None:
-    """Sets `model` of Gaussians and mixtures, many in one pass."""
-    for batch in _batches([prior for prior in priors if isinstance(prior, Gauss | Mixture)]):
+    """Sets `model` of priors, many in one pass. A few narrow ones are left: Python makes them in less time."""
+    if len(priors) < 8:
+        priors = [prior for prior in priors if prior.window.n > FEW]
+    for batch in _batches(priors):
         for prior, model in zip(batch, models_of_each(*normal_tables(batch)), strict=True):
             prior.__dict__["model"] = model  # where cached_property keeps it
 
 
-def _batches(priors: Sequence[AnyPrior]) -> Iterator[list[AnyPrior]]:
+def _batches(priors: Sequence[Prior]) -> Iterator[list[Prior]]:
     """Yields the priors in order, in batches whose windows have about BATCH entries together."""
-    batch, entries = list[AnyPrior](), 0
+    batch, entries = list[Prior](), 0
     for prior in priors:
         batch.append(prior)
         entries += prior.window.n
@@ -176,24 +143,12 @@ def _batches(priors: Sequence[AnyPrior]) -> Iterator[list[AnyPrior]]:
 
 
 def normal_tables(priors: Sequence[Prior]) -> tuple[np.ndarray, np.ndarray]:
-    """Returns (concatenated tables int64, their sizes int64 [m]).
-
-    Raises TypeError for a prior of another class, which has to define `cum` itself."""
-    normals = list[Normal]()
-    for prior in priors:
-        if isinstance(prior, Gauss):
-            normals.append(prior.normal)
-        elif isinstance(prior, Mixture):
-            normals.append(prior.first)
-        elif isinstance(prior, Const):
-            normals.append(Normal(0, 0))
-        else:
-            raise TypeError(f"{type(prior).__name__}: its table is not one of Gaussians")
+    """Returns (concatenated tables int64, their sizes int64 [m])."""
     sizes = np.array([prior.window.n for prior in priors], dtype=np.int64)
-    cdf = norm_cdf28_of_each(sizes, *_columns(normals))
-    if mixtures := [prior for prior in priors if isinstance(prior, Mixture)]:
-        mixed = np.array([isinstance(prior, Mixture) for prior in priors])
-        second = norm_cdf28_of_each(sizes[mixed], *_columns([prior.second for prior in mixtures]))
+    cdf = norm_cdf28_of_each(sizes, *_columns([(*prior.normals, _ANY)[0] for prior in priors]))
+    if mixtures := [prior for prior in priors if prior.family == 2]:
+        mixed = np.array([prior.family == 2 for prior in priors])
+        second = norm_cdf28_of_each(sizes[mixed], *_columns([prior.normals[1] for prior in mixtures]))
         weight = np.repeat(np.array([prior.weight for prior in mixtures]), sizes[mixed] + 1)
         inside = np.repeat(mixed, sizes + 1)
         cdf[inside] = ((256 - weight) * cdf[inside] + weight * second) >> 8
@@ -205,22 +160,16 @@ def _columns(normals: Sequence[Normal]) -> tuple[np.ndarray, np.ndarray]:
     return np.array(mu8, dtype=np.int64), np.array(si, dtype=np.int64)
 
 
-def read_prior(reader: ByteReader, family: int) -> Prior:
-    """Reads a prior of a family. Raises UnsupportedFeature for a family outside the registry."""
-    if family not in _FAMILIES:
-        raise UnsupportedFeature(f"prior family {family}, expected one of {sorted(_FAMILIES)}", offset=reader.offset)
-    return _FAMILIES[family].read(reader)
-
-
 # -- integer frequency tables ------------------------------------------------------------------------------------------
 
 FLOOR = 16  #: least frequency: 16 / 2**24 is the clip of R(a), and keeps outliers from steering a fit
 
 # The two constants of NormTable v1. Computing them in float64 is safe: no entry comes closer than 1e-4 to a rounding
 # boundary (a test checks that), while float64 is off by less than 1e-6 whatever the C library.
-_T = [round(2**27 * math.erf(i / (32 * math.sqrt(2)))) for i in range(257)]
-NORMAL = np.array([*_T, _T[-1]], dtype=np.int64)  #: T[i] = round(2**28 (Phi(i / 32) - 1/2)), T[257] = T[256]
-OCTAVE = np.array([round(2.0 ** (31 - j / 64)) for j in range(64)], dtype=np.int64)  #: M[j]
+_T = [round(2**27 * math.erf(min(i, 256) / (32 * math.sqrt(2)))) for i in range(258)]
+_M = [round(2.0 ** (31 - j / 64)) for j in range(64)]
+NORMAL = np.array(_T)  #: T[i] = round(2**28 (Phi(i / 32) - 1/2)), T[257] = T[256]
+OCTAVE = np.array(_M)  #: M[j]
 
 
 def _mass(t: np.ndarray, si: np.ndarray) -> np.ndarray:
@@ -232,6 +181,22 @@ def _mass(t: np.ndarray, si: np.ndarray) -> np.ndarray:
     v = NORMAL[i] + (((NORMAL[i + 1] - NORMAL[i]) * f) >> 11)
     mass: np.ndarray = (1 << 27) + np.where(t < 0, -v, v)
     return mass
+
+
+def _few_entries(prior: Prior) -> list[int]:
+    """The table of one prior of a few entries, as `normal_tables` makes it."""
+    n, cum, weights = prior.window.n, [0], (256 - prior.weight, prior.weight)
+    for k in range(n - 1):
+        mixed = 0
+        for normal, weight in zip(prior.normals, weights, strict=False):
+            e, t = normal.si >> 6, 256 * k + 128 - normal.mu8
+            nb = max(0, e - 8)
+            a = min(abs(t) >> nb, (1 << 21) - 1)
+            z = min(a * _M[normal.si & 63] >> 23 + e - nb, 8 << 16)
+            v = _T[z >> 11] + ((_T[(z >> 11) + 1] - _T[z >> 11]) * (z & 2047) >> 11)
+            mixed += weight * ((1 << 27) + (-v if t < 0 else v))
+        cum.append(((mixed >> 8) * (TOTAL - n * FLOOR) >> 28) + FLOOR * (k + 1))
+    return [*cum, TOTAL]
 
 
 def norm_cdf28_of_each(sizes: np.ndarray, mu8: np.ndarray, si: np.ndarray) -> np.ndarray:

@@ -12,18 +12,11 @@ from pd4dgs_codec.errors import DecodeError, EncodeError
 from pd4dgs_codec.format.header import MAX_CAMERA_SIDE, info_fault
 from pd4dgs_codec.format.plan import SceneSymbols
 from pd4dgs_codec.kinds import AnyScene
-from pd4dgs_codec.kinds.tracks import Tracks
+from pd4dgs_codec.kinds.scaffold import step_names
 from pd4dgs_codec.morton import MAX_VOXEL
 from pd4dgs_codec.scene import (
-    INSTANTS,
     MASK_MIN_CODE,
     MAX_CLASS,
-    MAX_FEATURE,
-    MAX_SLOTS,
-    PLANES,
-    SCAFFOLD_NETWORKS,
-    TRUNK,
-    Deformation,
     Scene,
     SceneInfo,
 )
@@ -45,8 +38,6 @@ def check_scene(scene: AnyScene) -> None:
     size = scene.info.voxel_size
     finite = not is_step(size) or all_finite(scene.anchor_q, size)
     expect(finite, f"anchor_q: a position is infinite at voxel size {size:g}, expected finite positions")
-    if isinstance(scene, Scene):
-        _check_widths(scene)
     width = 0
     for name, values in scene.attributes.items():
         expect_array(name, values, np.float32, (n, *values.shape[1:]))
@@ -58,24 +49,13 @@ def check_scene(scene: AnyScene) -> None:
         expect_array("centre of the attributes", scene.grading.centre, np.float32, (width,))
     _check_masks(scene)
     check_info(scene.info)
-    for name, step in (vars(scene.steps) if isinstance(scene, Scene) else scene.steps).items():
+    for name, step in scene.all_steps.items():
         expect(is_step(step), f"step of {name}: {step!r}, expected a positive normal binary32 value")
     for fill in scene.fills:
         valid = fill is None or (len(fill) == 3 and all(type(c) is int and 0 <= c <= 255 for c in fill))
         expect(valid, f"fill {fill}, expected None or three integers 0..255")
     expect(len(scene.fills) in (0, len(layers)), f"{len(scene.fills)} fills, expected none or one per layer {layers}")
     _check_tensors(scene)
-
-
-def _check_widths(scene: Scene) -> None:
-    for name, axes in (("feature", 2), ("offset", 3)):
-        found = scene.attributes[name].shape
-        expect(len(found) == axes, f"{name}: an array of {len(found)} axes, expected {axes}")
-    widths = scene.widths
-    for what, width, limit in (("feature width", widths.feature, MAX_FEATURE), ("slots", widths.slots, MAX_SLOTS)):
-        expect(1 <= width <= limit, f"{what}: {width}, expected 1..{limit}")
-    for name, shape in widths.attributes.items():
-        expect_array(name, scene.attributes[name], np.float32, (scene.rows[-1], *shape))
 
 
 def _check_tensors(scene: AnyScene) -> None:
@@ -86,62 +66,18 @@ def _check_tensors(scene: AnyScene) -> None:
         if layer and given is None:
             continue
         expect(layer in scene.layers, f"{own} is given, but layer {layer} is not among {scene.layers}")
-        if isinstance(given, Tracks):
-            _check_tracks(given, own, scene.rows[-1])
-        elif isinstance(scene, Scene):
-            _check_deformation(given or Deformation((), scene.networks), layer)
+        kinds.check_arrays(scene, layer)
         tensors = kinds.tensors_of(scene, layer)
-        names = [f"{own} {name}" for name in kinds.array_names(layer, tensors.tables)]
+        names = [f"{own} {name}" for name in kinds.array_names(scene, layer, tensors.tables)]
         shapes = tensors.tables.planes + tensors.tables.weights
         for name, array, shape in zip(names, tensors.arrays, shapes, strict=True):
             expect_array(name, array, np.float32, shape)
-        valued = isinstance(given, Tracks)  # the instants have rules of their own
+        valued = not isinstance(scene, Scene)  # no values of a scaffold have rules of their own
         found[layer] = tensors.quantised(names.__getitem__) if valued else Tensors(tensors.tables)
         try:
             kinds.check(kinds.kind_of(scene), kinds.row_table(scene), found)
         except DecodeError as error:
             raise EncodeError(f"{own}: {error}") from None
-
-
-def _check_deformation(given: Deformation, layer: int) -> None:
-    own = kinds.NAMES[layer]
-    known, required = (kinds.hexplane.CHAINS, (TRUNK,)) if layer else (SCAFFOLD_NETWORKS, SCAFFOLD_NETWORKS)
-    unknown = [name for name in given.networks if name not in known]
-    expect(not unknown, f"{own}: networks {unknown}, expected some of {list(known)}")
-    missing = [name for name in required if name not in given.networks]
-    expect(not missing, f"{own} networks {missing} are missing")
-    for name, network in given.networks.items():
-        axes = [(weight.ndim, bias.ndim) for weight, bias in network]
-        expect(set(axes) == {(2, 1)}, f"{own} network {name}: no layers, or other axes than of weight and bias")
-    for s, planes in enumerate(given.planes):
-        expect(set(planes) == {p for p, _, _ in PLANES}, f"{own} scale {s}: planes {sorted(planes)}, expected six")
-        flat = [name for name, plane in planes.items() if plane.ndim != 3 or not plane.size]
-        expect(not flat, f"{own} scale {s}: planes {flat} are empty or do not have 3 axes")
-    key = given.key
-    valid = key is None or (type(key) is int and 0 <= key <= INSTANTS)
-    expect(valid, f"{own}: key instant {key!r}, expected None or an integer 0..{INSTANTS}")
-
-
-def _check_tracks(given: Tracks, own: str, rows: int) -> None:
-    count = len(given.instants)
-    expect_array(f"{own} instants", given.instants, np.float32, (count,))
-    unknown = [name for name in given.heads if name not in kinds.tracks.HEADS]
-    expect(not unknown, f"{own}: heads {unknown}, expected some of {list(kinds.tracks.HEADS)}")
-    for name, head in given.heads.items():
-        number = len(head.bases)
-        expect(number > 0, f"{own}: no bases of {name}, expected some, or no such head")
-        expect_array(f"{own} bases of {name}", head.bases, np.float32, (number, kinds.tracks.HEADS[name], count))
-        most = min(len(head.coefficients), rows)
-        expect_array(f"{own} coefficients of {name}", head.coefficients, np.float32, (most, number))
-        expect(is_step(head.step), f"{own} step of {name}: {head.step!r}, expected a positive normal binary32 value")
-    if groups := given.groups:
-        fits = groups.maps.keys() <= given.heads.keys()
-        expect(fits, f"{own}: maps of {list(groups.maps)}, expected some of {list(given.heads)}")
-        expect_array(f"{own} groups", groups.rows, np.float32, (min(len(groups.rows), rows), 1))
-        number = len(groups.centres)
-        expect_array(f"{own} centres", groups.centres, np.float32, (number, 3))
-        for name, maps in groups.maps.items():
-            expect_array(f"{own} maps of {name}", maps, np.float32, (number, 4, len(given.heads[name].bases)))
 
 
 def _check_masks(scene: AnyScene) -> None:
@@ -228,7 +164,7 @@ def _pairs(
         layer, tensors = part.layer, kinds.tensors_of(given, part.layer)
         if symbols.base and not layer:
             continue  # its tensors are those of the base
-        names = kinds.step_names(layer) if isinstance(given, Scene) else (kinds.layer_name(given, layer),)
+        names = step_names(layer) if isinstance(given, Scene) else (kinds.layer_name(given, layer),)
         fields = [names[0]] * len(tensors.planes) + [names[-1]] * len(tensors.weights)
         for what, step, x, k in zip(fields, tensors.tables.steps, tensors.arrays, part.tensors.arrays, strict=True):
             yield what, step, x, dequantise(k, step), 1.0

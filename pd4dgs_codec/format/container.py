@@ -23,7 +23,7 @@ from pd4dgs_codec.format.registry import MAX_HEADER, MAX_PAYLOAD
 
 # As in PNG: a high bit and both line ends, so that a text-mode transfer breaks it, and 0x1A to stop a DOS listing.
 SIGNATURE = bytes.fromhex("89504434 0D0A1A0A")
-MAJOR, MINOR = 4, 0
+MAJOR, MINOR = 5, 0
 PREAMBLE_SIZE = 20
 CHUNK_HEAD_SIZE = 16
 CHUNK_OVERHEAD = CHUNK_HEAD_SIZE + 4
@@ -102,7 +102,7 @@ def read_preamble(data: Buffer) -> Preamble:
         _need(view, PREAMBLE_SIZE, "the preamble")
         _, major, minor, length = _PREAMBLE.unpack_from(view)
         if major != MAJOR:
-            told = "; drafts before 4.0 are not read any more: encode the scene again" if major < MAJOR else ""
+            told = "; drafts before 5.0 are not read any more: encode the scene again" if major < MAJOR else ""
             found = f"format version {major}.{minor}, this decoder reads {MAJOR}.x"
             raise UnsupportedVersion(found + told, offset=8)
         if length > MAX_HEADER:

@@ -27,11 +27,11 @@ from pd4dgs_codec.format.info import info
 from pd4dgs_codec.format.metadata import CHUNK_TYPE, Metadata, write_metadata
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.parameters import with_fill
-from pd4dgs_codec.format.payload import Past, StreamReport, write_slice
+from pd4dgs_codec.format.payload import StreamReport, write_slice
 from pd4dgs_codec.format.plan import LeftOut, SceneSymbols, plan
 from pd4dgs_codec.format.reader import Base, Source, read_base, read_layers
 from pd4dgs_codec.format.registry import MAX_CHUNKS
-from pd4dgs_codec.kinds import AnyScene, utility_of
+from pd4dgs_codec.kinds import AnyScene
 from pd4dgs_codec.tensors.symbols import LayerSymbols, sliced
 from pd4dgs_codec.tensors.tables import Fill
 from pd4dgs_codec.threads import one_blas_thread
@@ -128,7 +128,7 @@ def encode_with_report(
 
     left_out: parts that the caller has removed from the scene, added to the report. metadata: stored in the file.
     utility: function of the decoded scene, float [N], the gain in image quality by each anchor. It orders the anchors
-    of sliced layers; `kinds.utility_of` if None. fill: function of the scene that ends with a slice, its fill; called
+    of sliced layers; `scene.utility` if None. fill: function of the scene that ends with a slice, its fill; called
     for each slice but the last. If None, each slice has the fill of its layer. base: a file, or what `read_base` made
     of it, whose layer 0 the file names and does not hold: the scene's first rows and its networks of layer 0 are those
     of the base, whose mask codes in layer 0 may be 0 instead. changes: fields of EncodeOptions that replace those of
@@ -142,7 +142,8 @@ def encode_with_report(
     symbols, omitted = planned.symbols, planned.left_out
     errors = verify_errors(planned.scene, symbols) if options.verify else []
     del planned  # as large as the scene
-    written = _write_layers(symbols, options, utility or utility_of, None if fill is None else LONGEST)
+    utility = utility or (lambda scene: scene.utility)
+    written = _write_layers(symbols, options, utility, None if fill is None else LONGEST)
     if fill is not None:
         written = _filled(symbols, options, written, fill)
     data, about_bytes = _container(symbols, options.mode, written), 0
@@ -211,7 +212,7 @@ def _write_slices(layer: LayerSymbols, options: EncodeOptions, size: float, util
     """
     rows = np.argsort(-utility, kind="stable")
     costs = np.cumsum([0.0, *layer.bits_per_row()[rows]]) / 8  # bytes of the first 0, 1, .. rows
-    done, found, past = 0, list[_Slice](), Past[Fitted]()
+    done, found, known = 0, list[_Slice](), list[Fitted]()
     scale = 1.0  # bytes that a slice takes per byte expected
     fixed = len(write_slice(sliced(layer, rows[:0], True), options)[0])  # of planes and networks, in the first slice
     while done < len(rows) or not found:
@@ -224,12 +225,12 @@ def _write_slices(layer: LayerSymbols, options: EncodeOptions, size: float, util
             room = room if number == 1 else left / number / SLACK
         elif least:
             room = max(room, 2 * fixed)
-        tries: list[tuple[bool, int, _Slice, Past[Fitted]]] = []  # fits, anchors, slice, priors for the next slice
+        tries: list[tuple[bool, int, _Slice, list[Fitted]]] = []  # fits, anchors, slice, priors for the next slice
         for _ in range(TRIES):
             expected = (costs[done + 1 :] - costs[done]) * scale + fixed
             likely = int(np.searchsorted(expected, room * SLACK, side="right"))
             count = min(max(likely, least), len(rows) - done)
-            trial = past.copy()
+            trial = list(known)
             part = sliced(layer, rows[done : done + count], not found)
             payload, streams = write_slice(part, options, bool(found), trial)
             if count:
@@ -238,7 +239,7 @@ def _write_slices(layer: LayerSymbols, options: EncodeOptions, size: float, util
             tries.append((fits, count, _Slice(count, payload, streams, layer.fill), trial))
             if fits and (len(payload) >= room * FULL or count in (least, len(rows) - done)):
                 break
-        _, count, made, past = max(tries, key=lambda tried: (tried[0], tried[1] if tried[0] else -tried[1]))
+        _, count, made, known = max(tries, key=lambda tried: (tried[0], tried[1] if tried[0] else -tried[1]))
         found.append(made)
         done += count
     return found

@@ -14,8 +14,7 @@ from pd4dgs_codec.format.parameters import read_parameters
 from pd4dgs_codec.format.reader import Base, Source, read_layers
 from pd4dgs_codec.format.registry import LAYERS
 from pd4dgs_codec.kinds import AnyScene
-from pd4dgs_codec.kinds.splats import SplatScene
-from pd4dgs_codec.scene import MASK_STEP
+from pd4dgs_codec.scene import MASK_STEP, Scene
 from pd4dgs_codec.tensors.quantise import NO_CLASSES, dequantise, quantise
 from pd4dgs_codec.tensors.tables import Tables
 
@@ -155,7 +154,7 @@ def to_npz_dict(scene: AnyScene, symbols: bool = False) -> dict[str, np.ndarray]
     Coefficients are NAME_q steps, whatever their class.
     """
     arrays, steps = {"anchor": scene.anchor, **scene.attributes}, dict[str, float]()
-    table, tracks = kinds.row_table(scene), scene.tracks if isinstance(scene, SplatScene) else None
+    table = kinds.row_table(scene)
     if scene.grading is not None:
         arrays["step_class"] = scene.grading.classes
         for (name, values), (_, centre) in zip(
@@ -164,16 +163,14 @@ def to_npz_dict(scene: AnyScene, symbols: bool = False) -> dict[str, np.ndarray]
             arrays[f"{name}_centre"] = centre.reshape(values.shape[1:])
     for layer in LAYERS:
         tensors = kinds.tensors_of(scene, layer)
-        names = kinds.array_names(layer, tensors.tables)
-        for step, name, array in zip(tensors.tables.steps, names, tensors.arrays, strict=True):
+        found = dict(zip(kinds.array_names(scene, layer, tensors.tables), tensors.arrays, strict=True))
+        all_steps = [*tensors.tables.steps, *(tensor.step for tensor in tensors.tables.rows)]
+        if tensors.tables.rows:
+            found |= kinds.rows_of(scene, layer, scene.rows[scene.layers.index(layer)])
+        for step, (name, array) in zip(all_steps, found.items(), strict=True):
             family, rest = name.split(".", 1)
-            name = ".".join(filter(None, (family, OWNERS[layer] if tracks is None else str(layer), rest)))
+            name = ".".join(filter(None, (family, OWNERS[layer] if isinstance(scene, Scene) else str(layer), rest)))
             arrays[name], steps[name] = array, step
-        for name, head in tracks[layer].heads.items() if tracks and layer in tracks else ():
-            name = f"tracks.{layer}.coefficients.{name}"
-            arrays[name], steps[name] = head.coefficients, head.step
-        if tracks and layer in tracks and (groups := tracks[layer].groups):
-            arrays[f"tracks.{layer}.group"], steps[f"tracks.{layer}.group"] = groups.rows, 1.0
     if symbols:
         quantised = {name: quantise(arrays[name], step, name) for name, step in steps.items()}
         classes = NO_CLASSES if scene.grading is None else scene.grading.classes.astype(np.int32)

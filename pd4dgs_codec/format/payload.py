@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Generic, TypeVar
 
 import numpy as np
 
@@ -33,21 +32,6 @@ from pd4dgs_codec.tensors.tables import Tables, Tensors
 GROUPS = ("positions", "masks", "attributes", "planes", "weights")
 LZMA_GROUP = "symbols"
 GROUPS_OF_ROWS = 2 * (MAX_CLASS + 1)  #: step classes, of the base's rows and of others
-
-Known = TypeVar("Known", Prior, Fitted)
-
-
-@dataclass(eq=False)
-class Past(Generic[Known]):
-    """Prior lists of a layer's earlier slices that a later slice continues: of its positions, and of its masks, step
-    classes and rows."""
-
-    positions: list[Known] = field(default_factory=list)
-    rows: list[Known] = field(default_factory=list)
-
-    def copy(self) -> Past[Known]:
-        """A copy that grows independently."""
-        return Past(list(self.positions), list(self.rows))
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,31 +65,30 @@ class StreamReport:
 
 
 def write_slice(
-    symbols: LayerSymbols, options: EncodeOptions, later: bool = False, past: Past[Fitted] | None = None
+    symbols: LayerSymbols, options: EncodeOptions, later: bool = False, known: list[Fitted] | None = None
 ) -> tuple[bytes, list[StreamReport]]:
     """Returns (payload of a slice, a report per group of channels). The inverse of read_slice.
 
-    later: whether it is not the first slice of its layer. past: of the layer's earlier slices; it grows.
+    later: whether it is not the first slice of its layer. known: the priors of the layer's earlier slices; it grows.
     """
     coded = Residuals.of(symbols.tensors)
     tables = Tables() if later else coded.tables
     write = _write_lzma if options.mode == "lzma" else _write_ans
-    codes, stream, reports = write(symbols, coded, options, later, past or Past())
+    codes, stream, reports = write(symbols, coded, options, known)
     head = pack_parameters(len(symbols.anchor_q), len(codes), symbols.fill, tables)
     return b"".join([head, codes, stream]), reports
 
 
 def _write_ans(
-    symbols: LayerSymbols, coded: Residuals, options: EncodeOptions, later: bool, past: Past[Fitted]
+    symbols: LayerSymbols, coded: Residuals, options: EncodeOptions, known: list[Fitted] | None
 ) -> tuple[bytes, bytes, list[StreamReport]]:
-    writer = ChannelWriter(options.priors, options.effort, later)
-    encode_positions(symbols.anchor_q, writer, past.positions)
-    masks = writer.write([symbols.rises, symbols.codes], past.rows)
-    writer.write([symbols.classes], past.rows)
-    rows = writer.write(list(_row_channels(symbols)), past.rows) + entropy_bits(symbols.classes)
-    known = list[Fitted]()
-    planes = write_planes(coded.planes, writer, known)
-    weights = writer.write([array.ravel() for array in symbols.tensors.weights], known)
+    writer = ChannelWriter(options.priors, options.effort, known)
+    encode_positions(symbols.anchor_q, writer)
+    masks = writer.write([symbols.rises, symbols.codes])
+    writer.write([symbols.classes])
+    rows = writer.write(list(_row_channels(symbols))) + entropy_bits(symbols.classes)
+    planes = write_planes(coded.planes, writer)
+    weights = writer.write([array.ravel() for array in symbols.tensors.weights])
     codes, stream, bits = writer.finish()
     groups = (
         (bits[:1], 0.0, [symbols.anchor_q]),
@@ -146,7 +129,7 @@ def _groups(classes: np.ndarray, base_rows: int, n: int) -> np.ndarray:
 
 
 def _write_lzma(
-    symbols: LayerSymbols, coded: Residuals, options: EncodeOptions, later: bool, past: Past[Fitted]
+    symbols: LayerSymbols, coded: Residuals, options: EncodeOptions, known: list[Fitted] | None
 ) -> tuple[bytes, bytes, list[StreamReport]]:
     """All channels in one group. Its rate leaves out positions and masks and splits rows by step class."""
     morton_codes(symbols.anchor_q)  # raises EncodeError for cells too far apart
@@ -172,14 +155,14 @@ def read_slice(
     before: Declared,
     of: Tables | None = None,
     earlier: np.ndarray = NO_CLASSES,
-    past: Past[Prior] | None = None,
+    known: list[Prior] | None = None,
     base_rows: int = 0,
 ) -> tuple[LayerSymbols, Declared]:
     """Returns (symbols, sums with this slice) of a payload. Arguments as in read_parameters.
 
-    earlier: int32 [rows before], the step classes of the rows of all layers before; NO_CLASSES without any. past: of
-    the layer's earlier slices; it grows. base_rows: of the file's base. Raises subclasses of DecodeError; nothing is
-    allocated for a count beyond the limits or the payload.
+    earlier: int32 [rows before], the step classes of the rows of all layers before; NO_CLASSES without any. known: the
+    priors of the layer's earlier slices; it grows. base_rows: of the file's base. Raises subclasses of DecodeError;
+    nothing is allocated for a count beyond the limits or the payload.
     """
     parameters, start, declared = read_parameters(payload, layer, table, before, of)
     if of:
@@ -188,8 +171,8 @@ def read_slice(
     if mode == "lzma":
         coded = _read_lzma(codes, stream, table, parameters)
     else:
-        reader = ChannelReader(codes, stream, parameters.symbols, of is not None)
-        coded = _read_ans(reader, table, parameters, earlier, past or Past(), base_rows)
+        reader = ChannelReader(codes, stream, declared.symbols, known)
+        coded = _read_ans(reader, table, parameters, earlier, base_rows)
     voxels, rises, own, classes, k, layer_k, residuals, weights, bits = coded
     where, tables = f"layer {layer}", parameters.tables
     rise = ("rise of a mask code", rises, 0, 255 if layer else 1)
@@ -216,37 +199,34 @@ Array = np.ndarray
 Coded = tuple[Array, Array, Array, Array, Array, Array, list[Array], list[Array], dict[str, int]]
 
 
-def _read_ans(
-    reader: ChannelReader, table: RowTable, parameters: Parameters, earlier: Array, past: Past[Prior], base_rows: int
-) -> Coded:
+def _read_ans(reader: ChannelReader, table: RowTable, parameters: Parameters, earlier: Array, base_rows: int) -> Coded:
     n, tables, marks = parameters.rows, parameters.tables, [reader.bits]
-    voxels = decode_positions(reader, n, past.positions)
+    voxels = decode_positions(reader, n)
     marks.append(reader.bits)
-    rises, own = split(reader.read([parameters.rises, n], past.rows), [parameters.rises, n])
+    rises, own = split(reader.read([parameters.rises, n]), [parameters.rises, n])
     marks.append(reader.bits)
-    classes, width = reader.read([n] * table.graded, past.rows), RowTable(tables.rows).channels
+    classes, width = reader.read([n] * table.graded), RowTable(tables.rows).channels
     _check_classes(classes)
-    rows = _read_rows(reader, table.channels, n, classes, past.rows)
+    rows = _read_rows(reader, table.channels, n, classes)
     count = parameters.rises + n
     groups = _groups(np.concatenate([earlier, classes]), base_rows, count)
-    layer_rows = _read_rows(reader, width, count, groups, past.rows) if width else NO_LAYER_ROWS
+    layer_rows = _read_rows(reader, width, count, groups) if width else NO_LAYER_ROWS
     marks.append(reader.bits)
-    known, sizes = list[Prior](), [math.prod(shape) for shape in tables.weights]
-    residuals = read_planes(reader, tables.planes, known)
+    residuals, sizes = read_planes(reader, tables.planes), [math.prod(shape) for shape in tables.weights]
     marks.append(reader.bits)
-    weights = split(reader.read(sizes, known), sizes)
+    weights = split(reader.read(sizes), sizes)
     marks.append(reader.bits)
     reader.finish()
     bits = dict(zip(GROUPS, np.diff(marks).tolist(), strict=True))
     return voxels, rises, own, classes, rows, layer_rows, residuals, weights, bits
 
 
-def _read_rows(reader: ChannelReader, channels: int, n: int, groups: np.ndarray, known: list[Prior]) -> np.ndarray:
+def _read_rows(reader: ChannelReader, channels: int, n: int, groups: np.ndarray) -> np.ndarray:
     """Decodes the symbols int32 [channels, n] of rows of these groups, int32 [n] or NO_CLASSES."""
     if not groups.size:
-        return reader.read([n] * channels, known).reshape(channels, n)
+        return reader.read([n] * channels).reshape(channels, n)
     places = Places.by(groups, GROUPS_OF_ROWS)
-    rows = reader.read(places.sizes * channels, known).reshape(channels, n)
+    rows = reader.read(places.sizes * channels).reshape(channels, n)
     places.put(rows, rows)
     return rows
 

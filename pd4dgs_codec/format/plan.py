@@ -19,7 +19,6 @@ from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.payload import write_slice
 from pd4dgs_codec.format.reader import Base
 from pd4dgs_codec.kinds import AnyScene, hexplane
-from pd4dgs_codec.kinds.splats import SplatScene
 from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import MAX_CLASS, Deformation, S, Scene, SceneInfo
 from pd4dgs_codec.tensors.quantise import NO_CLASSES, WHOLE, Rows, RowTable, expect
@@ -120,7 +119,7 @@ def plan(scene: AnyScene, options: EncodeOptions = DEFAULTS, base: Base | None =
         arranged, unread = _without_unread(arranged, tensors)
         left_out += unread
     table = base.header.table if base else kinds.row_table(arranged)
-    if isinstance(arranged, SplatScene) and not table.graded and not base:
+    if not isinstance(arranged, Scene) and not table.graded and not base:
         table = _predicted(table, list(arranged.attributes.values()), NO_CLASSES)
     layers = [
         layer_symbols(arranged, index, tensors[layer], table, options, base_rows) for index, layer in enumerate(kept)
@@ -152,20 +151,24 @@ def _check_over(scene: AnyScene, base: Base) -> None:
 
 
 def _predicted(table: RowTable, values: Sequence[np.ndarray], classes: np.ndarray) -> RowTable:
-    """Returns the table with the predictor of each tensor that takes the fewest bits by order-0 entropy. values:
+    """Returns the table with the predictor of each tensor that takes the fewest bits by order-0 entropy, of those that
+    leave values as they are if one does: rows of a decoded file, whose predictors have lattices of their own. values:
     float32 [n, any] of each, in coding order."""
 
-    def bits(tensor: Rows, x: np.ndarray, centre: np.ndarray | None) -> float:
+    def cost(tensor: Rows, x: np.ndarray, centre: np.ndarray | None) -> tuple[bool, float]:
         alone = RowTable((tensor,), centre)
-        symbols = alone.symbols(alone.quantise([x], classes, [f"rows {tensor.id}"]), classes)
-        parts = Places.by(classes, MAX_CLASS + 1).parts(symbols) if alone.graded else symbols
-        return sum(map(entropy_bits, parts))
+        v = alone.quantise([x], classes, [f"rows {tensor.id}"])
+        symbols = alone.symbols(v, classes)
+        if not alone.graded:
+            return False, sum(map(entropy_bits, symbols))
+        moved = not np.array_equal(alone.dequantise(v)[0], x.reshape(-1, tensor.channels))
+        return moved, sum(map(entropy_bits, Places.by(classes, MAX_CLASS + 1).parts(symbols)))
 
     centres = [None] * len(values) if table.centre is None else [m for _, m in table.of_each(table.centre)]
     chosen = [
         tensor
         if tensor.predictor == WHOLE
-        else min((replace(tensor, predictor=p) for p in (0, 1)), key=lambda one: bits(one, x, m))  # noqa: B023
+        else min((replace(tensor, predictor=p) for p in (0, 1)), key=lambda one: cost(one, x, m))  # noqa: B023
         for tensor, x, m in zip(table.tensors, values, centres, strict=True)
     ]
     return RowTable(tuple(chosen), table.centre)
@@ -174,7 +177,7 @@ def _predicted(table: RowTable, values: Sequence[np.ndarray], classes: np.ndarra
 def symbols_of(scene: AnyScene, layer: int) -> Tensors:
     """Returns the symbols of the grids and chains of a layer. Raises EncodeError for a value without a symbol."""
     given = kinds.tensors_of(scene, layer)
-    names, own = kinds.array_names(layer, given.tables), kinds.layer_name(scene, layer)
+    names, own = kinds.array_names(scene, layer, given.tables), kinds.layer_name(scene, layer)
     return given.quantised(lambda i: f"{own} {names[i]}")
 
 
@@ -206,22 +209,17 @@ def layer_symbols(
         fill=scene.fills[index] if scene.fills else None,
         base_rows=base_rows,
     )
-    return _with_layer_rows(own, scene, last, options) if isinstance(scene, SplatScene) and tensors.tables.rows else own
+    return _with_layer_rows(own, scene, last, options) if tensors.tables.rows else own
 
 
-def _with_layer_rows(own: LayerSymbols, scene: SplatScene, last: int, options: EncodeOptions) -> LayerSymbols:
+def _with_layer_rows(own: LayerSymbols, scene: AnyScene, last: int, options: EncodeOptions) -> LayerSymbols:
     """Adds the layer rows of the scene's first `last` rows. Raises EncodeError for others that are not 0."""
-    given = scene.tracks[own.layer]
-    lost = [name for name, head in given.heads.items() if head.coefficients[last:].any()]
-    if given.groups and given.groups.maps and (given.groups.rows[last:] != kinds.tracks.NONE).any():
-        lost.append("groups")
-    expect(not lost, f"tracks of layer {own.layer}: {lost} of anchors of a later layer, expected 0 or no group")
     earlier = NO_CLASSES if scene.grading is None else scene.grading.classes[: last - len(own.codes)].astype(np.int32)
-    own, values = replace(own, earlier=earlier), kinds.tracks.coefficients(given, last)
+    own, values = replace(own, earlier=earlier), kinds.rows_of(scene, own.layer, last)
     table = own.layer_table
     if not (options.slices and table.graded and len(own.codes)):  # else a row's predecessor depends on its slice
         table = _predicted(table, list(values.values()), own.all_classes)
-    names = [f"tracks of layer {own.layer} {name}" for name in values]
+    names = [f"{kinds.layer_name(scene, own.layer)} {name}" for name in values]
     tensors = replace(own.tensors, tables=replace(own.tensors.tables, rows=table.tensors))
     return replace(own, tensors=tensors, layer_rows=table.quantise(list(values.values()), own.all_classes, names))
 
@@ -245,7 +243,7 @@ def _drop_heads(scene: AnyScene, layer: int, symbols: Tensors) -> tuple[AnyScene
     """Removes the heads of a layer that are zero after quantisation, or its deformation if no head is left and no layer
     above reads its planes. Returns (scene, symbols of the layer, parts left out)."""
     given, name = scene.deformation(layer), kinds.layer_name(scene, layer)
-    if not isinstance(given, Deformation) or isinstance(scene, SplatScene):
+    if not isinstance(scene, Scene) or not isinstance(given, Deformation):
         return scene, symbols, []
     whole = hexplane.deformation_of(symbols)
     zero, heads = hexplane.zero_heads(whole), len(given.networks) - 1
@@ -261,9 +259,10 @@ def _drop_heads(scene: AnyScene, layer: int, symbols: Tensors) -> tuple[AnyScene
     rest, steps = [n for n in given.networks if n not in zero], (symbols.tables.grid_step, symbols.tables.chain_step)
     alone = [replace(with_networks(whole, [n]), planes=()) for n in zero]
     gone = [
-        LeftOut(f"{name} head {n}", why, hexplane.tensors_of(part, *steps)) for n, part in zip(zero, alone, strict=True)
+        LeftOut(f"{name} head {n}", why, hexplane.tensors_of_parts(part, *steps))
+        for n, part in zip(zero, alone, strict=True)
     ]
-    kept = hexplane.tensors_of(with_networks(whole, rest), *steps)
+    kept = hexplane.tensors_of_parts(with_networks(whole, rest), *steps)
     return scene.with_deformation(layer, with_networks(given, rest)), kept, gone
 
 
@@ -312,8 +311,9 @@ def _without_unread(scene: Scene, tensors: dict[int, Tensors]) -> tuple[Scene, l
         before, given = tensors[layer], kinds.tensors_of(scene, layer)
         after, what, bits = hexplane.without_unread(before, unit)
         if after is not before:
-            left_out.append(LeftOut(f"{kinds.NAMES[layer]}: {what}", "no anchor reads them", bits=bits, lossless=True))
+            own = kinds.layer_name(scene, layer)
+            left_out.append(LeftOut(f"{own}: {what}", "no anchor reads them", bits=bits, lossless=True))
             rows = zip(given.arrays, before.arrays, after.arrays, after.dequantised().arrays, strict=True)
             values = given.with_arrays(np.where(old == new, x, restored) for x, old, new, restored in rows)
-            scene, tensors[layer] = kinds.with_tensors(scene, layer, values), after
+            scene, tensors[layer] = scene.with_deformation(layer, hexplane.deformation_of(values)), after
     return scene, left_out

@@ -10,7 +10,7 @@ from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.errors import BaseMismatch, BaseMissing, DecodeError, Malformed, Truncated, UnsupportedFeature
 from pd4dgs_codec.format.container import CHUNK_OVERHEAD, Chunk, read_chunk, read_preamble
 from pd4dgs_codec.format.header import Header, Reference, identity_of, scene_id_of, unpack_header
-from pd4dgs_codec.format.payload import Past, read_slice
+from pd4dgs_codec.format.payload import read_slice
 from pd4dgs_codec.format.registry import LAYERS
 from pd4dgs_codec.tensors.quantise import RowTable
 from pd4dgs_codec.tensors.symbols import Growing, LayerSymbols, LayerTensors, TakenVoxels, check_slice, merged
@@ -102,7 +102,9 @@ class LayerReader:
         self._scene_id = b""
         self.taken = TakenVoxels()
         self._tables = Tables()  # of the first slice of the layer in progress
-        self._past = Past[Prior]()  # copied for each slice, so that a fault leaves it unchanged
+        self._known = list[
+            Prior
+        ]()  # of the layer in progress; copied for each slice, so that a fault leaves it unchanged
 
     @property
     def complete(self) -> bool:
@@ -205,17 +207,17 @@ class LayerReader:
 
     def _read_slice(self, chunk: Chunk, layer: int, header: Header) -> LayerSymbols:
         later = layer == self._layer
-        past = self._past.copy() if later else Past[Prior]()
+        known = list(self._known) if later else []
         of, earlier = self._tables if later else None, self.grown.classes
         base_rows = header.base.rows if header.base else 0
         table, before = header.table, self._declared
-        part, declared = read_slice(chunk.payload, layer, table, header.mode, before, of, earlier, past, base_rows)
+        part, declared = read_slice(chunk.payload, layer, table, header.mode, before, of, earlier, known, base_rows)
         check_slice(part, self.grown.codes, header.info.voxel_size)
         if not later and layer not in self.grown.tensors:
             self._check(header.kind, table, {**self.grown.tensors, layer: part.tensors})
         self.taken.take(part.anchor_q)
         self._tables = self._tables if later else part.tensors.tables
-        self._declared, self._past = declared, past if chunk.more else Past()
+        self._declared, self._known = declared, known if chunk.more else []
         self._layer, self._number, self.count = layer, chunk.slice, self.count + 1
         self.grown.add(part, not later)
         if self._following[self._index + 1] != layer:

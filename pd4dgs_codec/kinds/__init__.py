@@ -1,7 +1,13 @@
 """The registry of kinds, by role and number: what gives the tensors of a file their meaning (clauses 13.1 and 17.1).
 
-A kind is a module with its number and name, its rules, and the way between tensors and the parts of a `Scene`. The
-modules of `format` know forms only; nothing else in the package lists kinds.
+Every module of this package with a NUMBER and a NAME is a kind, and nothing else lists kinds. Errors are those that the
+functions here document.
+
+Both roles have `check`, of the tensors of a file, `check_arrays`, of those that users give, `tensors_of`, `array_names`
+and `json_of_layer`. A kind of scene also has SCENE, its class; TENSORS, the names of rows by number; `widths_of` a
+header, `kind_of`, `scene_of` and `json`; without tensors in layer 0, neither `check_arrays`, `tensors_of` nor
+`array_names`. A kind of deformation also has OF, the name of the scenes that it moves; DEFORMATION, its class;
+`deformation_of` and, if it has layer rows, `rows_of`.
 """
 
 from __future__ import annotations
@@ -9,36 +15,34 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import replace
+from importlib import import_module
+from pkgutil import iter_modules
+from types import ModuleType
 from typing import Any
 
 import numpy as np
 
 from pd4dgs_codec.errors import DecodeError, Malformed, UnsupportedFeature
-from pd4dgs_codec.kinds import hexplane, scaffold, splats, tracks
-from pd4dgs_codec.kinds.splats import SplatScene
-from pd4dgs_codec.scene import ATTRIBUTES, PLANES, SCAFFOLD_NETWORKS, Grading, Scene, SceneInfo, Steps
+from pd4dgs_codec.scene import Grading, LayeredScene, SceneInfo
 from pd4dgs_codec.tensors.quantise import Rows, RowTable, quantise
 from pd4dgs_codec.tensors.symbols import Growing
 from pd4dgs_codec.tensors.tables import NOTHING, Kind, Tables, Tensors
 
 #: A scene of any kind.
-AnyScene = Scene | SplatScene
-
-SCENES = {scaffold.NUMBER: scaffold, splats.NUMBER: splats}
-DEFORMATIONS = {hexplane.NUMBER: hexplane, tracks.NUMBER: tracks}
-#: The kind of deformation of each kind of scene.
-MOVED_BY = {scaffold.NUMBER: hexplane, splats.NUMBER: tracks}
-
-#: By layer: what messages and reports call the grids and chains of a scaffold.
-NAMES = ("scaffold", "global_deformation", "local_deformation")
-#: By layer: the fields of Steps of its grids, None for layer 0, and of its chains.
-STEPS = ((None, "weights_scaffold"), ("planes_global", "weights_global"), ("planes_local", "weights_local"))
+AnyScene = LayeredScene
 
 
-def step_names(layer: int) -> tuple[str, ...]:
-    """Returns the fields of Steps that a layer's grids and chains use."""
-    return tuple(name for name in STEPS[layer] if name)
+def _registry(role: str) -> dict[int, ModuleType]:
+    """Returns the modules that have an attribute `role`, by ascending number."""
+    modules = [import_module(f"{__name__}.{found.name}") for found in iter_modules(__path__)]
+    return dict(sorted((module.NUMBER, module) for module in modules if hasattr(module, role)))
+
+
+SCENES, DEFORMATIONS = _registry("SCENE"), _registry("OF")
+
+
+def _of(scene: AnyScene) -> ModuleType:
+    return next(kind for kind in SCENES.values() if isinstance(scene, kind.SCENE))
 
 
 # -- reading -----------------------------------------------------------------------------------------------------------
@@ -50,21 +54,22 @@ def check(kind: Kind, table: RowTable, layers: Mapping[int, Tensors]) -> None:
 
     Raises UnsupportedFeature for a kind outside the registry, Malformed for tensors that break the rules of theirs.
     """
-    widths = _known("scene", kind, SCENES).widths_of(kind, table)
+    of = _known("scene", kind, SCENES)
+    widths = of.widths_of(kind, table)
     for layer, own in list(layers.items())[-1:]:
         where, tables = f"layer {layer}", own.tables
         if layer == 0:
-            SCENES[kind[0]].check(tables, widths)
+            of.check(tables, widths)
         elif tables != NOTHING.tables:
-            found = tables.kind and _known(f"{where}: deformation", tables.kind, DEFORMATIONS)
-            expected = MOVED_BY[kind[0]]
-            if found is not expected:
-                stated = found.NAME if found else "without a kind"
-                raise Malformed(f"{where}: deformation {stated}, expected {expected.NAME}")
-            expected.check(own, {i: other.tables for i, other in layers.items() if 0 < i < layer}, widths, where)
+            moves = tables.kind and _known(f"{where}: deformation", tables.kind, DEFORMATIONS)
+            if not moves or moves.OF != of.NAME:
+                expected = " or ".join(own.NAME for own in DEFORMATIONS.values() if own.OF == of.NAME)
+                stated = moves.NAME if moves else "without a kind"
+                raise Malformed(f"{where}: deformation {stated}, expected {expected}")
+            moves.check(own, {i: other.tables for i, other in layers.items() if 0 < i < layer}, widths, where)
 
 
-def _known(what: str, kind: Kind, registry: Mapping[int, Any]) -> Any:
+def _known(what: str, kind: Kind, registry: Mapping[int, ModuleType]) -> ModuleType:
     if kind[0] not in registry:
         names = ", ".join(f"{number} ({module.NAME})" for number, module in registry.items())
         raise UnsupportedFeature(f"{what} of kind {kind[0]}, expected {names}")
@@ -84,20 +89,12 @@ def scene_of(kind: Kind, table: RowTable, info: SceneInfo, grown: Growing, write
         "grading": Grading(classes, table.centre_values) if table.graded else None,
         "fills": tuple(grown.fills.values()),
     }
-    if kind[0] == splats.NUMBER:
-        pairs = zip(grown.tensors.items(), layer_rows, strict=True)
-        return splats.scene_of(table, common, rows, {i: tracks.tracks_of(own, x) for (i, own), x in pairs if x})
-    steps = {ATTRIBUTES[tensor.id]: tensor.step for tensor in table.tensors}
-    for layer, tensors in grown.tensors.items():
-        steps |= _steps(layer, tensors.tables)
-    moved = {i: hexplane.deformation_of(tensors) for i, tensors in grown.tensors.items() if i and tensors.weights}
-    networks = scaffold.networks_of(grown.tensors[0])
-    return scaffold.scene_of(kind, table, common, rows, Steps(**steps), networks, moved)
-
-
-def _steps(layer: int, tables: Tables) -> dict[str, float]:
-    used = zip(STEPS[layer], (tables.grid_step, tables.chain_step), strict=True)
-    return {name: step for name, step in used if name and step}
+    pairs = zip(grown.tensors.items(), layer_rows, strict=True)
+    moved = {
+        layer: DEFORMATIONS[own.tables.kind[0]].deformation_of(own, x) for (layer, own), x in pairs if own.tables.kind
+    }
+    scene: AnyScene = SCENES[kind[0]].scene_of(kind, table, common, rows, grown.tensors, moved)
+    return scene
 
 
 def json(kind: Kind, table: RowTable) -> dict[str, Any]:
@@ -117,10 +114,8 @@ def json_of_layer(kind: Kind, table: RowTable, layers: Mapping[int, Tables]) -> 
         check(kind, table, found if layer or own != NOTHING.tables else {})
     except DecodeError:
         return own.json()
-    if kind[0] == splats.NUMBER:
-        return tracks.json_of_layer(own)
-    words = hexplane.json_of_layer(own) if layer else scaffold.json_of_layer(own)
-    return {"steps": _steps(layer, own), **words}
+    words: dict[str, Any] = (DEFORMATIONS[own.kind[0]] if own.kind else SCENES[kind[0]]).json_of_layer(own, layer)
+    return words
 
 
 # -- writing -----------------------------------------------------------------------------------------------------------
@@ -128,12 +123,13 @@ def json_of_layer(kind: Kind, table: RowTable, layers: Mapping[int, Tables]) -> 
 
 def kind_of(scene: AnyScene) -> Kind:
     """Returns the integers of a scene's kind."""
-    return (splats.NUMBER,) if isinstance(scene, SplatScene) else scaffold.kind_of(scene.widths)
+    kind: Kind = _of(scene).kind_of(scene)
+    return kind
 
 
 def row_table(scene: AnyScene) -> RowTable:
     """Returns the table of a scene's rows. Raises EncodeError for a centre without a symbol."""
-    names = list(splats.TENSORS) if isinstance(scene, SplatScene) else ATTRIBUTES
+    names = list(_of(scene).TENSORS)
     sizes = {name: math.prod(values.shape[1:]) for name, values in scene.attributes.items()}
     table = RowTable(tuple(Rows(names.index(name), size, scene.row_steps[name]) for name, size in sizes.items()))
     if scene.grading is None:
@@ -144,48 +140,45 @@ def row_table(scene: AnyScene) -> RowTable:
     return RowTable(table.tensors, np.concatenate(centre))
 
 
+def _part(scene: AnyScene, layer: int) -> ModuleType | None:
+    """Returns the kind of what a layer has besides masks and rows, None if it has nothing."""
+    if layer == 0:
+        return _of(scene) if hasattr(_of(scene), "tensors_of") else None
+    given = scene.deformation(layer)
+    return next((kind for kind in DEFORMATIONS.values() if isinstance(given, kind.DEFORMATION)), None)
+
+
 def layer_name(scene: AnyScene, layer: int) -> str:
     """Returns what messages and reports call the grids and chains of a layer."""
-    return f"tracks of layer {layer}" if isinstance(scene, SplatScene) else NAMES[layer]
+    return f"{(_part(scene, layer) or _of(scene)).NAME} of layer {layer}"
 
 
-def utility_of(scene: AnyScene) -> np.ndarray:
-    """Estimates each anchor's utility without views, float32 [N]: its mask code in the highest layer, and opacity if
-    it has one, times the largest area, relative to other anchors, that its Gaussians may cover."""
-    opacity, logs = scene.mask[-1].astype(np.float32), scene.attributes.get("scaling_log")
-    if isinstance(scene, SplatScene):
-        opacity, logs = opacity * splats.sigmoid(scene.tensors["opacity"][:, 0]), scene.tensors["scale"]
-    assert logs is not None
-    area = np.sort(logs[:, -3:], axis=1)[:, 1:].sum(axis=1)
-    utility: np.ndarray = opacity * np.exp(area - area.max(initial=0))
-    return utility
+def check_arrays(scene: AnyScene, layer: int) -> None:
+    """Raises EncodeError for an array of a layer of another shape, dtype or value than its kind documents, as far as
+    the tables that follow from it do not tell."""
+    if part := _part(scene, layer):
+        part.check_arrays(scene, layer, layer_name(scene, layer))
 
 
 def tensors_of(scene: AnyScene, layer: int) -> Tensors:
     """Returns the values of the grids and chains of a layer."""
-    if isinstance(scene, SplatScene):
-        own = scene.deformation(layer)
-        return NOTHING if own is None else tracks.tensors_of(own)
-    planes, weights = (getattr(scene.steps, name) if name else 0.0 for name in STEPS[layer])
-    if layer == 0:
-        return scaffold.tensors_of(scene.networks, weights)
-    deformation = scene.deformation(layer)
-    return NOTHING if deformation is None else hexplane.tensors_of(deformation, planes, weights)
+    part = _part(scene, layer)
+    tensors: Tensors = part.tensors_of(scene, layer) if part else NOTHING
+    return tensors
 
 
-def with_tensors(scene: Scene, layer: int, tensors: Tensors) -> Scene:
-    """Returns the scene with these values in a layer; without grids and chains it has no deformation."""
-    if layer == 0:
-        return replace(scene, networks=scaffold.networks_of(tensors))
-    return scene.with_deformation(layer, hexplane.deformation_of(tensors) if tensors.weights else None)
+def rows_of(scene: AnyScene, layer: int, count: int) -> dict[str, np.ndarray]:
+    """Returns the layer rows of the scene's first `count` rows, float32 [count, K] by name in coding order, of a layer
+    whose tables have some. Raises EncodeError if later rows are not 0."""
+    part = _part(scene, layer)
+    assert part is not None
+    rows: dict[str, np.ndarray] = part.rows_of(scene, layer, count)
+    return rows
 
 
-def array_names(layer: int, tables: Tables) -> list[str]:
+def array_names(scene: AnyScene, layer: int, tables: Tables) -> list[str]:
     """Returns the names of a layer's planes, weights and biases in coding order, such as "planes.0.xy" and
     "mlp.trunk.weight.0"."""
-    if tables.kind[:1] == (tracks.NUMBER,):
-        return tracks.array_names(tables)
-    chains = hexplane.CHAINS if layer else SCAFFOLD_NETWORKS
-    planes = [f"planes.{s}.{name}" for s in range(len(tables.grids)) for name, _, _ in PLANES]
-    layers = [(chains[chain.id], i) for chain in tables.chains for i in range(len(chain.widths) - 1)]
-    return planes + [f"mlp.{name}.{part}.{i}" for name, i in layers for part in ("weight", "bias")]
+    part = _part(scene, layer)
+    names: list[str] = part.array_names(tables) if part else []
+    return names

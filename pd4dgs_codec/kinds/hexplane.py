@@ -5,19 +5,21 @@ Parameters: [], or [k] with the code of the key instant.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from pd4dgs_codec.errors import Malformed
-from pd4dgs_codec.kinds.scaffold import chains_of
-from pd4dgs_codec.scene import PLANES, TRUNK, Deformation, Widths, instant, plane_sides
+from pd4dgs_codec.kinds import scaffold
+from pd4dgs_codec.scene import INSTANTS, PLANES, TRUNK, Deformation, Scene, Widths, instant, plane_sides
 from pd4dgs_codec.tensors.planes import cells_read, fill_plane
+from pd4dgs_codec.tensors.quantise import expect
 from pd4dgs_codec.tensors.tables import Grid, Kind, Tables, Tensors
 
 NUMBER, NAME = 0, "hexplane"
+OF, DEFORMATION = scaffold.NAME, Deformation
 
 #: Chains by id: the trunk, the position, and the residual of each tensor of rows.
 CHAINS = (TRUNK, "position", "feature", "scaling", "offset")
@@ -54,28 +56,54 @@ def check(tensors: Tensors, below: Mapping[int, Tables], widths: Widths, where: 
             raise Malformed(f"{where} {name}: inputs and outputs {sides}, expected {expected}")
 
 
-def tensors_of(deformation: Deformation, planes_step: float, weights_step: float) -> Tensors:
+def check_arrays(scene: Scene, layer: int, own: str) -> None:
+    """Raises EncodeError for networks or planes of other names or axes than those of the kind, or another key."""
+    given = scene.deformation(layer)
+    assert given is not None
+    scaffold.check_networks(given.networks, CHAINS, (TRUNK,), own)
+    for s, planes in enumerate(given.planes):
+        expect(set(planes) == {p for p, _, _ in PLANES}, f"{own} scale {s}: planes {sorted(planes)}, expected six")
+        flat = [name for name, plane in planes.items() if plane.ndim != 3 or not plane.size]
+        expect(not flat, f"{own} scale {s}: planes {flat} are empty or do not have 3 axes")
+    key = given.key
+    valid = key is None or (type(key) is int and 0 <= key <= INSTANTS)
+    expect(valid, f"{own}: key instant {key!r}, expected None or an integer 0..{INSTANTS}")
+
+
+def tensors_of(scene: Scene, layer: int) -> Tensors:
+    """Returns the grids and chains of a layer."""
+    given = scene.deformation(layer)
+    assert given is not None
+    return tensors_of_parts(given, scene.steps.planes(layer), scene.steps.weights(layer))
+
+
+def tensors_of_parts(deformation: Deformation, planes_step: float, weights_step: float) -> Tensors:
     """Returns the grids and chains of a deformation, or of some of its parts."""
     grids = [Grid(s, len(scale["xy"]), plane_sides(scale)) for s, scale in enumerate(deformation.planes)]
     networks = {i: deformation.networks[name] for i, name in enumerate(CHAINS) if name in deformation.networks}
-    chains, key = chains_of(networks, weights_step), deformation.key
+    chains, key = scaffold.chains_of(networks, weights_step), deformation.key
     kind: Kind = (NUMBER,) if key is None else (NUMBER, key)
     tables = replace(chains.tables, grids=tuple(grids), grid_step=planes_step if grids else 0.0, kind=kind)
     return Tensors(tables, [scale[name] for scale in deformation.planes for name, _, _ in PLANES], chains.weights)
 
 
-def deformation_of(tensors: Tensors) -> Deformation:
-    """The inverse of `tensors_of`."""
+def array_names(tables: Tables) -> list[str]:
+    """Returns the names of planes, weights and biases in coding order."""
+    planes = [f"planes.{s}.{name}" for s in range(len(tables.grids)) for name, _, _ in PLANES]
+    return planes + scaffold.array_names(tables, CHAINS)
+
+
+def deformation_of(tensors: Tensors, rows: Sequence[np.ndarray] = ()) -> Deformation:
+    """The inverse of `tensors_of_parts`."""
     names = [name for name, _, _ in PLANES]
     planes = tuple(dict(zip(names, own, strict=True)) for own in tensors.grids.values())
     networks = {CHAINS[i]: network for i, network in tensors.chains.items()}
     return Deformation(planes, networks, *tensors.tables.kind[1:])
 
 
-def json_of_layer(tables: Tables) -> dict[str, Any]:
-    """planes: [C, x, y, z, t] per scale. networks: output widths by name. key_instant: normalised time, if any."""
-    networks = {CHAINS[chain.id]: list(chain.widths[1:]) for chain in tables.chains}
-    found = {"planes": [[grid.channels, *grid.sides] for grid in tables.grids], "networks": networks}
+def json_of_layer(tables: Tables, layer: int) -> dict[str, Any]:
+    """As of a scaffold, and key_instant: normalised time, if any."""
+    found = scaffold.json_of_layer(tables, layer, CHAINS)
     return found if len(tables.kind) < 2 else found | {"key_instant": instant(tables.kind[1])}
 
 

@@ -6,17 +6,16 @@ harmonics Y_j with their signs, and max(0, 0.5 + sum c_j Y_j(d)), d the unit vec
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from pd4dgs_codec.errors import Malformed
-from pd4dgs_codec.kinds.tracks import Tracks, total
-from pd4dgs_codec.scene import MASK_STEP, MIN_OPACITY, Gaussians, Grading, LayeredScene, SceneInfo
+from pd4dgs_codec.scene import MASK_STEP, MIN_OPACITY, Gaussians, Grading, LayeredScene, SceneInfo, relative_area
 from pd4dgs_codec.tensors.quantise import RowTable, dequantise
-from pd4dgs_codec.tensors.tables import Kind, Tables
+from pd4dgs_codec.tensors.tables import Kind, Tables, Tensors
 
 NUMBER, NAME = 1, "splats"
 
@@ -24,6 +23,8 @@ NUMBER, NAME = 1, "splats"
 TENSORS = {"offset": (3,), "color": (3,), "opacity": (1,), "scale": (3,), "rotation": (3,), "harmonics": (9, 24, 45),
            "window": (3,)}  # fmt: skip
 OPTIONAL = ("harmonics", "window")
+#: What deformations add to, in the order of the heads of tracks, with its components: see `Moving.at`.
+HEADS = {"position": 3, "rotation": 4, "scale": 3, "opacity": 1, "color": 3}
 
 MAX_DEGREE = 3
 #: Y_0, a constant: the factor between a colour and its first coefficient.
@@ -172,6 +173,26 @@ def sigmoid(x: np.ndarray) -> np.ndarray:
 # -- the scene ---------------------------------------------------------------------------------------------------------
 
 
+class Motion(Protocol):
+    """A deformation of splats, of any kind, whose arrays have the scene's first rows or all of them."""
+
+    @property
+    def heads(self) -> Collection[str]:
+        """Names in HEADS: what it adds to."""
+
+    def residuals(self, t: float) -> dict[str, np.ndarray]:
+        """Returns what it adds at normalised time t in 0..1, once `prepared`: float32 [rows, components] by head."""
+
+    def prepared(self, positions: np.ndarray, box: np.ndarray) -> Motion:
+        """Returns it for many times. positions: float32 [rows, 3], at rest, scene units. box: see SceneInfo."""
+
+    def of_rows(self, rows: np.ndarray | slice) -> Motion:
+        """Returns that of a scene's rows `rows`, an int64 array or the first ones."""
+
+    def scaled(self, factor: float) -> Motion:
+        """Returns it with every step times `factor`, rounded to binary32."""
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class SplatScene(LayeredScene):
     """A scene of the kind splats. tensors: float32 [N, C] by the names of TENSORS, in their order. steps: of the
@@ -179,7 +200,7 @@ class SplatScene(LayeredScene):
 
     steps: dict[str, float]
     tensors: dict[str, np.ndarray]
-    tracks: dict[int, Tracks]
+    tracks: dict[int, Any]
 
     @property
     def attributes(self) -> dict[str, np.ndarray]:
@@ -198,20 +219,18 @@ class SplatScene(LayeredScene):
     def still(self) -> bool:
         return super().still and "window" not in self.tensors
 
-    def deformation(self, layer: int) -> Tracks | None:
-        """Returns the tracks of a layer, None without any."""
+    @property
+    def utility(self) -> np.ndarray:
+        opacity = super().utility * sigmoid(self.tensors["opacity"][:, 0])
+        return np.asarray(opacity * relative_area(self.tensors["scale"]))
+
+    def deformation(self, layer: int) -> Any:
         return self.tracks.get(layer)
 
-    def with_deformation(self, layer: int, deformation: Tracks | None) -> SplatScene:
-        """Returns the scene with these tracks in a layer."""
-        others = {number: tracks for number, tracks in self.tracks.items() if number != layer}
-        return replace(self, tracks=others | ({layer: deformation} if deformation else {}))
-
     def of_anchors(self, rows: np.ndarray | slice) -> dict[str, Any]:
-        grading = None if self.grading is None else replace(self.grading, classes=self.grading.classes[rows])
         tensors = {name: values[rows] for name, values in self.tensors.items()}
         tracks = {layer: own.of_rows(rows) for layer, own in self.tracks.items()}
-        return {"anchor_q": self.anchor_q[rows], "tensors": tensors, "tracks": tracks, "grading": grading}
+        return super().of_anchors(rows) | {"tensors": tensors, "tracks": tracks}
 
     def of_layers(self) -> dict[str, Any]:
         return {"tracks": {layer: own for layer, own in self.tracks.items() if layer in self.layers}}
@@ -252,13 +271,13 @@ class Moving:
             self._rest = replace(self._rest, scales=self._rest.scales * mask[:, None])
         columns = {name: np.asfortranarray(getattr(self._rest, name)) for name in ("means", "quats") if heads}
         self._rest = replace(self._rest, **columns)  # in the order in memory of what is added to them
-        own = {layer: tracks.of_rows(rows) for layer, tracks in scene.tracks.items()}
-        self._tracks = {i: tracks.prepared(self._rest.means, scene.info.box) for i, tracks in own.items()}
+        own = [motion.of_rows(rows) for motion in scene.tracks.values()]
+        self._motions = [motion.prepared(self._rest.means, scene.info.box) for motion in own]
 
     @np.errstate(all="ignore")
     def at(self, t: float) -> tuple[Splats, np.ndarray]:
         """Returns (the visible Gaussians at normalised time t in 0..1, their rows int64 [K])."""
-        rest, mask, added = self._rest, self._mask, total(self._tracks, t, len(self._rows))
+        rest, mask, added = self._rest, self._mask, self._added(t)
         opacities = rest.opacities if "opacity" not in added else sigmoid(self._logits + added["opacity"][:, 0])
         if self._window is not None:
             opacities = opacities * visible(self._window, t)
@@ -279,6 +298,17 @@ class Moving:
             return splats, self._rows
         return splats.taken(seen), self._rows[seen]
 
+    def _added(self, t: float) -> dict[str, np.ndarray]:
+        """Returns the sum of the residuals of all layers at normalised time t: float32 [n, components] by head."""
+        found = dict[str, np.ndarray]()
+        for motion in self._motions:
+            for name, added in motion.residuals(t).items():
+                if name not in found and len(added) == len(self._rows):
+                    found[name] = added
+                    continue
+                found.setdefault(name, np.zeros((len(self._rows), HEADS[name]), np.float32))[: len(added)] += added
+        return found
+
 
 def scene(
     info: SceneInfo,
@@ -288,7 +318,7 @@ def scene(
     *,
     classes: np.ndarray | None = None,
     centres: Mapping[str, np.ndarray] | None = None,
-    tracks: Mapping[int, Tracks] | None = None,
+    tracks: Mapping[int, Motion] | None = None,
     layer: np.ndarray | None = None,
 ) -> SplatScene:
     """Returns a scene to be encoded, of n Gaussians in any order, all of them active from their layer on.
@@ -321,6 +351,14 @@ def scene(
 # -- tensors of a file -------------------------------------------------------------------------------------------------
 
 
+SCENE = SplatScene
+
+
+def kind_of(scene: SplatScene) -> Kind:
+    """Returns the integers of the kind."""
+    return (NUMBER,)
+
+
 def widths_of(kind: Kind, table: RowTable) -> None:
     """Raises Malformed if a header breaks the rules of the kind. No other widths follow from those of the rows."""
     if len(kind) != 1:
@@ -339,6 +377,11 @@ def check(tables: Tables, widths: None) -> None:
         raise Malformed("layer 0: grids, chains, layer rows or a deformation, expected none")
 
 
+def json_of_layer(tables: Tables, layer: int) -> dict[str, Any]:
+    """Returns steps and heads of a layer without a deformation, none."""
+    return {"steps": {}, "heads": {}}
+
+
 def json(kind: Kind, table: RowTable) -> dict[str, Any]:
     """Returns the degree of the harmonics, whether there are windows, and the steps."""
     steps = {list(TENSORS)[tensor.id]: tensor.step for tensor in table.tensors}
@@ -347,7 +390,12 @@ def json(kind: Kind, table: RowTable) -> dict[str, Any]:
 
 
 def scene_of(
-    table: RowTable, common: Mapping[str, Any], rows: Sequence[np.ndarray], tracks: dict[int, Tracks]
+    kind: Kind,
+    table: RowTable,
+    common: Mapping[str, Any],
+    rows: Sequence[np.ndarray],
+    tensors: Mapping[int, Tensors],
+    tracks: dict[int, Motion],
 ) -> SplatScene:
     """Returns a scene. common: arguments of `LayeredScene`. rows: float32 [N, C] of each tensor. tracks: by layer."""
     names = list(TENSORS)

@@ -8,21 +8,21 @@ head h (id MAPS + h) from the position to what is added to the coefficients.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from pd4dgs_codec.errors import Malformed
+from pd4dgs_codec.kinds import splats
+from pd4dgs_codec.kinds.splats import HEADS, SplatScene
 from pd4dgs_codec.scene import deformation_unit
-from pd4dgs_codec.tensors.quantise import WHOLE, Rows
+from pd4dgs_codec.tensors.quantise import WHOLE, Rows, expect, expect_array, is_step
 from pd4dgs_codec.tensors.tables import Grid, Tables, Tensors
 
 NUMBER, NAME = 1, "tracks"
 
-#: Components of each head, in the order of their numbers.
-HEADS = {"position": 3, "rotation": 4, "scale": 3, "opacity": 1, "color": 3}
 #: Ids of the layer rows of groups, of the grid of their centres, and of their first map.
 GROUP, CENTRES, MAPS = 5, 6, 7
 NONE = -1  #: the group of a row that has none, as any number outside 0..M - 1
@@ -142,6 +142,9 @@ class Tracks:
         return replace(self, instants=instants, step=float(np.float32(self.step * factor)), heads=heads)
 
 
+OF, DEFORMATION = splats.NAME, Tracks
+
+
 def check(tensors: Tensors, below: Mapping[int, Tables], widths: None, where: str) -> None:
     """Raises Malformed if the tensors of a layer, or its tables alone, break the rules of the kind."""
     tables, components = tensors.tables, list(HEADS.values())
@@ -172,8 +175,33 @@ def check(tensors: Tensors, below: Mapping[int, Tables], widths: None, where: st
             raise Malformed(f"{where}: instants do not ascend from 0")
 
 
-def tensors_of(tracks: Tracks) -> Tensors:
-    """Returns the grids of tracks; `coefficients` has the layer rows."""
+def check_arrays(scene: SplatScene, layer: int, own: str) -> None:
+    """Raises EncodeError for arrays of other shapes than Tracks documents, for unknown heads and for other steps."""
+    given, rows = scene.tracks[layer], scene.rows[-1]
+    count = len(given.instants)
+    expect_array(f"{own} instants", given.instants, np.float32, (count,))
+    unknown = [name for name in given.heads if name not in HEADS]
+    expect(not unknown, f"{own}: heads {unknown}, expected some of {list(HEADS)}")
+    for name, head in given.heads.items():
+        number = len(head.bases)
+        expect(number > 0, f"{own}: no bases of {name}, expected some, or no such head")
+        expect_array(f"{own} bases of {name}", head.bases, np.float32, (number, HEADS[name], count))
+        most = min(len(head.coefficients), rows)
+        expect_array(f"{own} coefficients of {name}", head.coefficients, np.float32, (most, number))
+        expect(is_step(head.step), f"{own} step of {name}: {head.step!r}, expected a positive normal binary32 value")
+    if groups := given.groups:
+        fits = groups.maps.keys() <= given.heads.keys()
+        expect(fits, f"{own}: maps of {list(groups.maps)}, expected some of {list(given.heads)}")
+        expect_array(f"{own} groups", groups.rows, np.float32, (min(len(groups.rows), rows), 1))
+        number = len(groups.centres)
+        expect_array(f"{own} centres", groups.centres, np.float32, (number, 3))
+        for name, maps in groups.maps.items():
+            expect_array(f"{own} maps of {name}", maps, np.float32, (number, 4, len(given.heads[name].bases)))
+
+
+def tensors_of(scene: SplatScene, layer: int) -> Tensors:
+    """Returns the grids of the tracks of a layer; `rows_of` has the layer rows."""
+    tracks: Tracks = scene.tracks[layer]
     heads = [(i, name, tracks.heads[name]) for i, name in enumerate(HEADS) if name in tracks.heads]
     planes = {0: tracks.instants[None]}
     planes |= {1 + i: head.bases.reshape(-1, head.bases.shape[2]) for i, _, head in heads}
@@ -188,15 +216,21 @@ def tensors_of(tracks: Tracks) -> Tensors:
     return Tensors(Tables(grids, grid_step=tracks.step, kind=(NUMBER,), rows=tuple(rows)), arrays)
 
 
-def coefficients(tracks: Tracks, count: int) -> dict[str, np.ndarray]:
-    """Returns the layer rows of the scene's first `count` rows, float32 [count, K] by name in coding order."""
+def rows_of(scene: SplatScene, layer: int, count: int) -> dict[str, np.ndarray]:
+    """Returns the layer rows of the scene's first `count` rows, float32 [count, K] by name in coding order. Raises
+    EncodeError for others that are not 0."""
+    tracks: Tracks = scene.tracks[layer]
+    lost = [name for name, head in tracks.heads.items() if head.coefficients[count:].any()]
+    if tracks.groups and tracks.groups.maps and (tracks.groups.rows[count:] != NONE).any():
+        lost.append("groups")
+    expect(not lost, f"tracks of layer {layer}: {lost} of anchors of a later layer, expected 0 or no group")
     taken = tracks.of_rows(np.arange(count))
-    found = {name: taken.heads[name].coefficients for name in HEADS if name in taken.heads}
-    return found | ({"group": taken.groups.rows} if taken.groups else {})
+    found = {f"tracks.coefficients.{name}": taken.heads[name].coefficients for name in HEADS if name in taken.heads}
+    return found | ({"tracks.group": taken.groups.rows} if taken.groups else {})
 
 
-def tracks_of(tensors: Tensors, rows: list[np.ndarray]) -> Tracks:
-    """The inverse of `tensors_of` and `coefficients`."""
+def deformation_of(tensors: Tensors, rows: Sequence[np.ndarray]) -> Tracks:
+    """The inverse of `tensors_of` and `rows_of`."""
     heads, maps, groups = dict[str, Head](), dict[str, np.ndarray](), None
     planes = {grid.id: plane[:, 0] for grid, plane in zip(tensors.tables.grids, tensors.planes, strict=True)}
     for tensor, values in zip(tensors.tables.rows, rows, strict=True):
@@ -210,11 +244,9 @@ def tracks_of(tensors: Tensors, rows: list[np.ndarray]) -> Tracks:
     return Tracks(planes[0][0], tensors.tables.grid_step, heads, groups)
 
 
-def json_of_layer(tables: Tables) -> dict[str, Any]:
+def json_of_layer(tables: Tables, layer: int) -> dict[str, Any]:
     """instants: their number T. heads: number K of bases by name. groups: their number M. steps: of each head's
-    coefficients, and of all grids. All are empty or 0 without tracks."""
-    if not tables.grids:
-        return {"steps": {}, "instants": 0, "heads": {}, "groups": 0}
+    coefficients, and of all grids."""
     heads = {list(HEADS)[rows.id]: rows for rows in tables.rows if rows.id != GROUP}
     sides = {grid.id: grid.sides[0] for grid in tables.grids}
     return {
@@ -229,15 +261,3 @@ def array_names(tables: Tables) -> list[str]:
     """Returns the names of the planes in coding order."""
     names = ["instants", *(f"bases.{name}" for name in HEADS), "centres", *(f"maps.{name}" for name in HEADS)]
     return [f"tracks.{names[grid.id]}" for grid in tables.grids]
-
-
-def total(layers: Mapping[int, Tracks], t: float, count: int) -> dict[str, np.ndarray]:
-    """Returns the sum of the residuals of all layers at normalised time t: float32 [count, c] by head."""
-    found = dict[str, np.ndarray]()
-    for tracks in layers.values():
-        for name, added in tracks.residuals(t).items():
-            if name not in found and len(added) == count:
-                found[name] = added
-                continue
-            found.setdefault(name, np.zeros((count, HEADS[name]), np.float32))[: len(added)] += added
-    return found

@@ -25,6 +25,7 @@ from pd4dgs_codec.io import read_source, write_bytes
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model, check_finite, from_scene
 from pd4dgs_codec.model.networks import MLP
+from pd4dgs_codec.morton import morton_codes
 from pd4dgs_codec.scene import SCAFFOLD_NETWORKS, Camera, Deformation, Grading, Scene, SceneInfo, Steps, Viewpoint
 
 FORMAT = "pd4dgs-checkpoint"
@@ -33,7 +34,7 @@ VERSION = 1
 
 def save(path: str | Path, model: Model, training: dict[str, Any] | None = None) -> None:
     """Writes the model and `training`, the state for resuming, whole or not at all. Raises DataError, also for a model
-    that `load` would refuse. See `target`."""
+    that `load` or, by the places of its anchors, `encode` would refuse. See `target`."""
     real, training = target(path), dict(training or {})
     if viewpoints := training.get("viewpoints"):
         training["viewpoints"] = [[_camera_to_plain(camera), time] for camera, time in viewpoints]
@@ -51,7 +52,7 @@ def save(path: str | Path, model: Model, training: dict[str, Any] | None = None)
     }
     try:
         check_finite(content["state"])
-        _build(content)
+        morton_codes(_build(content).anchor_q.numpy())  # raises EncodeError for anchors too far apart to be encoded
     except (DataError, EncodeError) as error:
         raise DataError(f"{path}: the model cannot be stored: {error}") from None
     content["digest"] = _digest(content)

@@ -3,7 +3,7 @@
     pick     rows of the attributes, with noise or rounding      [n, 9 + D + 3 G]
     grow     the scaffold's networks: the Gaussians of anchors    [K, 14]
 
-A row's columns are the residual heads in the registry's order. `reference` has the same stages in plain torch.
+A row has the position, then the attributes in their order. `reference` has the same stages in plain torch.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ def fusible(networks: Sequence[MLP]) -> bool:
 
 
 def pick(attributes: Sequence[Tensor], position: Tensor, rows: Tensor, quantisation: Quantisation) -> Tensor:
-    """Returns [n, 9 + D + 3 G]: the anchors `rows` (int64 [n], none twice), with noise or rounded. attributes: feature
-    [N, D], offset [N, G, 3], scaling [N, 6]. position: [N, 3]."""
+    """Returns [n, 9 + D + 3 G]: the anchors `rows` (int64 [n], none twice), with noise or rounded. attributes: [N, ...]
+    each, in the order of ATTRIBUTES. position: [N, 3]."""
     row: Tensor = _Pick.apply(position, rows, quantisation, *attributes)  # type: ignore[no-untyped-call]
     return row
 

@@ -40,6 +40,8 @@ from pd4dgs_codec.scene import (
 )
 from pd4dgs_codec.tensors.quantise import mask_codes
 
+#: Log2 of the step of frozen anchors, in steps of class 0: so fine that neither noise nor rounding changes them.
+FROZEN_STEP = -12.0
 #: Range over which the opacity biases of an anchor's Gaussians, which start at one place, are spread at the start: some
 #: but not all of them are visible everywhere.
 START_OPACITY = (-0.1, 0.2)
@@ -61,7 +63,8 @@ class Gaussians:
 
 class Model(nn.Module):
     """Anchors, networks, deformations and masks. All tensors are float32 except anchor_q (int32 [N, 3]) and step_class
-    (uint8 [N]). step_class and centre [channels]: see `scene.Grading`."""
+    (uint8 [N]). step_class and centre [channels]: see `scene.Grading`. frozen: number of the first anchors, those of a
+    base, which training does not change, nor the networks (0: none)."""
 
     anchor_q: Tensor
     step_class: Tensor
@@ -84,6 +87,7 @@ class Model(nn.Module):
     ):
         super().__init__()
         self.info, self.steps = info, steps
+        self.frozen = 0
         self.backgrounds = dict[int, tuple[float, float, float]]()  #: of levels of incomplete files
         self.register_buffer("anchor_q", anchor_q)
         widths = Widths(feature.shape[1], offset.shape[1])
@@ -117,7 +121,14 @@ class Model(nn.Module):
     @property
     def spacing(self) -> Tensor:
         """[N], 2^c: the factor on the steps of each anchor's attributes."""
-        return torch.exp2(self.step_class.float())
+        classes = self.step_class.float()
+        classes[: self.frozen] = FROZEN_STEP
+        return torch.exp2(classes)
+
+    def freeze(self, count: int) -> None:
+        """Freezes the first `count` anchors, and the networks if there are any."""
+        self.frozen = count
+        self.networks.requires_grad_(not count)
 
     @property
     def centres(self) -> dict[str, Tensor]:
@@ -173,15 +184,11 @@ class Model(nn.Module):
 
     def _picked(self, rows: Tensor, rounding: Rounding) -> tuple[Any, ...]:
         """Returns the arguments of `pick` for the anchors `rows`: attributes, positions, rows and quantisation."""
-        steps, centres, names = self.steps.attributes, self.centres, ("feature", "offset", "scaling_log")
-        noise = None
+        steps, centres, noise = [*self.steps.attributes.values()], [*self.centres.values()], None
         if rounding.noise is not None and not rounding.attributes:
-            draws = {n: rounding.noise.draw(len(rows), centres[n].numel()) for n in ATTRIBUTES}
-            noise = [draws[name] for name in names]
-        quantisation = Quantisation(
-            [steps[n] for n in names], [centres[n] for n in names], self.spacing, noise, rounding.attributes
-        )
-        return [getattr(self, name) for name in names], self.anchor, rows, quantisation
+            noise = [rounding.noise.draw(len(rows), centre.numel()) for centre in centres]
+        quantisation = Quantisation(steps, centres, self.spacing, noise, rounding.attributes)
+        return [getattr(self, name) for name in ATTRIBUTES], self.anchor, rows, quantisation
 
     def _moved(self, level: int, rows: Tensor, t: float, rounding: Rounding, kernels: bool) -> Tensor:
         """Returns the rows of anchors plus the residuals of the deformation of `level`."""
@@ -214,8 +221,9 @@ class Model(nn.Module):
         for name, centre in self.centres.items():
             values = getattr(self, name)
             step = getattr(steps, name) * self.spacing.view(-1, *(1,) * centre.dim())
-            values.copy_(centre + torch.round((values - centre) / step) * step)
-        parts = [([*self.networks.parameters()], steps.weights_scaffold)]
+            rounded = centre + torch.round((values - centre) / step) * step
+            values[self.frozen :] = rounded[self.frozen :]
+        parts = [([] if self.frozen else [*self.networks.parameters()], steps.weights_scaffold)]
         for layer, field in self.deformations.items():
             parts += [([field.planes.grid], steps.planes(layer)), (field.weights, steps.weights(layer))]
         for parameters, step in parts:

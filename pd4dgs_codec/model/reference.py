@@ -155,9 +155,8 @@ def grow(
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """See `fused.grow`."""
     slots = len(networks[0].layers[-1].bias)
-    position, feature, offset, scaling = torch.split(
-        anchors, [3, anchors.shape[1] - 3 - 3 * slots - SCALING_DIM, 3 * slots, SCALING_DIM], dim=1
-    )
+    features = anchors.shape[1] - 3 - SCALING_DIM - 3 * slots
+    position, feature, scaling, offset = torch.split(anchors, [3, features, SCALING_DIM, 3 * slots], dim=1)
     inputs = torch.cat([feature, F.normalize(position - eye, dim=1)], dim=1)
     opacity, shape, color = (network(inputs[:, : network.layers[0].in_features], step) for network in networks)
     opacity = torch.tanh(opacity)

@@ -13,7 +13,7 @@ import os
 import shutil
 import stat
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import asdict, astuple, dataclass
 from functools import cached_property
 from pathlib import Path
@@ -145,7 +145,7 @@ def _begun(work: Path, recording: Recording, options: Options) -> Iterator[None]
         stream.seek(0)
         try:
             same = json.loads(stream.read()) == asked
-        except ValueError:  # empty, if it is new
+        except (ValueError, RecursionError):  # empty, if it is new
             same = False
         if not same:
             for path in set(work.iterdir()) - {state}:
@@ -162,21 +162,23 @@ def _frames(
     work: Path, recording: Recording, options: Options, progress: Progress
 ) -> tuple[list[Look], Choice, dict[str, float]]:
     """Writes the chosen frames to images/ once. Returns (measurements of all frames, choice, seconds by file name)."""
-    done = work / "frames.json"
-    if done.is_file():
-        stored = json.loads(done.read_text())
+    done, images = work / "frames.json", work / "images"
+    with suppress(OSError, ValueError, TypeError, LookupError, RecursionError):  # absent or damaged: made anew
+        stored = json.loads(done.read_bytes())
         looks = [Look(i, t, sharp, float("inf") if i == 0 else change) for i, t, sharp, change in stored["looks"]]
-        return looks, Choice(*map(tuple, stored["choice"])), stored["times"]
+        times = {name: float(time) for name, time in dict(stored["times"]).items()}
+        if times and times.keys() <= set(os.listdir(images)):
+            return looks, Choice(*map(tuple, stored["choice"])), times
     with progress(None, "frames", "measuring") as advance:
         looks = look(recording, advance)
     choice = choose(looks, options.frames)
     if len(choice.chosen) < FEWEST_FRAMES:
         found = f"{len(choice.blurred)} blurred and {len(choice.repeated)} repeated of {len(looks)} frames"
         raise DataError(f"{recording.path}: {found} leave {len(choice.chosen)}, expected at least {FEWEST_FRAMES}")
-    shutil.rmtree(work / "images", ignore_errors=True)
-    (work / "images").mkdir()
+    shutil.rmtree(images, ignore_errors=True)
+    images.mkdir()
     with progress(len(choice.chosen), "frames", "writing") as advance:
-        times = write_frames(recording, choice.chosen, work / "images", options.downscale, advance)
+        times = write_frames(recording, choice.chosen, images, options.downscale, advance)
     content = {"looks": [astuple(each) for each in looks], "choice": astuple(choice), "times": times}
     write_bytes(done, json.dumps(finite(content)).encode(), overwrite=True)
     return looks, choice, times

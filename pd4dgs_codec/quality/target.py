@@ -26,7 +26,8 @@ from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.payload import write_slice
 from pd4dgs_codec.format.plan import LeftOut, Plan, in_file_order, passed, plan
 from pd4dgs_codec.format.registry import MAX_PAYLOAD
-from pd4dgs_codec.kinds import AnyScene, step_names
+from pd4dgs_codec.kinds import AnyScene
+from pd4dgs_codec.kinds.scaffold import step_names
 from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.tensors.symbols import LayerSymbols, sliced
 
@@ -347,7 +348,7 @@ class _Layer:
 
     def describe(self, setting: Setting, target: int) -> Fit:
         """Returns the report of the chosen setting."""
-        moved, steps = self._moved(setting), vars(self._planned(setting).scene.steps)
+        moved, steps = self._moved(setting), self._planned(setting).scene.all_steps
         factors = {k: 2.0**v for k, v in setting.items() if k != ANCHORS}
         return Fit(
             layer=self.layer,

@@ -10,8 +10,8 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from pd4dgs_codec.entropy.channels import ChannelReader, ChannelWriter, Places
-from pd4dgs_codec.entropy.fitting import Fitted, histogram
-from pd4dgs_codec.entropy.priors import BIT, Prior, frequency_costs
+from pd4dgs_codec.entropy.fitting import histogram
+from pd4dgs_codec.entropy.priors import BIT, frequency_costs
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.tensors.quantise import MAX_SYMBOL, magnitude
 
@@ -210,21 +210,20 @@ def _filled(k: Array, given: Array, predictor: int) -> Array:
 # channels before. All arithmetic is on integers.
 
 
-def write_planes(residuals: Sequence[Array], writer: ChannelWriter, known: list[Fitted]) -> float:
-    """Codes residuals int32 [C, H, W] per plane, a batch per stage. Returns the sum of R(a) of all channels. known: the
-    prior list."""
+def write_planes(residuals: Sequence[Array], writer: ChannelWriter) -> float:
+    """Codes residuals int32 [C, H, W] per plane, a batch per stage. Returns the sum of R(a) of all channels."""
     planes = [plane.reshape(len(plane), -1) for plane in residuals]
     for stage in _stages(planes, [plane.shape for plane in residuals]):
-        writer.write([part for channels, places in stage for part in places.parts(channels)], known)
+        writer.write([part for channels, places in stage for part in places.parts(channels)])
     return sum(histogram(c).rate_bits for plane in planes for c in plane)
 
 
-def read_planes(reader: ChannelReader, shapes: Sequence[PlaneShape], known: list[Prior]) -> list[Array]:
+def read_planes(reader: ChannelReader, shapes: Sequence[PlaneShape]) -> list[Array]:
     """Decodes residuals int32 [C, H, W] per plane, the inverse of write_planes. shapes: checked against the limits."""
     planes = [np.zeros((c, h * w), np.int32) for c, h, w in shapes]
     for groups in _stages(planes, shapes):
         counts = [count for channels, places in groups for count in places.sizes * len(channels)]
-        symbols, end = reader.read(counts, known), 0
+        symbols, end = reader.read(counts), 0
         for channels, places in groups:
             first, end = end, end + channels.size
             places.put(symbols[first:end], channels)

@@ -27,9 +27,7 @@ VIEW_DEPENDENT = ("color", "covariance+color", "opacity+color", "opacity+covaria
 ABLATIONS: dict[str, dict[str, Any]] = {
     "rate": {"rate_scale": 0.0, "plane_rate": 0.0},
     "planes": {"plane_rate": 0.0},
-    "binary": {"tmc_binary": False},
-    "smooth": {"tmc_smooth": False},
-    "tmc": {"tmc_binary": False, "tmc_smooth": False},
+    "binary": {"binary": 0.0},
     "noise": {"noise": False},
     "whitening": {"whitening": False},
 }
@@ -172,13 +170,9 @@ class TrainConfig:
     rate_scale: float = option(0.08, help="weight of the anchors' bitrate; the paper's is 1", least=0, dial=4.0)
     rate_share: float = 0.05  #: share of the anchors from which a step estimates the rate
     plane_rate: float = option(4e-9, least=0, dial=4.0, fixed=False)  #: weight per bit of the planes, ramped up
-    tmc: float = 0.01
-    tmc_binary: bool = True
-    #: the binary term's weight grows to this multiple of its start, so that masks end near 0 or 1: a half-visible
-    #: anchor costs all its bytes
-    tmc_binary_growth: float = 20.0
-    tmc_smooth: bool = True
-    tmc_tau: float = 4.0  #: voxels
+    binary: float = 0.01  #: weight at first of the term that moves masks towards 0 or 1
+    #: that weight grows to this multiple of its start: a half-visible anchor costs all its bytes
+    binary_growth: float = 20.0
     #: the gradients of a step's views are averaged; workers share the views
     views_per_step: int = option(
         1, help="views per step and level, shared by the workers of torchrun", metavar="V", least=1
@@ -218,6 +212,7 @@ class TrainConfig:
     #: share of the run, at its end, over which all learning rates fall to 0: otherwise the last steps move weights
     #: across rounding boundaries, and the PSNR jumps by tenths of a dB from one step to the next
     cooldown: float = option(0.4, least=0, most=1, fixed=False)
+    still: bool = False  #: level 0 alone, of views of all times, without what moves
     ssim: float = 0.2
     volume: float = 0.01  #: weight of the mean product of scales (Scaffold-GS)
     noise: bool = True  #: simulate quantisation: noise on attributes, rounding of planes and weights, finally of all

@@ -19,6 +19,8 @@ from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model, fresh_networks
 from pd4dgs_codec.morton import MAX_VOXEL
 from pd4dgs_codec.scene import INSTANTS, SceneInfo, Steps, Widths
+from pd4dgs_codec.train import workers
+from pd4dgs_codec.train.movers import moving_starts
 from pd4dgs_codec.train.stereo import with_points
 
 #: Voxels along the longest side of the scene's box.
@@ -50,15 +52,20 @@ def fresh_model(
     """Returns an untrained model without the deformations of the layers above max_layer.
 
     Anchors start at the dataset's points, with jittered copies if there are few. Without points they start in its box
-    where pictures differ from a plain background, or at points found by stereo if there is none. A layer's start values
-    do not depend on max_layer. key: the key instant, normalised time; None: no key instant.
+    where pictures differ from a plain background, or at points found by stereo if there is none. More start where
+    something moves at the key instant, see `movers`. A layer's start values do not depend on max_layer. key: the key
+    instant, normalised time; None: no key instant.
     """
     if dataset.points is None and not on_plain_background(dataset):
         dataset = with_points(dataset, key)
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)  # nn.Linear and HexPlane draw their start values from the global generator
     info = scene_info(dataset)
-    anchor_q = initial_cells(dataset, config.initial_anchors, info.voxel_size, generator)
+    moving = torch.zeros(0, 3)
+    if key is not None and max_layer > 0:
+        moving = workers.alike(lambda: moving_starts(dataset, key))
+        moving = moving[torch.randperm(len(moving), generator=generator)[: config.initial_anchors]]
+    anchor_q = initial_cells(dataset, config.initial_anchors, info.voxel_size, generator, moving)
     n = len(anchor_q)
     spacing = nearest_distances((anchor_q.double() * info.voxel_size).float()).clamp(min=info.voxel_size)
     key_code = None if key is None else round(INSTANTS * key)  # see `scene.instant`
@@ -112,8 +119,10 @@ def scene_info(dataset: Dataset) -> SceneInfo:
     )
 
 
-def initial_cells(dataset: Dataset, count: int, voxel_size: float, generator: torch.Generator) -> Tensor:
-    """int32 [n, 3] unique voxel cells, about `count` of them."""
+def initial_cells(
+    dataset: Dataset, count: int, voxel_size: float, generator: torch.Generator, moving: Tensor | None = None
+) -> Tensor:
+    """int32 [n, 3] unique voxel cells, about `count` of them and those of the points `moving` [m, 3]."""
     points = torch.from_numpy(np.array(() if dataset.points is None else dataset.points, np.float32).reshape(-1, 3))
     box = torch.from_numpy(np.array(dataset.box, np.float32))
     points = points[near_box(points, box)]
@@ -127,6 +136,7 @@ def initial_cells(dataset: Dataset, count: int, voxel_size: float, generator: to
         jitter = torch.randn(len(pick), 3, generator=generator) * spacing[pick, None]
         points = torch.cat([points, points[pick] + jitter])
         points = points[near_box(points, box)]
+    points = points if moving is None else torch.cat([points, moving])
     cells: Tensor = torch.unique(torch.round(points / voxel_size).to(torch.int32), dim=0)
     return cells
 

@@ -20,6 +20,7 @@ from pd4dgs_codec.train import workers
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.losses import ModelLoss
 from pd4dgs_codec.train.phases import Phase
+from pd4dgs_codec.train.phases.follow import Follow
 from pd4dgs_codec.train.phases.grow import Grow
 from pd4dgs_codec.train.phases.levels import SelectLevels
 from pd4dgs_codec.train.phases.matching import Match
@@ -48,12 +49,13 @@ class Learner(TrainState):
         schedule: Schedule,
         device: torch.device,
         size: ModelConfig | None = None,
+        start: Model | None = None,
     ):
-        """Starts with a fresh model for `dataset`, of the preset's size by default."""
+        """As `TrainState`."""
         keep_freed_memory()
         if device.type == "cuda":  # TF32 is too coarse for SSIM's variances, differences of blurred images
             torch.backends.cudnn.allow_tf32 = False
-        super().__init__(config, dataset, schedule, device, size)
+        super().__init__(config, dataset, schedule, device, size, start)
         self.unit = float(deformation_unit(self.model.info.box))  #: of lengths in the loss, scene units
         self.model_loss = ModelLoss(config, self.generator)
         self.levels, self.prefixes, self.grow = SelectLevels(self.practise), Prefixes(), Grow()
@@ -61,6 +63,7 @@ class Learner(TrainState):
         self.before_practice: Callable[[int, int], None] = lambda done, steps: None
         pruning = (Prune(turn) for turn in range(PRUNING_ROUNDS))
         self.before_step: list[Phase] = [
+            Follow(),
             OpenTime(self.practise),
             self.match,
             self.levels,

@@ -70,12 +70,19 @@ class Trainer:
     against time, a row for each evaluation. interrupted: whether a signal ended the last `run`.
     """
 
-    def __init__(self, config: TrainConfig, dataset: Dataset, device: str = "cpu", size: ModelConfig | None = None):
-        """size: the model's size; by default the preset's."""
+    def __init__(
+        self,
+        config: TrainConfig,
+        dataset: Dataset,
+        device: str = "cpu",
+        size: ModelConfig | None = None,
+        start: Model | None = None,
+    ):
+        """size: the model's size; by default the preset's. start: the model that is trained; by default a fresh one."""
         self.timed = config.total is None
         self.config, self.dataset = config, dataset
         self.fingerprint = dataset.fingerprint()
-        self.learner = Learner(config, dataset, Schedule(config.total), torch.device(device), size)
+        self.learner = Learner(config, dataset, Schedule(config.total), torch.device(device), size, start)
         self.learner.share = 0.0 if self.timed else None
         self._costs: list[float] = []  #: seconds of each step from which a timed run estimates N
         self._step = self._evaluation = 0.0  #: seconds of the last step and of the last evaluation

@@ -1,4 +1,4 @@
-"""The terms of the loss that need no picture, with their gradients: planes, rate, temporal mask consistency.
+"""The terms of the loss that need no picture, with their gradients: planes, rate, masks.
 
 The CPU computes them on a second thread while the step renders, which makes steps of levels 1 and 2 a tenth faster. On
 a GPU they would be most of a step's operations, each too small to be worth its start. Their graph has leaves of its
@@ -18,7 +18,6 @@ from pd4dgs_codec.model.hexplane import HexPlane
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.networks import level_mask
 from pd4dgs_codec.model.rate import row_bits
-from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import ATTRIBUTES, MASK_THRESHOLD
 from pd4dgs_codec.threads import aside
 from pd4dgs_codec.train.config import TrainConfig
@@ -43,7 +42,6 @@ class ModelLoss:
 
     def __init__(self, config: TrainConfig, generator: torch.Generator):
         self.config, self.generator = config, generator
-        self._neighbours: Neighbours | None = None
 
     def begin(self, model: Model, level: int, schedule: Schedule, position: int) -> Callable[[], Terms]:
         """Starts to compute the terms of a step at `position` and returns a function that waits for them. Until that
@@ -83,18 +81,13 @@ class ModelLoss:
     def _mask_terms(
         self, model: Model, level: int, anchors: Mapping[str, Tensor], separation: float
     ) -> Iterator[Weighted]:
-        """Yields the anchors' rate and the two terms of temporal mask consistency."""
+        """Yields the anchors' rate and the term that separates masks."""
         config, mask = self.config, level_mask(anchors["mask_logits"], level)
         if config.rate_scale:
             weight = config.lambdas[level] * config.rate_scale
             yield "rate", weight, rate_term(model, anchors, mask, config.rate_share, self.generator)
-        if config.tmc_binary:
-            yield "tmc_binary", config.tmc * config.tmc_binary_growth**separation, binary_term(mask)
-        if config.tmc_smooth:
-            if self._neighbours is None or self._neighbours.anchor_q is not model.anchor_q:
-                self._neighbours = Neighbours(model.anchor_q, config.tmc_tau)
-            away = self._neighbours.draw(self.generator)
-            yield "tmc_smooth", config.tmc, smooth_term(mask, self._neighbours, away)
+        if config.binary:
+            yield "binary", config.binary * config.binary_growth**separation, binary_term(mask)
 
 
 def anchor_bits(model: Model, anchors: Mapping[str, Tensor], rows: Tensor, active: Tensor) -> Tensor:
@@ -125,37 +118,3 @@ def binary_term(mask: Tensor) -> Tensor:
     """L_binary = -1/|V| sum (m log2 m + (1 - m) log2(1 - m)); m clamped to INSIDE in the logarithms."""
     m = mask.clamp(*INSIDE)
     return -torch.lerp((1 - m).log2(), m.log2(), m).mean()
-
-
-class Neighbours:
-    """Pairs of anchors that are at most REACH apart on a space-filling (Morton) curve. A pair i, j has the weight
-    exp(-|x_i - x_j| / tau), distances in voxels.
-
-    order: int64 [N], the anchors along the curve. weights: [N, REACH], of each anchor and the one 1..REACH further on.
-    """
-
-    REACH = 8
-
-    def __init__(self, anchor_q: Tensor, tau: float):
-        self.anchor_q = anchor_q
-        self.order = torch.from_numpy(morton_order(anchor_q.cpu().numpy()))
-        positions = anchor_q.cpu()[self.order].double()
-        self.weights = torch.zeros(len(positions), self.REACH)
-        for away in range(1, min(self.REACH + 1, len(positions))):
-            distance = (positions[away:] - positions[:-away]).norm(dim=1)
-            self.weights[:-away, away - 1] = torch.exp(distance / -tau)
-
-    def draw(self, generator: torch.Generator) -> Tensor:
-        """Draws int64 [N]: for each anchor along the curve, how far along its partner is, 1..REACH."""
-        return torch.randint(1, self.REACH + 1, (len(self.order),), generator=generator)
-
-
-def smooth_term(mask: Tensor, neighbours: Neighbours, away: Tensor) -> Tensor:
-    """L_smooth = 1/|S| sum w_ij |m_i - m_j| over the pairs S that end within the curve; 0 without such pairs.
-    away: from `Neighbours.draw`."""
-    order, weights = neighbours.order, neighbours.weights
-    first = (torch.arange(len(order)) + away < len(order)).nonzero()[:, 0]
-    if not len(first):
-        return mask.sum() * 0.0
-    jump = mask.index_select(0, order[first]) - mask.index_select(0, order[first + away[first]])
-    return (weights[first, away[first] - 1].to(mask) * jump.abs()).mean()

@@ -20,6 +20,8 @@ from pd4dgs_codec.train.config import LearningRates
 PER_ANCHOR = ("feature", "scaling_log", "offset", "mask_logits")
 #: Names of a parameter's moments: its steps so far, and the running means of gradients and of their squares.
 STEP, MEAN, SQUARE = "step", "exp_avg", "exp_avg_sq"
+#: Decay of both running means, and the number added to the root of the second.
+BETA1, BETA2, EPS = 0.9, 0.99, 1e-15
 
 
 class Optimiser:
@@ -32,7 +34,8 @@ class Optimiser:
     def __init__(self, model: Model, rates: LearningRates, cooldown: float, exposures: Iterable[nn.Parameter] = ()):
         self.model, self.rates, self.cooldown = model, rates, cooldown
         groups: dict[str, list[nn.Parameter]] = {name: [getattr(model, name)] for name in PER_ANCHOR}
-        groups |= {name: list(net.parameters()) for name, net in model.networks.items()}
+        if not model.frozen:
+            groups |= {name: list(net.parameters()) for name, net in model.networks.items()}
         fields = model.deformations.values()
         groups["planes"] = [f.planes.grid for f in fields]
         groups["deformation"] = [p for f in fields for p in f.weights]
@@ -61,12 +64,16 @@ class Optimiser:
             if moved:
                 torch._foreach_add_(steps, 1)
                 torch._fused_adam_(
-                    moved, gradients, means, squares, [], steps, amsgrad=False, maximize=False, beta1=0.9, beta2=0.99,
-                    lr=rate, weight_decay=0.0, eps=1e-15,
+                    moved, gradients, means, squares, [], steps, amsgrad=False, maximize=False, beta1=BETA1,
+                    beta2=BETA2, lr=rate, weight_decay=0.0, eps=EPS,
                 )  # fmt: skip
 
     def clip_gradients(self, most: float) -> float:
-        """Scales the gradients to a norm of at most `most`. Returns their norm before, NaN or inf if one is."""
+        """Scales the gradients to a norm of at most `most`. Returns their norm before, NaN or inf if one is. Those of
+        frozen anchors become 0, so that neither they nor their moments change."""
+        for p in (self.groups[name][0] for name in PER_ANCHOR if self.model.frozen):
+            if p.grad is not None:
+                p.grad[: self.model.frozen] = 0
         gradients = [p.grad for p in self.parameters if p.grad is not None]
         norm = float(torch.stack(torch._foreach_norm(gradients)).norm()) if gradients else 0.0
         if most < norm < math.inf:

@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import math
 
-#: Share of a run in which level 0 alone is trained.
+#: The views near the key instant: a share of all, and of the longest time from the key instant, which is the window of
+#: `phases.opening` at first. Its trial has twice this window.
+NEAR_SHARE = 1 / 12
+#: Share of a run in which level 0 alone is trained, at first and before it is compared with higher levels.
 COARSE_SHARE = 1 / 10
 #: Share of a run with a key instant after which views of all times train motion, see `phases.opening`.
 OPENING_SHARE = 1 / 2
-#: Share of a run that points guide until which pictures of motion train motion alone, see `phases.matching`.
-GUIDED_SHARE = 0.35
+#: Parts of a run: anchors grow after each, and are pruned after every other one.
+PARTS = 100
+#: Share of a run after which the rate terms set in, and after twice of which planes and weights are rounded.
+THIRD = 1 / 3
 #: Rounds in which anchors of little use are pruned; each anchor is a candidate in one round.
 PRUNING_ROUNDS = 4
 
@@ -21,7 +26,8 @@ class Schedule:
     phase begins at infinity, and nothing is grown or pruned.
     coarse_end: before it only level 0 is trained; from it on, quantisation noise is added.
     moving: transparent anchors are pruned from here on; earlier, moving objects may be missing still.
-    progressive: the rate term, TMC and the average rho start here (T_progressive; T_warm is within the coarse phase).
+    progressive: the terms of rate and masks and the average rho start here (T_progressive; T_warm is within the coarse
+    phase).
     rho_every: iterations between updates of rho (K).
     rounding: planes and weights are rounded straight-through from here on.
     exact_rounding: the anchors' attributes are rounded straight-through from here on, instead of noise.
@@ -34,15 +40,14 @@ class Schedule:
             return math.inf if iterations is None else round(iterations * fraction)
 
         self.iterations = iterations
-        self.coarse_end, self.progressive, self.rho_every = at(COARSE_SHARE), at(1 / 3), max(1, at(1 / 150))
+        self.coarse_end, self.progressive, self.rho_every = at(COARSE_SHARE), at(THIRD), max(1, at(1 / PARTS))
         self.moving = at(2 * COARSE_SHARE)
-        self.rounding, self.exact_rounding = at(2 / 3), at(9 / 10)
+        self.rounding, self.exact_rounding = at(2 * THIRD), at(9 / 10)
         self.grow = self.prune = range(0)
         if iterations is not None:
-            every = max(20, round(iterations * (1 / 100)))
-            self.grow = range(round(iterations * (1 / 60)) + every, round(iterations * (1 / 2)) + 1, every)
-            every = max(1, round(iterations * (1 / 50)))
-            self.prune = range(self.grow.stop, self.grow.stop + PRUNING_ROUNDS * every, every)
+            every, twice = max(20, round(iterations / PARTS)), max(1, round(2 * iterations / PARTS))
+            self.grow = range(twice + every, round(iterations / 2) + 1, every)
+            self.prune = range(self.grow.stop, self.grow.stop + PRUNING_ROUNDS * twice, twice)
 
     def progress(self, iteration: int) -> float:
         """The share of the run, 0..1, that lies before `iteration`; 0 while N is not known."""

@@ -21,7 +21,7 @@ from pd4dgs_codec.scene import MASK_THRESHOLD, instant
 from pd4dgs_codec.train.config import MOST_STEPS, TrainConfig
 from pd4dgs_codec.train.initialise import check_visible, fresh_model
 from pd4dgs_codec.train.optimiser import PER_ANCHOR, Optimiser
-from pd4dgs_codec.train.schedule import GUIDED_SHARE, Schedule
+from pd4dgs_codec.train.schedule import Schedule
 from pd4dgs_codec.train.ssim import Part, pixel_weights, within_reach
 
 #: Bytes of images on the device, weights included, beyond which the least recently used are dropped.
@@ -166,13 +166,14 @@ class TrainState:
         schedule: Schedule,
         device: torch.device,
         size: ModelConfig | None = None,
+        start: Model | None = None,
     ):
-        """Starts with a fresh model for `dataset`, of the preset's size by default."""
+        """Starts with the model `start`, by default with a fresh one for `dataset`, of the preset's size by default."""
         self.config, self.dataset, self.schedule, self.device = config, dataset, schedule, device
         self.size = size or PRESETS[config.preset]
         steps = config.model_steps(self.size.steps)
         key = config.key_instant if config.rollout == "key" else None
-        model = fresh_model(self.size, dataset, config.widths, steps, config.seed, config.max_layer, key)
+        model = start or fresh_model(self.size, dataset, config.widths, steps, config.seed, config.max_layer, key)
         check_visible(model, dataset)
         self.model = model.to(device)
         self.views = TrainingViews(dataset.train, model.info.background, device)
@@ -210,7 +211,7 @@ class TrainState:
     @property
     def guiding(self) -> bool:
         """Whether pictures of motion train nothing but motion at this step."""
-        return self.guided and self.schedule.progress(self.position) < GUIDED_SHARE
+        return self.guided and self.position < self.schedule.progressive
 
     def rounding(self, *, noisy: bool = True) -> Rounding:
         """How the steps at this position simulate quantisation; without noise if not `noisy`."""
@@ -320,6 +321,11 @@ class TrainState:
             if (stored := state["exposures"][camera]).shape != exposure.shape:
                 raise ValueError(f"exposure has shape {tuple(stored.shape)}, expected {tuple(exposure.shape)}")
             exposure.data.copy_(stored)
+        frozen = self.model.frozen
+        for name in ("anchor_q", *PER_ANCHOR):
+            if not torch.equal(getattr(model, name)[:frozen].to(self.device), getattr(self.model, name)[:frozen]):
+                raise ValueError(f"{name} of the first {frozen} anchors is not that of the base")
+        model.freeze(frozen)
         self.model = model.to(self.device)
         self.optimiser = Optimiser(self.model, self.config.rates, self.config.cooldown, self.views.exposures.values())
         self.optimiser.load_state(state["optimiser"])

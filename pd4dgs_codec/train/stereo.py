@@ -10,29 +10,31 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, unfold
 
-from pd4dgs_codec.data.view import Dataset, View, points_box, shrunk_view, spans_volume, thinned
+from pd4dgs_codec.data.view import Dataset, View, depth_bounds, points_box, shrunk_view, spans_volume, thinned
 from pd4dgs_codec.train import workers
 
-#: Views that are searched. They are those of one instant if it has at least CAMERAS, else evenly spread over all.
-VIEWS, CAMERAS = 32, 8
+#: Views that are searched, and patches of PATCH x PATCH pixels in each.
+VIEWS, PIXELS, PATCH = 32, 1000, 5
 #: Pictures are searched at a size of at least this many pixels on the shorter side, if they have more.
 SIZE = 180
-#: A patch has PATCH x PATCH pixels. Of each view, at most PIXELS patches are searched whose deviation is CONTRAST.
-PATCH, PIXELS, CONTRAST = 5, 1000, 0.02
-#: Nearest and farthest depth, in distances of the cameras from the middle of the box; steps of 1/depth between them.
-DEPTHS, NEAREST, FARTHEST = 100, 0.2, 4.0
-#: Neighbours of a view: so many of the nearest cameras, and their distances from it in the same unit. Two of them have
-#: to agree, since others may not see the point.
-NEIGHBOURS, LEAST_BASE, MOST_BASE, AGREE = 4, 0.05, 1.5, 2
-#: A depth is taken if its correlation is ALIKE, and CLEAR above that of depths more than BESIDE steps away.
-ALIKE, CLEAR, BESIDE = 0.8, 0.05, 4
-#: Points are used if at least so many of the searched pixels have one.
+#: Steps of 1/depth from NEAREST, a share of the cameras' distance from the middle of the box, to 1/NEAREST of it.
+DEPTHS, NEAREST = 100, 0.2
+#: Neighbours of a view: so many of the nearest cameras that are LEAST_BASE of that distance away, an angle of 3 degrees
+#: as in COLMAP. Two of them have to agree, since others may not see the point.
+NEIGHBOURS, AGREE, LEAST_BASE = 4, 2, 0.05
+#: A depth is taken if its correlation is ALIKE, and CLEAR above that of depths a patch or more away.
+ALIKE, CLEAR = 0.8, 0.05
+#: Depths on a ray within the box. A pixel's colour tells its depth if a share of at most AMBIGUOUS of them agrees.
+DEPTH_STEPS, AMBIGUOUS = 64, 0.3
+#: Points are used if at least so many of the searched pixels have one, here and in `phases.matching`: otherwise the
+#: cameras are too near to each other, or move too little between views, for depths to be trusted.
 LEAST_FOUND = 1 / 6
 
 
@@ -43,22 +45,42 @@ def with_points(dataset: Dataset, key: float | None) -> Dataset:
     points, depths = workers.alike(lambda: stereo_points(views, dataset.box.mean(0)))
     if not spans_volume(points):
         return dataset
-    near, far = np.percentile(depths, [0.5, 99.5])
-    box = points_box(points).astype(np.float32)
-    return replace(dataset, points=points, box=box, near=float(near / 2), far=float(far * 1.5))
+    near, far = depth_bounds(depths)
+    return replace(dataset, points=points, box=points_box(points).astype(np.float32), near=near, far=far)
 
 
 def _chosen(views: Sequence[View], key: float) -> Sequence[View]:
-    """The views to search."""
+    """The views to search: those of the instant nearest `key` if most views of it have neighbours, else evenly spread
+    ones."""
     nearest = min(views, key=lambda view: abs(view.time - key)).time
     together = [view for view in views if view.time == nearest]
-    return thinned(together if len(together) >= CAMERAS else views, VIEWS)
+    return thinned(together if len(together) >= 2 * NEIGHBOURS else views, VIEWS)
 
 
 def pixel_rays(rotation: Tensor, K: Tensor, rows: Tensor, columns: Tensor) -> Tensor:
     """[..., 3]: the rays of pixels, in world axes, of depth 1. rotation: [3, 3], world to camera. K: [3, 3]."""
     x, y = (columns + 0.5 - K[0, 2]) / K[0, 0], (rows + 0.5 - K[1, 2]) / K[1, 1]
     return torch.stack([x, y, torch.ones_like(x)], -1) @ rotation
+
+
+class Rays(NamedTuple):
+    """Rays of n pixels, cut by a box. eye: [3]. places: [n, DEPTH_STEPS, 3], world, at depths that are evenly
+    spread. inside: bool [n], whether the ray meets the box."""
+
+    eye: Tensor
+    places: Tensor
+    inside: Tensor
+
+
+def rays_of(view: View, pixels: Tensor, low: Tensor, high: Tensor, near: float) -> Rays:
+    """The rays of `pixels` (int64 [n, 2], row and column), beyond the depth `near` and in the box `low` to `high`."""
+    viewmat, K = (torch.from_numpy(np.array(matrix, np.float32)) for matrix in (view.viewmat, view.K))
+    eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    rays = pixel_rays(viewmat[:3, :3], K, *pixels.unbind(1))
+    bounds = torch.stack([(low - eye) / rays, (high - eye) / rays])
+    first, last = bounds.amin(0).amax(1).clamp(min=near), bounds.amax(0).amin(1)
+    depths = first[:, None] + (last - first)[:, None] * ((torch.arange(DEPTH_STEPS) + 0.5) / DEPTH_STEPS)
+    return Rays(eye, eye + depths[..., None] * rays[:, None], first < last)
 
 
 class Eye:
@@ -76,11 +98,12 @@ class Eye:
 
     def patches(self) -> tuple[Tensor, Tensor]:
         """(float32 [m, PATCH²], the surroundings of each pixel that is not too near to the border, by line; int64 [n],
-        the indices of those with contrast)."""
+        the indices of those whose contrast is at least the mean)."""
         if min(self.picture.shape) < PATCH:
             return torch.zeros(0, PATCH**2), torch.zeros(0, dtype=torch.int64)
         found = unfold(self.picture[None, None], PATCH)[0].T
-        return found, (found.std(1) >= CONTRAST).nonzero()[:, 0]
+        contrast = found.std(1)
+        return found, (contrast >= contrast.nanmean()).nonzero()[:, 0]
 
     def sample(self, places: Tensor) -> Tensor:
         """[n, p]: the picture at places [n, p, 3]; NaN where one of the p is outside."""
@@ -103,11 +126,11 @@ def stereo_points(views: Sequence[View], middle: np.ndarray) -> tuple[np.ndarray
     at = torch.stack([eye.position for eye in eyes])
     unit = float((at - torch.from_numpy(middle)).norm(dim=1).median())
     apart, ahead = torch.cdist(at, at) / unit, torch.stack([eye.rotation[2] for eye in eyes])
-    depths: Tensor = unit / torch.linspace(1 / NEAREST, 1 / FARTHEST, DEPTHS)
+    depths: Tensor = unit / torch.linspace(1 / NEAREST, NEAREST, DEPTHS)
     found, searched = [(torch.zeros(0, 3), torch.zeros(0))], 0
     for i, eye in enumerate(eyes):
-        near = (apart[i] >= LEAST_BASE) & (apart[i] <= MOST_BASE) & (ahead @ ahead[i] > 0)
-        neighbours = [eyes[j] for j in apart[i].argsort().tolist() if near[j]][:NEIGHBOURS]
+        beside = (apart[i] >= LEAST_BASE) & (ahead @ ahead[i] > 0)
+        neighbours = [eyes[j] for j in apart[i].argsort().tolist() if beside[j]][:NEIGHBOURS]
         patches, pixels = eye.patches()
         pixels = pixels[torch.randperm(len(pixels), generator=generator)[:PIXELS]]
         searched += len(pixels)
@@ -134,7 +157,7 @@ def _search(
         scores = torch.stack([(own * _normalised(other.sample(places))).sum(1) for other in neighbours])
         alike[:, i] = scores.nan_to_num(-1.0).topk(AGREE, dim=0).values.mean(0)
     best, k = alike.max(1)
-    beside = (torch.arange(len(depths)) - k[:, None]).abs() <= BESIDE
+    beside = (torch.arange(len(depths)) - k[:, None]).abs() < PATCH
     clear = (best >= ALIKE) & (best - alike.masked_fill(beside, -1).amax(1) >= CLEAR) & (k > 0) & (k < len(depths) - 1)
     found = depths[k[clear]]
     return eye.position + found[:, None] * rays[clear, PATCH**2 // 2], found
@@ -144,5 +167,5 @@ def _normalised(patches: Tensor) -> Tensor:
     """Patches [n, p] of mean 0 and norm 1; NaN without contrast."""
     patches = patches - patches.mean(1, keepdim=True)
     norm = patches.norm(dim=1, keepdim=True)
-    found: Tensor = patches / norm.where(norm >= CONTRAST * PATCH, torch.nan)
+    found: Tensor = patches / norm.where(norm > 0, torch.nan)
     return found

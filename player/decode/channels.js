@@ -19,40 +19,37 @@ const FIRST_REUSE = 8;
 
 /** The channels of a slice, one after the other. */
 export class ChannelReader {
-  /** @param {Uint8Array} codes @param {Uint8Array} stream @param {number} entries that windows may have at most */
-  constructor(codes, stream, entries) {
+  /** @param {Uint8Array} codes @param {Uint8Array} stream @param {Prior[]} priors of the layer so far, in order; new ones
+   * are added @param {number} entries that their windows may have at most */
+  constructor(codes, stream, priors, entries) {
     /** What is read besides channels stands in the codes between theirs. */
     this.codes = new ByteReader(codes);
     this._stream = new AnsDecoder(stream);
+    this._priors = priors;
     this._most = entries;
-    this._entries = 0;
+    this._entries = priors.reduce((sum, { n }) => sum + n, 0);
   }
 
-  /**
-   * The symbols of the next channels of these lengths, one behind the other, each in its range.
-   *
-   * @param {number[]} lengths @param {Prior[]} priors defined so far, in order; new ones are added
-   * @param {number} least @param {number} most @param {string} what names a symbol in messages
-   */
-  read(lengths, priors, least, most, what) {
-    const out = new Int32Array(lengths.reduce((sum, length) => sum + length, 0));
-    let at = 0;
-    for (const length of lengths) this._take(out, at, (at += length), priors);
+  /** The symbols of the next channel, each in its range. @param {number} length @param {number} least
+   * @param {number} most @param {string} what names a symbol in messages */
+  read(length, least, most, what) {
+    const out = new Int32Array(length);
+    this._take(out, 0, length);
     checkRange(out, least, most, what);
     return out;
   }
 
-  /** Reads the next channel into `out`, split if there are groups. @param {Int32Array} out @param {Prior[]} priors
+  /** Reads the next channel into `out`, split if there are groups. @param {Int32Array} out
    * @param {Groups | null} [groups] */
-  fill(out, priors, groups) {
+  fill(out, groups) {
     if (!groups) {
-      this._take(out, 0, out.length, priors);
+      this._take(out, 0, out.length);
       return;
     }
     const { order, sizes } = groups;
     const sorted = new Int32Array(out.length);
     let at = 0;
-    for (const size of sizes) this._take(sorted, at, (at += size), priors);
+    for (const size of sizes) this._take(sorted, at, (at += size));
     for (let i = 0; i < order.length; i++) out[order[i]] = sorted[i];
   }
 
@@ -63,12 +60,12 @@ export class ChannelReader {
   }
 
   /** A channel: its code, then its symbols between the exceptions. @param {Int32Array} out @param {number} at
-   * @param {number} end @param {Prior[]} priors */
-  _take(out, at, end, priors) {
+   * @param {number} end */
+  _take(out, at, end) {
     if (at === end) return;
     const { codes } = this;
     const token = codes.varint(2 * (MAX_COUNT + FIRST_REUSE), "a channel's prior");
-    const prior = this._prior(token >> 1, priors);
+    const prior = this._prior(token >> 1);
     const exceptions = token & 1 ? 1 + codes.varint(MAX_VARINT, "the number of exceptions") : 0;
     if (exceptions > end - at) throw malformed(`${exceptions} exceptions, expected at most ${end - at}`);
     const { kmin, n } = prior;
@@ -87,8 +84,9 @@ export class ChannelReader {
     this._stream.symbols(prior, out, from, end);
   }
 
-  /** 8.1. @param {number} family @param {Prior[]} priors */
-  _prior(family, priors) {
+  /** 8.1. @param {number} family */
+  _prior(family) {
+    const priors = this._priors;
     if (family >= FIRST_REUSE) {
       const prior = priors[priors.length - 1 - (family - FIRST_REUSE)];
       if (!prior) throw malformed("a channel reuses a prior before the first");
@@ -98,7 +96,7 @@ export class ChannelReader {
     priors.push(prior);
     this._entries += prior.n;
     if (this._entries > this._most) {
-      throw limitExceeded(`tables of ${this._entries} entries for one slice, limit ${this._most}`);
+      throw limitExceeded(`tables of ${this._entries} entries in one layer, limit ${this._most}`);
     }
     return prior;
   }

@@ -5,7 +5,7 @@ import { crc32, hex, sha256 } from "./digests.js";
 import { MAX_HEADER, MAX_PAYLOAD } from "./limits.js";
 
 const SIGNATURE = [0x89, 0x50, 0x44, 0x34, 0x0d, 0x0a, 0x1a, 0x0a];
-const MAJOR = 4;
+const MAJOR = 5;
 export const PREAMBLE_SIZE = 20;
 /** Bytes of preamble and the longest header. */
 export const LONGEST_HEADER = PREAMBLE_SIZE + MAX_HEADER;

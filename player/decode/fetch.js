@@ -145,6 +145,8 @@ export class SceneSource {
         } catch (thrown) {
           const reason = this._controller?.signal.reason;
           const error = reason instanceof Cut ? reason : thrown; // not all engines throw the reason
+          // without an answer, browsers do not tell the two apart
+          const lost = this._body ? "the connection broke" : "no connection, or no CORS permission of the server";
           this.close();
           this._signal?.throwIfAborted();
           if (now() >= until) return;
@@ -152,8 +154,7 @@ export class SceneSource {
           if (!(error instanceof Cut || error instanceof TypeError || error instanceof DOMException)) throw error;
           this.cuts++;
           if (++failures >= this._attempts) {
-            // browsers do not tell the two apart
-            const why = error instanceof Cut ? error.message : "no connection, or no CORS permission of the server";
+            const why = error instanceof Cut ? error.message : lost;
             throw new FetchError(`${this.url}: ${why} (${this.received} bytes received)`);
           }
           if (failures > 1) await sleep(1000 * Math.min(this._pause * 2 ** (failures - 2), until - now()));

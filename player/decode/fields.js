@@ -57,11 +57,20 @@ export function asItems(value, least, limit, where) {
 /** @param {Value[]} list @param {number} least @param {number} limit @param {string} where */
 export const asIntegers = (list, least, limit, where) => list.map((item) => asInteger(item, least, limit, where));
 
-/** The next id of a list in which they ascend. @param {Value} value @param {number} last @param {string} where */
-export function asId(value, last, where) {
-  const id = asInteger(value, 0, MAX_ID, `${where}: id`);
-  if (id <= last) throw malformed(`${where}: id ${id} after ${last}, expected ascending ones`);
-  return id;
+/**
+ * What `read` makes of each tensor of a table, a list that begins with an id; ids ascend.
+ *
+ * @template T
+ * @param {Value[]} table @param {string} where @param {(id: number, rest: Value[], where: string) => T} read
+ */
+export function asTensors(table, where, read) {
+  let last = -1;
+  return table.map((tensor) => {
+    const [id, ...rest] = asItems(tensor, 1, Infinity, where);
+    if (asInteger(id, 0, MAX_ID, `${where}: id`) <= last) throw malformed(`${where}: id ${id} after ${last}`);
+    last = /** @type {number} */ (id);
+    return read(last, rest, where);
+  });
 }
 
 /** @param {Value | undefined} value @param {string} where @returns {number} an exact binary32 value */

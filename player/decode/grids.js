@@ -5,7 +5,6 @@ import { malformed } from "./errors.js";
 import { MAX_SYMBOL } from "./limits.js";
 /** @import { ChannelReader } from "./channels.js" */
 /** @import { PlaneShape } from "./parameters.js" */
-/** @import { Prior } from "./tables.js" */
 
 /** How many predictors 11.3 has. */
 export const PREDICTORS = 2;
@@ -17,10 +16,10 @@ const LOOKED_UP = 256;
 /**
  * The samples of each plane of all grids.
  *
- * @param {ChannelReader} reader @param {PlaneShape[]} shapes @param {Prior[]} priors see ChannelReader
+ * @param {ChannelReader} reader @param {PlaneShape[]} shapes
  * @returns {Int32Array[]} [channels, height, width] each
  */
-export function decodePlanes(reader, shapes, priors) {
+export function decodePlanes(reader, shapes) {
   const planes = shapes.map(({ channels, height, width }) => new Int32Array(channels * height * width));
   const all = planes.map((plane, i) => channelsOf(plane, shapes[i].channels));
   /** @type {Float64Array[]} */
@@ -31,7 +30,7 @@ export function decodePlanes(reader, shapes, priors) {
       const stage = all[i].slice(first, end);
       if (!stage.length) return;
       const groups = first ? groupByActivity(sumOfNine(magnitudes[i], height, width)) : null;
-      for (const channel of stage) reader.fill(channel, priors, groups);
+      for (const channel of stage) reader.fill(channel, groups);
       if (end >= channels) return;
       if (!first) magnitudes[i] = new Float64Array(height * width);
       for (const residuals of stage) addRelativeMagnitudes(residuals, magnitudes[i]);

@@ -3,7 +3,7 @@
 import { SCENE_ID_SIZE, sceneIdOf } from "./container.js";
 import { hex } from "./digests.js";
 import { limitExceeded, malformed, unsupported } from "./errors.js";
-import { Fields, asId, asInteger, asIntegers, asItems, asList, asRegistered, asStep, checkBytes } from "./fields.js";
+import { Fields, asInteger, asIntegers, asItems, asList, asRegistered, asStep, asTensors, checkBytes } from "./fields.js";
 import { MAX_CHANNELS, MAX_CHUNKS, MAX_KIND, MAX_PAYLOAD, MAX_ROWS } from "./limits.js";
 import { MAX_ROW_CHANNELS, MAX_ROW_TENSORS, MAX_SYMBOL } from "./limits.js";
 import { unpack } from "./msgpack.js";
@@ -91,13 +91,11 @@ function readChunkList(value) {
 
 /** Tensors of rows of the header or of a layer. @param {Value} value @param {string} place @returns {RowTensor[]} */
 export function readRows(value, place) {
-  const where = `${place}: a tensor of rows`;
-  let last = -1;
-  const rows = asItems(value, 1, MAX_ROW_TENSORS, `${place}: rows`).map((row) => {
-    const [id, channels, step, predictor] = asList(row, where, 4);
-    last = asId(id, last, where);
+  const table = asItems(value, 1, MAX_ROW_TENSORS, `${place}: rows`);
+  const rows = asTensors(table, `${place}: a tensor of rows`, (id, rest, where) => {
+    const [channels, step, predictor] = asList(rest, where, 3);
     return {
-      id: last,
+      id,
       channels: asInteger(channels, 1, MAX_CHANNELS, `${where}: channels`),
       step: asStep(step, `${where}: step`),
       predictor: asRegistered(predictor, ROW_PREDICTORS, `${where}: predictor`),

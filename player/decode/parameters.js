@@ -1,7 +1,7 @@
 // Clause 6: the parameters of a slice, and the shapes of the tensors that it codes.
 
 import { limitExceeded, malformed } from "./errors.js";
-import { Fields, asId, asInteger, asIntegers, asItems, asList, asRegistered, asStep } from "./fields.js";
+import { Fields, asInteger, asIntegers, asItems, asList, asRegistered, asStep, asTensors } from "./fields.js";
 import { readKind, readRows } from "./header.js";
 import { MAX_AXES, MAX_CHAINS, MAX_CHANNELS, MAX_FIELDS, MAX_GRIDS } from "./limits.js";
 import { MAX_LINEAR_LAYERS, MAX_PAYLOAD, MAX_PLANE_CELLS, MAX_ROWS, MAX_SIDE, MAX_WIDTH } from "./limits.js";
@@ -35,7 +35,6 @@ const FIRST_KEYS = [4, 5, 6, 7];
  * @property {RowTensor[]} layerRows those of the layer, with a row for each rise and each own row
  * @property {Uint8Array} codes
  * @property {Uint8Array} stream
- * @property {number} symbols so many as 6.5 counts for this slice
  * @property {Declared} declared by the slices so far, this one included
  */
 
@@ -89,7 +88,6 @@ export function readParameters(payload, { width, centres, base }, before, known,
     layerRows,
     codes: payload.subarray(4 + length, 4 + length + size),
     stream: payload.subarray(4 + length + size),
-    symbols,
     declared,
   };
 }
@@ -112,13 +110,7 @@ function checkDeclared(where, what, count, free, each, bytes) {
 function readStepped(fields, key, limit, where, read) {
   if (!fields.has(key)) return { step: 0, list: [] };
   const [step, ...shapes] = asItems(fields.get(key), 2, 1 + limit, `${where} of key ${key}`);
-  let last = -1;
-  const list = shapes.map((shape) => {
-    const [id, ...rest] = asItems(shape, 1, Infinity, where);
-    last = asId(id, last, where);
-    return read(last, rest, where);
-  });
-  return { step: asStep(step, `${where}: step`), list };
+  return { step: asStep(step, `${where}: step`), list: asTensors(shapes, where, read) };
 }
 
 /** @param {number} id @param {Value[]} rest @param {string} where @returns {GridShape} */

@@ -12,7 +12,8 @@ import { VoxelTable, mortonOrder } from "./voxels.js";
 /** @import { Values } from "./columns.js" */
 /** @import { Header } from "./header.js" */
 /** @import { Declared } from "./parameters.js" */
-/** @import { Priors, Slice } from "./slice.js" */
+/** @import { Slice } from "./slice.js" */
+/** @import { Prior } from "./tables.js" */
 /** @import { LayerTensors, Tensors } from "./tensors.js" */
 
 /**
@@ -30,7 +31,7 @@ import { VoxelTable, mortonOrder } from "./voxels.js";
  * tensors of rows; `sorted`, whether its rows are.
  *
  * @typedef {Omit<LayerTensors, "codes" | "rows"> & {slices: number, first: number, sorted: boolean,
- *   codes: Column<Uint8Array>, rows: Column<Float32Array>[], priors: Priors}} Layer
+ *   codes: Column<Uint8Array>, rows: Column<Float32Array>[], priors: Prior[]}} Layer
  */
 
 /**
@@ -270,15 +271,14 @@ export class TensorReader {
     if (next !== null && more !== (next === layer)) {
       throw flagged(`layer ${layer} ${more ? "announces a further slice" : "ends"}, but layer ${next} follows`);
     }
-    const lists = had ? Object.values(had.priors) : [];
-    const lengths = lists.map(({ length }) => length);
+    const known = had?.priors.length ?? 0;
     try {
       const before = { declared: this._declared, classes: this._classes.values, layer: had };
       const slice = decodeSlice(payload, layer, header, before);
       this._accept(slice, had, header);
       return slice;
     } catch (error) {
-      lists.forEach((list, i) => (list.length = lengths[i]));
+      if (had) had.priors.length = known;
       throw error;
     }
   }

@@ -4,7 +4,6 @@ import { channelsOf, checkRange, groupByClass } from "./channels.js";
 import { malformed } from "./errors.js";
 import { MAX_SYMBOL } from "./limits.js";
 /** @import { ChannelReader } from "./channels.js" */
-/** @import { Prior } from "./tables.js" */
 /** @import { RowTensor } from "./tensors.js" */
 
 /** How many predictors of rows 11.2 has. */
@@ -21,17 +20,17 @@ export const widthOf = (tensors) => tensors.reduce((sum, { channels }) => sum + 
  *
  * @param {ChannelReader} reader @param {RowTensor[]} tensors @param {number} count of rows
  * @param {Int32Array | Uint8Array | null} classes [count] step classes, null if rows have none
- * @param {number[] | null} centres of the channels, null if they are 0 @param {Prior[]} priors see ChannelReader
+ * @param {number[] | null} centres of the channels, null if they are 0
  * @param {number} [base] rows of a base, the first ones, which are channels of their own
  */
-export function decodeRows(reader, tensors, count, classes, centres, priors, base = 0) {
+export function decodeRows(reader, tensors, count, classes, centres, base = 0) {
   const values = new Int32Array(widthOf(tensors) * count);
   const parts = base ? Uint8Array.from(values.subarray(0, count), (_, i) => (i < base ? 0 : STEP_CLASSES)) : classes;
   if (base) classes?.forEach((c, i) => (/** @type {Uint8Array} */ (parts)[i] += c));
   const groups = parts && groupByClass(parts, 2 * STEP_CLASSES);
   const predictors = tensors.flatMap(({ channels, predictor }) => new Array(channels).fill(predictor));
   channelsOf(values, predictors.length).forEach((channel, c) => {
-    reader.fill(channel, priors, groups);
+    reader.fill(channel, groups);
     restore(channel, classes, centres?.[c] ?? 0, predictors[c]);
   });
   return values;

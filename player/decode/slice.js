@@ -11,14 +11,11 @@ import { STEP_CLASSES, decodeRows, dequantise } from "./rows.js";
 /** @import { Prior } from "./tables.js" */
 /** @import { RowTensor } from "./tensors.js" */
 
-/** The priors that a layer's slices define, which later ones may refer to (8): of positions, and of what rows hold.
- * @typedef {{positions: Prior[], rows: Prior[]}} Priors */
-
 /**
  * What earlier slices leave to those behind them. classes: the step classes of all rows so far, empty if rows have none.
  * layer: what the slices of the same layer before left, null if there are none.
  *
- * @typedef {{declared: Declared, classes: Uint8Array, layer: {rowTensors: RowTensor[], priors: Priors} | null}} Before
+ * @typedef {{declared: Declared, classes: Uint8Array, layer: {rowTensors: RowTensor[], priors: Prior[]} | null}} Before
  *
  * The symbols of a slice with n rows of its own and E earlier ones, none in a later slice of its layer. Of rows they are
  * the values in steps (11.2), of planes the samples (11.3).
@@ -34,12 +31,11 @@ import { STEP_CLASSES, decodeRows, dequantise } from "./rows.js";
  * @property {Int32Array} layerRows [channels, E + n] of the layer's own tensors of rows, one behind the other
  * @property {Int32Array[]} planes [C, H, W] each, grid by grid
  * @property {Int32Array[]} weights weight, bias, weight, bias and so on, chain by chain
- * @property {Priors} priors of the layer so far
+ * @property {Prior[]} priors of the layer so far (8)
  */
 
-/** Entries of windows beyond one per symbol, of a first slice and of a later one. */
+/** Entries of a layer's windows beyond one per symbol of the file so far. */
 const FREE_ENTRIES = 2 ** 18;
-const MORE_ENTRIES = 2 ** 10;
 export const LEAST_OWN_CODE = 3;
 export const MOST_CODE = 255;
 
@@ -53,25 +49,23 @@ export const MOST_CODE = 255;
 export function decodeSlice(payload, layer, header, before) {
   const known = before.layer;
   const parameters = readParameters(payload, header, before.declared, known?.rowTensors ?? null, layer);
-  const { rows: n, rises: earlier, grids, chains, codes: bytes, stream, symbols } = parameters;
-  const reader = new ChannelReader(bytes, stream, symbols + (known ? MORE_ENTRIES : FREE_ENTRIES));
-  const priors = known?.priors ?? { positions: [], rows: [] };
-  const voxels = n ? decodePositions(reader, n, priors.positions) : new Int32Array(0);
-  const rises = reader.read([earlier], priors.rows, 0, layer ? MOST_CODE : 1, "a rise of a mask code");
-  const codes = reader.read([n], priors.rows, LEAST_OWN_CODE, MOST_CODE, "a mask code");
-  const stepClasses = header.centres && reader.read([n], priors.rows, 0, STEP_CLASSES - 1, "a step class");
-  const rows = decodeRows(reader, header.rows, n, stepClasses, header.centres, priors.rows);
+  const { rows: n, rises: earlier, grids, chains, codes: bytes, stream, declared } = parameters;
+  const priors = known?.priors ?? [];
+  const reader = new ChannelReader(bytes, stream, priors, declared.symbols + FREE_ENTRIES);
+  const voxels = n ? decodePositions(reader, n) : new Int32Array(0);
+  const rises = reader.read(earlier, 0, layer ? MOST_CODE : 1, "a rise of a mask code");
+  const codes = reader.read(n, LEAST_OWN_CODE, MOST_CODE, "a mask code");
+  const stepClasses = header.centres && reader.read(n, 0, STEP_CLASSES - 1, "a step class");
+  const rows = decodeRows(reader, header.rows, n, stepClasses, header.centres);
   const classes = stepClasses && new Uint8Array(earlier + n);
   classes?.set(before.classes.subarray(0, earlier));
   classes?.set(/** @type {Int32Array} */ (stepClasses), earlier);
   const base = known ? 0 : header.base?.rows;
-  const layerRows = decodeRows(reader, parameters.layerRows, earlier + n, classes, null, priors.rows, base);
-  /** @type {Prior[]} */
-  const others = []; // of grids and chains
-  const planes = decodePlanes(reader, grids.list.flatMap((grid) => grid.planes), others);
+  const layerRows = decodeRows(reader, parameters.layerRows, earlier + n, classes, null, base);
+  const planes = decodePlanes(reader, grids.list.flatMap((grid) => grid.planes));
   const linears = chains.list.flatMap((chain) => chain.linears);
   const lengths = linears.flatMap(({ inputs, outputs }) => [inputs * outputs, outputs]);
-  const weights = lengths.map((length) => reader.read([length], others, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of a chain"));
+  const weights = lengths.map((length) => reader.read(length, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of a chain"));
   reader.finish();
   return { layer, parameters, voxels, rises, codes, stepClasses, rows, layerRows, planes, weights, priors };
 }

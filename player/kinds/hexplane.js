@@ -45,7 +45,7 @@ export const hexplane = {
     if (chains.length < 2) throw malformed(`${where} of ${chains.length} chain, expected the trunk and a head at least`);
   },
 
-  /** @param {Header} header @param {LayerTables[]} layers as in check @returns {Deformation} */
+  /** That of the last of these layers. @param {Header} header @param {LayerTables[]} layers @returns {Deformation} */
   deformationOf({ rows }, layers) {
     const { chains, kind } = layers[layers.length - 1];
     const scales = layers.flatMap(({ grids }) => grids);

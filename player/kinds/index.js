@@ -1,10 +1,9 @@
 // Clauses 13.1 and 17.1: the kinds, which say what tensors mean, by number.
 
 import { malformed, unsupported } from "../decode/errors.js";
-import { hexplane } from "./hexplane.js";
+import { DEFORMATIONS } from "./deformations.js";
 import { scaffold } from "./scaffold.js";
 import { splats } from "./splats.js";
-import { tracks } from "./tracks.js";
 /** @import { Header } from "../decode/header.js" */
 /** @import { Rules } from "../decode/reader.js" */
 /** @import { Tensors } from "../decode/tensors.js" */
@@ -20,7 +19,7 @@ import { tracks } from "./tracks.js";
  * A prefix of a scene, with N anchors, or N Gaussians that need none. Arrays in units and axes of the specification.
  *
  * motion: per layer what moves its level, null if nothing does: the deformation of the highest layer up to this one that
- * has one, or the tracks of all of these (none where only windows open and close).
+ * has one, or those of all of these (none where only windows open and close).
  *
  * @typedef {Anchors & SceneLayers & {motion: (Deformation | null)[]}} AnchorScene
  * @typedef {ExplicitGaussians & SceneLayers & {motion: (Tracks[] | null)[]}} SplatScene
@@ -37,7 +36,9 @@ import { tracks } from "./tracks.js";
  */
 
 const SCENES = [scaffold, splats];
-const DEFORMATIONS = [hexplane, tracks];
+
+/** The kind of a scene. @param {Scene} scene */
+export const kindOf = (scene) => SCENES.find(({ name }) => name === scene.kind);
 
 /** @template {{name: string}} K @param {K[]} kinds @param {string} what @param {number[]} kind */
 function registered(kinds, what, [number]) {
@@ -86,9 +87,9 @@ function checkForms(where, forms, allowed) {
 /** The scene of tensors that were read under RULES. @param {Tensors} tensors @returns {Scene} */
 export function sceneOf(tensors) {
   const { header, layers, voxels } = tensors;
-  const anchors = sceneKind(header).anchorsOf(tensors);
-  /** @type {Deformation | Tracks[] | null} */
-  let motion = anchors.kind === "splats" && anchors.window ? [] : null;
+  const kinds = sceneKind(header);
+  const anchors = kinds.anchorsOf(tensors);
+  let motion = /** @type {any} */ (anchors).motion ?? null;
   const scene = {
     ...anchors,
     info: header.info,
@@ -99,8 +100,9 @@ export function sceneOf(tensors) {
     mask: layers.map(({ codes }) => codes),
     fill: layers.map(({ fill }) => fill),
     motion: layers.map(({ kind }, i) => {
-      if (kind) motion = registered(DEFORMATIONS, "deformation", kind).deformationOf(header, layers.slice(0, i + 1));
-      return motion;
+      if (!kind) return motion;
+      const own = registered(DEFORMATIONS, "deformation", kind).deformationOf(header, layers.slice(0, i + 1));
+      return (motion = kinds.moved(motion, /** @type {any} */ (own)));
     }),
   };
   return /** @type {Scene} */ (scene); // RULES see to it that kinds of deformations fit that of the scene

@@ -3,6 +3,9 @@
 import { malformed } from "../decode/errors.js";
 /** @import { Chain, RowTensor } from "../decode/tensors.js" */
 
+/** Components of what deformations may add to Gaussians: position, rotation (w x y z), scale, opacity and color. */
+export const COMPONENTS = [3, 4, 3, 1, 3];
+
 /** Malformed at the first of these descriptions that is not as expected. @param {string} where @param {string[]} found
  * @param {string[]} expected */
 export function checkAlike(where, found, expected) {

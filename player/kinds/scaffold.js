@@ -4,6 +4,7 @@ import { malformed } from "../decode/errors.js";
 import { chainOf, checkAlike, described, describedRows, rowsOf } from "./rules.js";
 /** @import { Header } from "../decode/header.js" */
 /** @import { LayerTensors, Network, Tensors } from "../decode/tensors.js" */
+/** @import { Deformation } from "./index.js" */
 
 /** D, scalars of a feature, G, Gaussians of an anchor, and V, bit i: network i of layer 0 takes the view direction.
  * @typedef {{feature: number, slots: number, views: number}} Widths */
@@ -13,6 +14,7 @@ import { chainOf, checkAlike, described, describedRows, rowsOf } from "./rules.j
  *
  * @typedef {object} Anchors
  * @property {"scaffold"} kind
+ * @property {boolean} sees whether Gaussians depend on the camera's centre
  * @property {Widths} widths
  * @property {Float32Array} anchor [N, 3] positions, scene units
  * @property {Float32Array} feature [N, D]
@@ -55,6 +57,10 @@ export const scaffold = {
     const [feature, scalingLog, offset] = rows;
     const networks = { opacity, covariance, color };
     const widths = { feature: channels, slots, views };
-    return { kind: "scaffold", widths, anchor: positions, feature, scalingLog, offset, networks };
+    return { kind: "scaffold", sees: views > 0, widths, anchor: positions, feature, scalingLog, offset, networks };
   },
+
+  /** What moves the next level: the deformation of its own layer alone. @param {unknown} _below
+   * @param {Deformation} own */
+  moved: (_below, own) => own,
 };

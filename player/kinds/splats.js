@@ -4,12 +4,14 @@ import { malformed } from "../decode/errors.js";
 import { checkAlike, describedRows, rowsOf } from "./rules.js";
 /** @import { Header } from "../decode/header.js" */
 /** @import { LayerTensors, Tensors } from "../decode/tensors.js" */
+/** @import { Tracks } from "./index.js" */
 
 /**
  * What N Gaussians hold.
  *
  * @typedef {object} ExplicitGaussians
  * @property {"splats"} kind
+ * @property {boolean} sees whether colours depend on the camera's centre
  * @property {Float32Array} anchor [N, 3] corners of their voxels, scene units
  * @property {Float32Array} offset [N, 3] positions from there, in voxels
  * @property {Float32Array} color [N, 3] Y, Co, Cg of the harmonic of degree 0
@@ -45,12 +47,17 @@ export const splats = {
     if (chains.length) throw malformed(`layer 0: ${chains.length} chains, expected none`);
   },
 
-  /** @param {Tensors} tensors @returns {ExplicitGaussians} */
+  /** @param {Tensors} tensors @returns {ExplicitGaussians & {motion: Tracks[] | null}} motion: below any deformation */
   anchorsOf({ header, positions, rows }) {
     const [offset, color, opacity, scale, rotation] = rows;
     const [harmonics, window] = [HARMONICS, WINDOW].map(({ id: wanted }) => {
       return rows[header.rows.findIndex(({ id }) => id === wanted)] ?? null;
     });
-    return { kind: "splats", anchor: positions, offset, color, opacity, scale, rotation, harmonics, window };
+    const motion = window && /** @type {Tracks[]} */ ([]); // time opens and closes windows
+    const seen = { kind: /** @type {"splats"} */ ("splats"), sees: !!harmonics, motion };
+    return { ...seen, anchor: positions, offset, color, opacity, scale, rotation, harmonics, window };
   },
+
+  /** What moves the next level: deformations add up. @param {Tracks[] | null} below @param {Tracks} own */
+  moved: (below, own) => [...(below ?? []), own],
 };

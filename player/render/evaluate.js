@@ -293,7 +293,7 @@ class Evaluator {
     for (let r = 0; r < count; r++) {
       const from = r * wide;
       const at = inputs + r * stride;
-      floats.set(records.subarray(from + 12, from + 12 + F), at);
+      floats.set(records.subarray(from + 4, from + 4 + F), at);
       const x = records[from] - eye[0];
       const y = records[from + 1] - eye[1];
       const z = records[from + 2] - eye[2];
@@ -329,7 +329,8 @@ class Evaluator {
     alive.forEach((r, row) => {
       const from = r * wide;
       const gate = codes[anchors[r]] / 255;
-      for (let k = 4; k < 12; k++) records[from + k] = Math.exp(records[from + k]);
+      const size = from + this._offsetAt - 8;
+      for (let k = 0; k < 8; k++) records[size + k] = Math.exp(records[size + k]);
       for (let i = 0; i < S; i++) {
         const opacity = opacities[r * S + i];
         if (!opacity) continue;
@@ -337,8 +338,8 @@ class Evaluator {
         const w = this._color.out + row * this._color.stride + 3 * i;
         const offset = from + this._offsetAt + 4 * i;
         for (let k = 0; k < 3; k++) {
-          record[k] = records[from + k] + records[offset + k] * records[from + 4 + k];
-          record[4 + k] = records[from + 8 + k] * sigmoid(floats[v + k]) * gate;
+          record[k] = records[from + k] + records[offset + k] * records[size + k];
+          record[4 + k] = records[size + 4 + k] * sigmoid(floats[v + k]) * gate;
           record[12 + k] = sigmoid(floats[w + k]);
         }
         record[3] = opacity * gate;

@@ -29,7 +29,7 @@ import { ANCHOR_BITS, NO_ENTRY } from "./sort.js";
  */
 
 /** Block of an anchor's record where its features begin. */
-const FEATURE_BLOCK = 3;
+const FEATURE_BLOCK = 1;
 /** Block of a Gaussian's record that is its colour. */
 const COLOR_BLOCK = 3;
 /** Blocks of a Gaussian's record. */
@@ -392,7 +392,7 @@ void main() {
   int slot = int(entry >> ${ANCHOR_BITS});
   float opacity = texelFetch(opacities, ivec3(p, slot >> 2), 0)[slot & 3];
   vec3 offset = anchorBlock(p, ${this._offsetBlock} + slot).xyz;
-  vec3 mean = anchorBlock(p, 0).xyz + offset * exp(anchorBlock(p, 1).xyz);
+  vec3 mean = anchorBlock(p, 0).xyz + offset * exp(anchorBlock(p, ${this._offsetBlock - 2}).xyz);
   out0 = vec4(mean, 0);
   if (!(opacity > 0.)) return;
   vec3 d = directionTo(p);
@@ -402,7 +402,7 @@ ${repeat(K, (k) => `v += vw[${k}] * x${k}; q += qw[${k}] * x${k};`)}
   float gate = texelFetch(codes, p, 0).r;
   float n = length(q);
   out0 = vec4(mean, opacity * gate);
-  out1 = vec4(exp(anchorBlock(p, 2).xyz) / (1. + exp(-v.xyz)) * gate, 0);
+  out1 = vec4(exp(anchorBlock(p, ${this._offsetBlock - 1}).xyz) / (1. + exp(-v.xyz)) * gate, 0);
   out2 = n > 0. ? q / n : vec4(1, 0, 0, 0);
   out3 = colorOf(p, d);
 }`;

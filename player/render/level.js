@@ -116,8 +116,7 @@ export function stateOf(scene, level, seconds, eye) {
   const { number, motion } = levelOf(scene, level);
   const [start, end] = scene.info.timeRange;
   const t = (seconds - start) / (end - start); // clause 13.4; no number where the range is empty
-  const sees = scene.kind === "splats" ? scene.harmonics : scene.widths.views;
-  return { scene, level: number, t: motion && t > 0 ? Math.min(t, 1) : 0, eye: sees ? eye : [0, 0, 0] };
+  return { scene, level: number, t: motion && t > 0 ? Math.min(t, 1) : 0, eye: scene.sees ? eye : [0, 0, 0] };
 }
 
 /** @param {State} a @param {State} b */

@@ -58,7 +58,7 @@ export class Clip extends EventTarget {
     this._parts = new Map();
     /** Why segments do not come. @type {Map<number, string>} */
     this._problems = new Map();
-    /** The segment at hand. */
+    /** The segment at hand. @type {number} */
     this._segment = -1;
     /** @type {import("../decode/fetch.js").Budget} */
     this._budget = {};

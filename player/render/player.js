@@ -1,15 +1,15 @@
 // A player on a canvas. It loads, evaluates, sorts and draws, each step only when its inputs have changed.
 
+import { drawing } from "../kinds/drawing.js";
 import { centreOf, defaultCamera, fitted } from "./camera.js";
 import { CpuEvaluator } from "./cpu.js";
-import { GpuEvaluator, SPLAT_BLOCKS } from "./evaluator.js";
+import { SPLAT_BLOCKS } from "./evaluator.js";
 import { Gpu } from "./gl.js";
 import { levelOf, sameState, stateOf } from "./level.js";
 import { Clip } from "./loader.js";
 import { Pace } from "./pace.js";
 import { Painter } from "./painter.js";
 import { Remote } from "./remote.js";
-import { SplatPass } from "./splat-pass.js";
 import { WORKERS } from "./workers.js";
 /** @import { Camera } from "../decode/tensors.js" */
 /** @import { Scene } from "../kinds/index.js" */
@@ -52,9 +52,6 @@ import { WORKERS } from "./workers.js";
 
 /** After so many milliseconds without movement the picture is drawn at full quality. */
 const REST_MS = 250;
-/** Up to so many anchors a machine without a GPU uses the CPU evaluator: its shaders take seconds to compile and are
- * hardly faster. */
-const SOFTWARE_ANCHORS = 30_000;
 /** The first step of SCALES without a GPU. */
 const SOFTWARE_STEP = 2;
 /** So many players of a page have WebGL contexts, as many as mobile browsers keep; for more in view, the browser decides.
@@ -95,7 +92,7 @@ export class Player extends Clip {
     this._gpu = null;
     /** @type {Painter | null} */
     this._painter = null;
-    /** @type {GpuEvaluator | SplatPass | null} */
+    /** @type {import("../kinds/drawing.js").OnGpu | null} */
     this._evaluator = null;
     /** @type {CpuEvaluator | null} */
     this._cpu = null;
@@ -512,15 +509,17 @@ export class Player extends Clip {
   /** @param {Gpu} gpu @param {Scene} scene */
   _onCpu(gpu, scene) {
     const { evaluator } = this._options;
-    const few = gpu.software && (scene.kind === "splats" || scene.anchor.length <= 3 * SOFTWARE_ANCHORS);
-    return evaluator === "cpu" || this._unfit || !gpu.floats || (few && evaluator !== "gpu");
+    const kind = drawing(scene);
+    if (evaluator === "cpu" || this._unfit || !gpu.floats || !kind.gpu) return true;
+    return evaluator !== "gpu" && gpu.software && scene.anchor.length <= 3 * kind.few;
   }
 
   /** @param {Gpu} gpu @param {State} state @param {Splats | null} into what may be overwritten
    * @returns {Promise<Evaluated>} */
   async _gaussians(gpu, state, into) {
     const { scene, level, t, eye } = state;
-    const onCpu = this._onCpu(gpu, scene);
+    const { gpu: evaluatorOn } = drawing(scene);
+    const onCpu = !evaluatorOn || this._onCpu(gpu, scene);
     if (onCpu || this._evaluator?.scene !== scene) {
       this._evaluator?.free();
       this._evaluator = null;
@@ -533,10 +532,7 @@ export class Player extends Clip {
       for (const block of blocks) gpu.write(field, data, Math.ceil(count / width), block, 1);
       return { splats: { field, still }, means };
     }
-    this._evaluator ??=
-      scene.kind === "splats"
-        ? new SplatPass(gpu, scene, (this._cpu ??= new CpuEvaluator()))
-        : new GpuEvaluator(gpu, scene);
+    this._evaluator ??= evaluatorOn(gpu, scene, (this._cpu ??= new CpuEvaluator()));
     return this._evaluator.evaluate(level, t, eye, into, (opacities, ...rest) =>
       this._sorter.call("list", [opacities, ...rest], [opacities.buffer]),
     );

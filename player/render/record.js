@@ -14,8 +14,8 @@
 /** The quantities in the order of a deformation's heads. @param {Widths} widths @returns {Quantity[]} */
 export const quantitiesOf = ({ feature: D, slots: G }) => [
   { values: "anchor", outputs: 3, run: 3, at: 0, length: true },
-  { values: "feature", outputs: D, run: D, at: 12 },
-  { values: "scalingLog", outputs: 6, run: 3, at: 4 },
+  { values: "feature", outputs: D, run: D, at: 4 },
+  { values: "scalingLog", outputs: 6, run: 3, at: 4 + 4 * Math.ceil(D / 4) },
   { values: "offset", outputs: 3 * G, run: 3, at: 12 + 4 * Math.ceil(D / 4) },
 ];
 

@@ -1,7 +1,7 @@
 // Clauses 13.7 and 13.8 on the GPU, as one fragment pass: a texel for each Gaussian of a level, of opacity -1 where it is
 // not seen. What a time needs of the CPU are the bases; what the order needs, means and opacities, a worker evaluates.
 
-import { COMPONENTS } from "../kinds/tracks.js";
+import { COMPONENTS } from "../kinds/rules.js";
 import { TooLarge, blocksOf, repeat, targets } from "./layers.js";
 import { MIN_OPACITY, levelOf } from "./level.js";
 import { basesOf, eachBasis } from "./splats.js";
@@ -72,8 +72,7 @@ void main() {
 
 /** A level on the GPU. heads: their bases with those of the coefficients' blocks before.
  * @typedef {{number: number, program: Program, textures: Record<string, import("./gl.js").Field | WebGLTexture>,
- *   heads: (ReturnType<typeof basesOf> & {head: number, block: number})[], bases: Float32Array, width: number,
- *   height: number}} OnGpu */
+ *   heads: (ReturnType<typeof basesOf> & {block: number})[], bases: Float32Array, width: number, height: number}} OnGpu */
 
 /** Evaluates a scene, as GpuEvaluator does one of the other kind. */
 export class SplatPass {
@@ -107,8 +106,8 @@ export class SplatPass {
     const { program, textures, heads, bases, width, height } = this._level;
     const means = t === this._time ? null : await cpu.means(scene, level, t);
     this._time = t;
-    for (const { head, block, parts } of heads) {
-      eachBasis(parts, COMPONENTS[head], t, (basis, c, value) => (bases[16 * block + 4 * basis + c] = value));
+    for (const { block, parts } of heads) {
+      eachBasis(parts, t, (basis, c, value) => (bases[16 * block + 4 * basis + c] = value));
     }
     const field = gpu.renewed(into?.field, width, height, 4);
     gpu.use(program, textures);
@@ -126,7 +125,7 @@ export class SplatPass {
     const tracks = levelOf(this.scene, number).motion ?? [];
     let blocks = 0;
     const heads = COMPONENTS.map((_, head) => {
-      const found = { head, block: blocks, ...basesOf(tracks, head) };
+      const found = { block: blocks, ...basesOf(tracks, head) };
       blocks += blocksOf(found.inputs);
       return found;
     });

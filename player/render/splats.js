@@ -2,7 +2,8 @@
 //
 // What neither time nor camera changes is computed once for a level.
 
-import { COMPONENTS } from "../kinds/tracks.js";
+import { splatMotion } from "../kinds/deformations.js";
+import { COMPONENTS } from "../kinds/rules.js";
 import { Arena, GROUP } from "./kernel.js";
 import { blocksOf } from "./layers.js";
 import { MIN_OPACITY, deformationUnit, levelOf, texelsFor } from "./level.js";
@@ -264,8 +265,8 @@ export class SplatEvaluator {
     return heads.map((head) => {
       const sum = (this._sums[head] ??= this._sumOf(head));
       if (!sum.layer.inputs) return null;
-      const { layer: { inputs }, components, x, parts } = sum;
-      eachBasis(parts, components, t, (basis, c, value) => (this._arena.floats[x + c * inputs + basis] = value));
+      const { layer: { inputs }, x, parts } = sum;
+      eachBasis(parts, t, (basis, c, value) => (this._arena.floats[x + c * inputs + basis] = value));
       return sum;
     });
   }
@@ -288,29 +289,10 @@ export class SplatEvaluator {
     return { layer, components, x: arena.take(components * inputs), sums: arena.take(components * BATCH), parts };
   }
 
-  /** The coefficients of a layer's head, with what groups have for them, of the rows that may be seen, [count, width].
-   * @param {Part} part */
-  _coefficients({ width, coefficients, groups, maps }) {
-    const { _rows: rows, _rest: rest } = this;
-    const own = new Float32Array(width * rows.length);
-    for (let i = 0; i < rows.length; i++) {
-      // layers have nothing for the rows of later ones
-      for (let k = 0; k < width; k++) own[width * i + k] = coefficients[width * rows[i] + k] ?? 0;
-    }
-    if (!groups || !maps) return own;
-    const { of, centres } = groups;
-    const count = centres.length / 3;
+  /** The coefficients of a layer's head, of the rows that may be seen, [count, width]. @param {Part} part */
+  _coefficients({ motion, head }) {
     const scale = 1 / (deformationUnit(this.scene) || Infinity);
-    for (let i = 0; i < rows.length; i++) {
-      const group = of[rows[i]];
-      if (!(group >= 0 && group < count)) continue;
-      const [x, y, z] = [0, 1, 2].map((axis) => rest[4 * i + axis] * scale - centres[axis * count + group]);
-      for (let k = 0, from = group, step = width * count; k < width; k++, from += count) {
-        const turned = x * maps[from] + y * maps[from + step] + z * maps[from + 2 * step];
-        own[width * i + k] += turned + maps[from + 3 * step];
-      }
-    }
-    return own;
+    return splatMotion(motion).coefficients(motion, head, this._rows, this._rest, scale);
   }
 
   /** Makes the sums of a batch. @param {(Sum | null)[]} sums @param {number} first Gaussian of the batch */
@@ -436,29 +418,22 @@ export class SplatEvaluator {
 
 /** What one layer has of a head. @typedef {ReturnType<typeof basesOf>["parts"][number]} Part */
 
-/** The bases of a head in all layers, each layer's with the first of its own, and their number. @param {Tracks[]} tracks
+/** The bases of a head in all layers, each layer's with the first of its own, and their number. @param {Tracks[]} motions
  * @param {number} head */
-export function basesOf(tracks, head) {
+export function basesOf(motions, head) {
   let inputs = 0;
-  const parts = tracks.flatMap(({ instants, groups, heads: { [head]: found } }) => {
-    if (!found) return [];
-    const width = found.bases.length / COMPONENTS[head] / instants.length;
+  const parts = motions.flatMap((motion) => {
+    const width = splatMotion(motion).width(motion, head);
     inputs += width;
-    return { first: inputs - width, width, instants, groups, ...found };
+    return width ? { first: inputs - width, width, motion, head } : [];
   });
   return { inputs, parts };
 }
 
-/** @param {Part[]} parts @param {number} components @param {number} t 0..1
- * @param {(basis: number, component: number, value: number) => void} put takes each component of each basis at a time */
-export function eachBasis(parts, components, t, put) {
-  for (const { first, bases, instants } of parts) {
-    const { length } = instants;
-    let j = 0;
-    while (j < length - 2 && instants[j + 1] <= t) j++;
-    const f = (t - instants[j]) / (instants[j + 1] - instants[j]);
-    for (let from = j, c = 0; from < bases.length; from += length, c++) {
-      put(first + Math.floor(c / components), c % components, bases[from] * (1 - f) + bases[from + 1] * f);
-    }
+/** @param {Part[]} parts @param {number} t 0..1 @param {(basis: number, component: number, value: number) => void} put
+ * takes each component of each basis at a time */
+export function eachBasis(parts, t, put) {
+  for (const { first, motion, head } of parts) {
+    splatMotion(motion).basesAt(motion, head, t, (basis, c, value) => put(first + basis, c, value));
   }
 }

@@ -4,9 +4,9 @@
 import { readFileSync } from "node:fs";
 
 import { decode } from "../decode/index.js";
-import { COMPONENTS } from "../kinds/tracks.js";
+import { drawing } from "../kinds/drawing.js";
+import { COMPONENTS } from "../kinds/rules.js";
 import { centreOf, defaultCamera } from "./camera.js";
-import { texelsOf } from "./evaluate.js";
 import { packed } from "./ext-splats.js";
 import { levelOf } from "./level.js";
 import { takeCentres } from "./playback.js";
@@ -38,7 +38,8 @@ const camera = defaultCamera(scene.info);
 const centre = centreOf(camera);
 const row = camera.viewmat.slice(8, 12);
 const sorter = new DepthSort();
-const evaluator = new SplatEvaluator(/** @type {import("../kinds/index.js").SplatScene} */ (scene)); // if it is one
+const evaluator = drawing(scene).cpu(scene);
+const explicit = evaluator instanceof SplatEvaluator ? evaluator : null;
 const tracks = (scene.kind === "splats" && levelOf(scene, LEVEL).motion) || [];
 /** @type {import("./ext-splats.js").Packed | null} */
 let splats = null;
@@ -51,16 +52,14 @@ let centres = new Float32Array(0);
 for (let i = 0; i < Number(pictures); i++) {
   const t = (i * STEP) % 1;
   const eye = centre.map((x) => x + i / 1000);
-  const texels = timed("evaluate", () => {
-    return scene.kind === "splats" ? evaluator.evaluate(LEVEL, t, eye, spare) : texelsOf(scene, LEVEL, t, eye, spare);
-  });
+  const texels = timed("evaluate", () => evaluator.evaluate(LEVEL, t, eye, spare));
   spare = texels;
   const { count, data, changing } = texels;
-  const means = scene.kind === "splats" ? timed("evaluate means", () => evaluator.means(LEVEL, t)) : data.slice(0, 4 * count);
+  const means = explicit ? timed("evaluate means", () => explicit.means(LEVEL, t)) : data.slice(0, 4 * count);
   timed("sort", () => sorter.sort(means, row, scene.info.near));
   splats = timed("pack for Spark", () => packed(texels, splats));
   timed("page, own player: bases", () => {
-    COMPONENTS.forEach((c, head) => eachBasis(basesOf(tracks, head).parts, c, t, () => {}));
+    COMPONENTS.forEach((_, head) => eachBasis(basesOf(tracks, head).parts, t, () => {}));
   });
   if (arrays.length !== data.length) [arrays, centres] = [data.slice(), new Float32Array((3 * data.length) / 16)];
   timed("page, PlayCanvas: arrays", () => {

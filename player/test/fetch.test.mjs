@@ -204,9 +204,10 @@ for (const [name, [behave, options]] of Object.entries(INTACT)) {
 }
 
 test("of a changed file that no tag gives away, the checksums do", async () => {
-  const { source } = await serving((i) => (i ? { bytes: OTHER } : { cut: ENDS[0] + 5 }), { fetch: hidden });
+  const bytes = readVector("valid/slices"); // as long as the layer that was begun
+  const { source } = await serving((i) => (i ? { bytes } : { cut: ENDS[0] + 5 }), { fetch: hidden });
   const scenes = await all(source);
-  assert.ok(same(scenes[scenes.length - 1], decode(OTHER)));
+  assert.ok(same(scenes[scenes.length - 1], decode(bytes)));
   assert.equal(source.changes, 1);
 });
 
@@ -266,6 +267,13 @@ test("temporary status codes are tried again, others are final, and a dead serve
   const dead = await serving(() => ({ status: 500 }), { attempts: 3 });
   await assert.rejects(all(dead.source), { name: "FetchError" });
   assert.equal(dead.asked.length, 3);
+});
+
+test("an answer that breaks is told from none", async () => {
+  const { source } = await serving(() => ({ cut: 0 }), { attempts: 2 });
+  await assert.rejects(all(source), { name: "FetchError", message: /the connection broke \(0 bytes received\)$/ });
+  const none = await serving(undefined, { attempts: 2, fetch: () => Promise.reject(new TypeError("fetch failed")) });
+  await assert.rejects(all(none.source), { message: /no connection, or no CORS permission of the server \(0 bytes/ });
 });
 
 test("an abort raises the signal's reason, before and during the download", async () => {

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { COMPONENTS } from "../kinds/tracks.js";
+import { COMPONENTS } from "../kinds/rules.js";
 import { levelOf, sameState, stateOf } from "../render/level.js";
 import { SplatEvaluator } from "../render/splats.js";
 /** @import { SplatScene, Tracks } from "../kinds/index.js" */
@@ -24,7 +24,7 @@ function tracksOf(rows, instants, heads, groups) {
   });
   const of = Float32Array.from({ length: rows }, (_, i) => (i % (groups + 2)) - 1);
   const own = groups ? { of, centres: numbers(3 * groups) } : null;
-  return { instants: Float64Array.from(instants), heads: made, groups: own };
+  return { kind: "tracks", instants: Float64Array.from(instants), heads: made, groups: own };
 }
 
 /** Rows with each layer; more than a batch. */
@@ -48,6 +48,7 @@ function sceneOf({ degree = 0, window = false, heads = [ALL_HEADS, [0, 1]], grou
   const mask = ROWS.map((rows) => numbers(rows).map((v) => (v < -0.8 ? 0 : 255 * Math.min(1, 1 + v))));
   return {
     kind: "splats",
+    sees: degree > 0,
     info: {
       voxelSize: 1 / 16, box: flat ? [[2, 2, 2], [2, 2, 2]] : [[-1, -2, 3], [1, 1, 4]], timeRange: [1, 3], background: [0, 0, 0], near: 0.1, far: 9,
       up: [0, 1, 0], unit: 0, camera: null,

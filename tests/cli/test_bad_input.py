@@ -127,7 +127,7 @@ CASES = [
     (2, "export SCENE -o a.PLY --to spz", "-o a.PLY ends in .ply, but --to is spz"),
     (2, "export SCENE -o a.pt --to ply", "-o a.pt ends in .pt, but --to is ply"),
     (2, "export SCENE -o frames.spz --to ply-seq", "-o frames.spz ends in .spz, but --to is ply-seq"),
-    (2, "export SCENE -o frames", "found -o frames, expected a name that ends in .ply, .spz, .glb or .4dgs, or --to"),
+    (2, "export SCENE -o frames", "found -o frames, expected a name that ends in .ply, .spz, "),
     *((2, f"decode s.pd4 --max-bytes {text}", "such as 50k or 1.5MB") for text in ("0", "5kb", "1kBB", "B", "2KiB")),
     (1, "view empty --no-browser", "empty: found no .pd4 file in this folder"),
     (1, "view . --no-browser", "cut.pd4: "),
@@ -179,6 +179,7 @@ CASES = [
     (1, "encode nan.pt -o s.pd4", "feature"),
     (1, "encode inf.pt -o s.pd4", "feature"),
     (1, "encode huge.pt -o s.pd4", "feature"),
+    (1, "encode ends.pt -o s.pd4", "ends.pt: positions span 2097153 voxels on one axis, limit 2097152 in a slice"),
     # outputs
     *(
         (1, command, "exists already")  # not that the input is absent: the output is checked first
@@ -204,9 +205,11 @@ def bad_files(tmp_path_factory, model_pt, scene_pd4, scene):
     (folder / "flipped.pd4").write_bytes(flipped(data, 400))
     (folder / "late.pd4").write_bytes(flipped(data, -30))
     (folder / "blind.pd4").write_bytes(encode(replace(scene, info=replace(scene.info, camera=None)), effort=1))
-    for name, value in (("nan", float("nan")), ("inf", float("inf")), ("huge", 1e20)):
+    spoilt = {"nan": ("feature", float("nan")), "inf": ("feature", float("inf")), "huge": ("feature", 1e20)}
+    for name, (key, value) in (spoilt | {"ends": ("anchor_q", 1 << 20)}).items():
         content = torch.load(model_pt, weights_only=True)
-        content["state"]["feature"][3, 2] = value
+        content["state"][key][3, 2] = value
+        content["state"][key][4, 2] = -value
         content["digest"] = checkpoint._digest(content)
         torch.save(content, folder / f"{name}.pt")
     torch.save({"format": "pd4dgs-checkpoint", "version": 1, "state": Trap(folder / "ran")}, folder / "evil.pt")

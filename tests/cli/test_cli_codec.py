@@ -108,7 +108,7 @@ def test_partial_input_exits_3_only_when_allowed(cli, scene_pd4, tmp_path):
 def test_info_states_layers_and_first_frame(cli, scene_pd4):
     result = cli("info", scene_pd4, "--json", "--check", "--at", "500k,2M,1G,1e9,64k")
     report, size = result.json, scene_pd4.stat().st_size
-    assert report["format_version"] == "4.0" and report["bytes"] == size and report["checked"] is True
+    assert report["format_version"] == "5.0" and report["bytes"] == size and report["checked"] is True
     assert report["layers"][-1]["end"] == size
     end = report["layers"][0]["end"]
     rates = {"500k": 5e5, "2M": 2e6, "1G": 1e9, "1e9": 1e9, "64k": 64e3}

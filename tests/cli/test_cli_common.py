@@ -85,6 +85,18 @@ def test_help_and_usage_errors_load_no_heavy_module(python):
     assert python(program).strip() == "['numpy']"  # by the fields of TrainConfig
 
 
+@pytest.mark.parametrize(
+    "total, says",
+    [(3, ["packing: 1 of 3 steps", "packing: 2 of 3 steps"]), (None, ["packing: step 1", "packing: step 2"])],
+)
+def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch, capsys, total, says):
+    monkeypatch.setattr(common, "LINE_SECONDS", -1.0)
+    with common.progress_bar(total, "steps", "packing") as step:
+        step()
+        step()
+    assert capsys.readouterr().err.splitlines() == says
+
+
 def test_links_and_other_spellings_name_one_file(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "a").touch()

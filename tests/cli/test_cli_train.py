@@ -53,7 +53,7 @@ def test_train_reports_and_logs(train, tmp_path, shared_dataset):
 
 def test_options_reach_the_configuration(train, tmp_path):
     options = ("--seed", 7, "--downscale", 2, "--holdout", 3, "--rate-scale", 0.5, "--rollout", "fixed")
-    options += ("--without", "noise", "--without", "tmc", "--max-layer", 1, "--prune", 0.1)
+    options += ("--without", "noise", "--without", "binary", "--max-layer", 1, "--prune", 0.1)
     options += ("--feature-width", 5, "--slots", 3, "--keep-layers")
     assert train(tmp_path / "m.pt", *options, iterations=1).code == 0
     config = json.loads(checkpoint.load(tmp_path / "m.pt")[1]["config"])
@@ -61,7 +61,7 @@ def test_options_reach_the_configuration(train, tmp_path):
     assert given.items() <= config.items() and config["preset"] == "tiny"
     scene = to_scene(checkpoint.load(tmp_path / "m.pt")[0])
     assert scene.widths == decode(encode(scene, effort=1)).widths == Widths(5, 3, viewing=("color",))
-    assert not (config["noise"] or config["tmc_binary"] or config["tmc_smooth"]) and config["keep_layers"]
+    assert not (config["noise"] or config["binary"]) and config["keep_layers"]
 
 
 def test_the_quality_sets_the_dial_and_single_options_replace_parts_of_it(train, tmp_path):

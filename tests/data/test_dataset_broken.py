@@ -106,9 +106,11 @@ SYNTHETIC = {
         for value in values
     },
     "static?size=7x160": "size is '7x160'; expected for example size=960x540, each 8 to 8192",
+    "static?seconds=0": "seconds is '0'; expected for example seconds=60, 1 to 3600",
+    "bend?seconds=5": "found seconds, expected them of synthetic:static|global|local|fast alone",
     "static?frames=2": "frames is '2'; expected for example frames=300, 3 to 10000",
     **{
-        f"static?{query}": "expected each of seed, size, frames, path once at most, as key=value"
+        f"static?{query}": "expected each of seed, size, frames, seconds, path once at most, as key=value"
         for query in ("", "a", "seed=1&a", "seed=1&seed=1", "seed=1&")
     },
 }

@@ -11,6 +11,7 @@ from pd4dgs_codec.data.bodies import MOTIONS, NO_BODY, THINGS, Eye, bodies, ente
 from pd4dgs_codec.data.dancer import Dancer
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.data.random_bodies import PATHS, RANDOM, random_scene
+from pd4dgs_codec.data.view import LaterView, pixels_later
 
 LENS, SWEEPS = syn.ROOM.lens, syn.PATHS["sweeps"]
 
@@ -160,6 +161,19 @@ def test_content_depends_on_the_string_alone(local):
     first = digest(f"local?{small}")
     np.random.seed(5)  # noqa: NPY002 - a global seed must not matter
     assert digest(f"local?seed=0&{small}") == first != digest(f"local?{small}&seed=1")
+
+
+def test_more_seconds_go_on_with_the_motion_and_pixels_come_when_they_are_asked_for():
+    usual, longer = (
+        load(f"synthetic:local?size=40x30&frames={n}{more}") for n, more in ((60, ""), (119, "&seconds=10"))
+    )
+    assert longer.time_range == (0, 10) and len(load("synthetic:local?size=40x30&seconds=2").train) == 24
+    assert np.array_equal(usual.train[0].image, longer.train[0].image)
+    assert abs(usual.train[59].image.astype(int) - longer.train[58].image).mean() < 3, "after 4.9 s"
+    with pixels_later():
+        later = load("synthetic:local?size=40x30&frames=119&seconds=10")
+    assert type(later.train[0]) is LaterView and later.fingerprint() == longer.fingerprint()
+    assert np.array_equal(later.test[3].mask, longer.test[3].mask)
 
 
 def test_size_and_frames_options(large):

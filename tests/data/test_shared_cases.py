@@ -250,7 +250,7 @@ def player(browser, tmp_path_factory) -> Iterator[tuple[Any, str, str]]:
 SAYS = {
     "spa/a": "not a .pd4 file: it begins with 3c21646f63",
     "signed/a?sig=1": "answered 403",
-    "weak/cut": "no connection",
+    "weak/cut": "connection",
 }
 
 

@@ -19,7 +19,7 @@ def ordered(cells):
 
 def coded(cells):
     writer = ChannelWriter()
-    encode_positions(cells, writer, [])
+    encode_positions(cells, writer)
     return writer.finish()[:2]
 
 
@@ -29,7 +29,7 @@ def size_of(cells):
 
 def decoded(codes, stream, count):
     reader = ChannelReader(codes, stream, 3 * count)
-    cells = decode_positions(reader, count, [])
+    cells = decode_positions(reader, count)
     reader.finish()
     return cells
 

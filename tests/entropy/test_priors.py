@@ -13,16 +13,14 @@ from strategies import norm_table
 
 from pd4dgs_codec.entropy.ans import TOTAL
 from pd4dgs_codec.entropy.priors import (
+    FEW,
     NORMAL,
     OCTAVE,
     SI_MAX,
     SI_MIN,
-    Const,
-    Gauss,
-    Mixture,
     Normal,
+    Prior,
     Window,
-    _Tabled,
     make_models,
     normal_tables,
 )
@@ -70,7 +68,7 @@ def test_loses_almost_nothing_against_the_exact_gaussian(sigma):
 
 @given(st.integers(2, 200), st.integers(0, 256), st.integers(SI_MIN, SI_MAX), st.integers(SI_MIN, SI_MAX))
 def test_mixture_is_a_table_between_its_parts(n, weight, si1, si2):
-    cum = Mixture(Window(0, n), Normal(100, si1), Normal(256 * n, si2), weight).cum
+    cum = Prior(Window(0, n), (Normal(100, si1), Normal(256 * n, si2)), weight).cum
     ends = np.stack([norm_table(n, 100, si1), norm_table(n, 256 * n, si2)])
     assert is_table(cum, n)
     assert np.all(cum >= ends.min(axis=0) - 1) and np.all(cum <= ends.max(axis=0) + 1)
@@ -87,22 +85,17 @@ def test_tables_are_frozen():
 
 def test_tables_made_together_are_those_made_alone():
     rng = np.random.default_rng(3)
-    priors: list[Gauss | Mixture | Const] = [Const(Window(4, 1))]
+    priors = [Prior(Window(4, 1))]
     for n in [2, 3, 7, 300, 20_000, 2, 900, *rng.integers(2, 60, 40).tolist()]:
         means, widths = rng.integers(-(2**31), 2**31, 2) >> rng.integers(0, 31, 2), rng.integers(-640, 1281, 2)
         first, second = map(Normal, means.tolist(), widths.tolist())
         window = Window(-3, min(n, 1 << 14))
-        priors += [Gauss(window, first), Mixture(window, first, second, int(rng.integers(1, 256)))]
-    cums, sizes = normal_tables(priors[1:])
-    for found, prior in zip(np.split(cums, np.cumsum(sizes + 1)[:-1]), priors[1:], strict=True):
+        priors += [Prior(window, (first,)), Prior(window, (first, second), int(rng.integers(1, 256)))]
+    cums, sizes = normal_tables(priors)
+    for found, prior in zip(np.split(cums, np.cumsum(sizes + 1)[:-1]), priors, strict=True):
         np.testing.assert_array_equal(found, prior.cum)
     make_models(priors)
-    assert all("model" in prior.__dict__ for prior in priors[1:])
-
-
-def test_priors_of_another_class_are_not_taken_for_gaussians():
-    class Laplace(_Tabled):
-        window, normal = Window(0, 9), Normal(0, 0)
-
-    with pytest.raises(TypeError, match="^Laplace: "):
-        Laplace().cum  # noqa: B018
+    assert all("model" in prior.__dict__ for prior in priors)
+    few = [Prior(Window(0, FEW + i), (Normal(0, 0),)) for i in range(2)]
+    make_models(few)
+    assert ["model" in prior.__dict__ for prior in few] == [False, True]

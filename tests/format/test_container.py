@@ -19,7 +19,7 @@ from pd4dgs_codec.format.registry import MAX_HEADER
 
 
 def test_exact_bytes():
-    front = bytes.fromhex("89504434 0d0a1a0a 0400 0000 03000000")
+    front = bytes.fromhex("89504434 0d0a1a0a 0500 0000 03000000")
     assert write_preamble(b"abc") == front + struct.pack("<I", zlib.crc32(front + b"abc")) + b"abc"
     body = bytes.fromhex("0500 0100 02000000 0102030405060708") + b"hi"
     chunk = write_chunk(5, FLAG_ANCILLARY, bytes(range(1, 9)), b"hi")

@@ -27,7 +27,7 @@ def test_info_needs_the_header_alone():
     first = info(data[: whole["header_bytes"]])
     with pytest.raises(Truncated):
         info(data[: whole["header_bytes"] - 1])
-    assert whole["format_version"] == FORMAT_VERSION == "4.0"
+    assert whole["format_version"] == FORMAT_VERSION == "5.0"
     assert whole["bytes"] == first["bytes"] == len(data)
     place = ("layer", "offset", "bytes", "end")
     before, after = ([{k: row[k] for k in place} for row in found["layers"]] for found in (first, whole))

@@ -12,7 +12,7 @@ from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.errors import EncodeError, Malformed
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.parameters import Declared, with_fill
-from pd4dgs_codec.format.payload import Past, read_slice, write_slice
+from pd4dgs_codec.format.payload import read_slice, write_slice
 from pd4dgs_codec.morton import MAX_VOXEL, morton_order
 from pd4dgs_codec.scene import MAX_CLASS
 from pd4dgs_codec.tensors.quantise import MAX_SYMBOL, NO_CLASSES, Rows, RowTable
@@ -246,7 +246,7 @@ def test_a_later_slice_refers_to_the_priors_of_the_first():
     options = EncodeOptions(effort=3)
     layer = gaussian_layer(5, rows=400)
     parts = [sliced(layer, np.arange(i, 400, 2), i == 0) for i in range(2)]
-    written, known, past = list[bytes](), Past(), Past()
+    written, known, past = list[bytes](), [], []
     for i, part in enumerate(parts):
         written.append(write_slice(part, options, i > 0, known)[0])
     assert len(written[1]) < len(write_slice(parts[1], options)[0])

@@ -10,7 +10,6 @@ from strategies import make_scene
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format import encoder
 from pd4dgs_codec.format.decoder import decode
-from pd4dgs_codec.kinds import NAMES
 from pd4dgs_codec.scene import HEADS, PLANES, Deformation, Widths
 
 encode, encode_with_report = (partial(f, effort=1) for f in (encoder.encode, encoder.encode_with_report))
@@ -62,7 +61,7 @@ def test_layers_go_with_their_deformation_and_the_highest_masks_stay(given_value
         assert active_codes(got, index) == active_codes(scene, layer)
     gone = {row["what"]: row for row in report.left_out}
     for layer, value in ((1, given_values[0]), (2, given_values[1])):
-        name = NAMES[layer]
+        name = f"hexplane of layer {layer}"
         assert (name in gone) == (value == 1e-8)
         if name in gone:
             assert gone[name]["bytes"] > 50 and "zero" in gone[name]["why"]
@@ -76,7 +75,7 @@ def test_a_layer_1_whose_planes_layer_2_reads_keeps_them_and_one_head(value):
     assert got.layers == (0, 1, 2) and encode(got) == data
     (given,), (kept,) = scene.global_deformation.planes, got.global_deformation.planes
     assert all(np.array_equal(kept[name], given[name]) for name in given)
-    heads = [f"global_deformation head {head}" for head in HEADS if head not in got.global_deformation.networks]
+    heads = [f"hexplane of layer 1 head {head}" for head in HEADS if head not in got.global_deformation.networks]
     assert len(heads) == len(HEADS) - 1 and set(heads) <= {row["what"] for row in report.left_out}
 
 

@@ -101,13 +101,13 @@ def test_the_choice_suits_the_plane():
 def coded(planes, *options):
     """(codes, stream, sum of R(a)) of residuals. options: of ChannelWriter."""
     writer = ChannelWriter(*options)
-    rate = write_planes(planes, writer, [])
+    rate = write_planes(planes, writer)
     return *writer.finish()[:2], rate
 
 
 def decoded(codes, stream, planes):
     reader = ChannelReader(codes, stream, sum(plane.size for plane in planes))
-    found = read_planes(reader, [plane.shape for plane in planes], [])
+    found = read_planes(reader, [plane.shape for plane in planes])
     reader.finish()
     return found
 
@@ -115,7 +115,7 @@ def decoded(codes, stream, planes):
 def plainly(planes):
     """(bits, sum of R(a)) of the channels without classes."""
     writer = ChannelWriter()
-    rate = writer.write([channel.ravel() for plane in planes for channel in plane], [])
+    rate = writer.write([channel.ravel() for plane in planes for channel in plane])
     return writer.finish()[2][0], rate
 
 

@@ -98,16 +98,18 @@ FAULTS = {
     "mask of layer 2 is below the mask of the layer before": broken(
         "mask", lambda m: (np.full_like(m[0], 9),) * 2 + (np.full_like(m[0], 8),)
     ),
-    "scaffold networks .'color'. are missing": broken("networks", lambda n: {k: n[k] for k in n if k != "color"}),
+    "scaffold of layer 0: networks .'color'. are missing": broken(
+        "networks", lambda n: {k: n[k] for k in n if k != "color"}
+    ),
     "layers": broken("layers", lambda _: (0, 2, 1)),
     "step of feature": broken("steps", lambda s: replace(s, feature=0.0)),
-    "global_deformation: layer 1 trunk: 3 inputs, expected 2": broken(
+    "hexplane of layer 1: layer 1 trunk: 3 inputs, expected 2": broken(
         "global_deformation", lambda d: replace(d, networks={**d.networks, "trunk": d.networks["position"]})
     ),
-    "scaffold mlp.color.weight.1: .* expected float32 .30, 4.": broken(
+    "scaffold of layer 0 mlp.color.weight.1: .* expected float32 .30, 4.": broken(
         "networks", lambda n: {**n, "color": (n["color"][0], (np.zeros((30, 5), np.float32), n["color"][1][1]))}
     ),
-    "local_deformation network trunk: no layers": broken(
+    "hexplane of layer 2: network trunk: no layers": broken(
         "local_deformation", lambda d: replace(d, networks={**d.networks, "trunk": ()})
     ),
     "2 fills, expected none or one per layer": broken("fills", lambda _: (None, None)),

@@ -3,17 +3,20 @@
 import gc
 import weakref
 from collections import deque
+from dataclasses import replace
 from functools import cache
 from itertools import chain
 
 import numpy as np
 import pytest
+from fuzzing.mutate import Chunk, put_together, take_apart
 from strategies import assert_same_scene, by_voxel, slice_ends, small_file
 from streams import cost
 from vectors.blocks import later, line, make_file, make_layer, pattern
 
 from pd4dgs_codec import decode, open_stream
 from pd4dgs_codec.errors import ChecksumMismatch
+from pd4dgs_codec.format.container import FLAG_ANCILLARY
 
 SLICES, ROWS = 120, 64
 
@@ -72,6 +75,21 @@ def test_any_split_takes_the_time_and_memory_of_decoding(split):
     found_seconds, found_peak = cost(lambda: streamed(cuts, keep=1), 2)
     assert found_seconds <= 3 * seconds
     assert found_peak <= 1.5 * peak
+
+
+def test_bytes_that_are_skipped_take_a_constant_a_piece():
+    """Of a chunk of a type to come, decode takes the checksum alone, so that multiples of its time promise nothing."""
+    parts = take_apart(small_file())
+    data = put_together(replace(parts, chunks=[*parts.chunks, Chunk(99, FLAG_ANCILLARY, bytes(300_000))]))
+
+    def fed() -> None:
+        stream = open_stream()
+        for at in range(len(data)):
+            stream.feed(data[at : at + 1])
+        stream.finish()
+
+    seconds, found = cost(lambda: decode(data), 3)[0], cost(fed, 1)[0]
+    assert found <= 3 * seconds + 5e-6 * len(data)
 
 
 @pytest.mark.parametrize("split", SPLITS)

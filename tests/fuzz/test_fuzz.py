@@ -88,7 +88,7 @@ def exceptions():
     """Weights that are exceptions, of two bytes each."""
     ones = [np.ones(shape, np.int32) for shape in ((300, 2), 300, (300, 300), 300, (1, 300), 1)]
     chains = {0: ones, 1: (2, 7), 2: (2, 3)}
-    return make_file(make_layer(chains=chains, choose=lambda which, piece, *_: Prior(piece != "chains"))).data()
+    return make_file(make_layer(chains=chains, choose=lambda piece, *_: Prior(piece != "chains"))).data()
 
 
 def predicted_rows():

@@ -233,6 +233,12 @@ def test_broken_plys(tmp_path, cli):
     for size, held in ((1e39, "inf"), (1e-46, "0")):
         assert f"the voxel size is {held} in binary32" in _fails(tmp_path, cli, "--voxel-size", size)
     assert "several anchors lie in voxel [0, 0, 0] of 1e+30" in _fails(tmp_path, cli, "--voxel-size", 1e30)
+    far = Checkpoint(voxel=2**-7)
+    far.anchor[:2, 0] = -(2**13), 2**13  # farther apart than in any slice
+    far.write(tmp_path / "run")
+    assert "model.pt: the model cannot be stored: positions span 2097153 voxels" in _fails(
+        tmp_path, cli, "--voxel-size", 2**-7
+    )
     theirs.anchor[7] = theirs.anchor[3]  # such a checkpoint could not be encoded
     theirs.write(tmp_path / "run")
     assert "several anchors lie in voxel [" in _fails(tmp_path, cli)

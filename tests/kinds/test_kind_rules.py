@@ -183,11 +183,11 @@ def test_layers_without_grids_and_chains_have_no_deformation():
 
 def test_old_drafts_are_refused_in_one_line():
     data = bytearray(small_file())
-    data[8] = 3
-    with pytest.raises(DecodeError, match=r"format version 3.0, .* reads 4.x; drafts before 4.0 .* encode .* again"):
+    data[8] = 4
+    with pytest.raises(DecodeError, match=r"format version 4.0, .* reads 5.x; drafts before 5.0 .* encode .* again"):
         decode(bytes(data))
-    data[8] = 5
-    with pytest.raises(DecodeError, match=r"format version 5.0, this decoder reads 4.x \(offset 8\)$"):
+    data[8] = 6
+    with pytest.raises(DecodeError, match=r"format version 6.0, this decoder reads 5.x \(offset 8\)$"):
         decode(bytes(data))
 
 

@@ -100,15 +100,17 @@ def test_no_camera_and_no_anchors(tmp_path):
 
 
 def test_anchors_beyond_the_limits_of_the_format_are_not_saved(tmp_path):
-    """Such a checkpoint replaces none; anchors at a limit come back and are in a file too."""
+    """Such a checkpoint replaces none; anchors at a limit come back and are in a file too. Those at both limits of an
+    axis are farther apart than in any slice."""
     path, given = tmp_path / "m.pt", model()
     given.anchor_q[1] = MAX_VOXEL
     checkpoint.save(path, given)
     assert decode(encode(to_scene(checkpoint.load(path)[0]), effort=1)).anchor_q.max() == MAX_VOXEL
     before = path.read_bytes()
-    given.anchor_q[1] += 1
-    with pytest.raises(DataError, match="m.pt: the model cannot be stored: anchor_q: voxel index of magnitude 1048577"):
-        checkpoint.save(path, given)
+    for beyond, says in ((1, "anchor_q: voxel index of magnitude 1048577"), (0, "positions span 2097153 voxels")):
+        given.anchor_q[1, 0], given.anchor_q[2, 0] = MAX_VOXEL + beyond, -MAX_VOXEL
+        with pytest.raises(DataError, match=f"m.pt: the model cannot be stored: {says}"):
+            checkpoint.save(path, given)
     assert path.read_bytes() == before and os.listdir(tmp_path) == ["m.pt"]
 
 

@@ -268,7 +268,7 @@ def test_playback_moves_anchors_as_the_model_does(channels):
     points = np.random.default_rng(4).uniform(-2, 2, (200, 3)).astype(np.float32)
     points[:2] = BOX
     columns, scene = model.widths.head_columns, to_scene(model)
-    rows = torch.zeros(len(points), columns["scaling"].stop)
+    rows = torch.zeros(len(points), columns["offset"].stop)
     rows[:, :3] = torch.from_numpy(points)
     for level in (1, 2):
         for t in (-0.5, 0.0, 0.123, 0.5, 1.0, 2.0):
@@ -295,7 +295,7 @@ def test_heads_of_one_quantity_add_to_the_same_columns(monkeypatch, deep, kernel
 
     def residuals(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
         given = Deformation(planes, {name: networks[name] for name in ("trunk", *names)})
-        field, played = DeformationField.from_arrays(given, BOX), np.zeros((20, columns["scaling"].stop), np.float32)
+        field, played = DeformationField.from_arrays(given, BOX), np.zeros((20, columns["offset"].stop), np.float32)
         Field(given, BOX, columns).move(played, points, t)
         still, at = torch.zeros(played.shape), torch.from_numpy(points)
         moved = field.moved(still, lambda time: field.planes(at, time), columns, t, None, kernels)

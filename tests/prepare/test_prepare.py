@@ -101,6 +101,24 @@ def test_pictures_that_changed_since_an_interruption_are_read_anew(tmp_path, mon
                 Image.fromarray(255 - np.asarray(Image.open(file))).save(file)  # the folder stays as it was
 
 
+def test_what_a_stopped_run_left_damaged_is_made_anew(tmp_path, monkeypatch, capsys):
+    frames, work = write(tmp_path / "frames", walk(COUNT)[0]), tmp_path / "out.partial"
+    monkeypatch.setattr(poses, "extract", Mock(side_effect=KeyboardInterrupt))
+
+    def run() -> str:
+        assert main([str(frames), "-o", str(tmp_path / "out")]) == 1
+        assert "interrupted; the same command resumes from" in capsys.readouterr().err
+        return (work / "frames.json").read_text()
+
+    stored, picture = run(), work / "images" / "frame_000003.png"
+    elsewhere = stored.replace('"frame_000003.png"', '"../colmap.db"')
+    for name, content in (("frames.json", "[]"), ("frames.json", elsewhere), ("prepare.json", "[" * 100_000)):
+        (work / name).write_text(content)
+        assert run() == stored
+    picture.unlink()
+    assert run() == stored and picture.is_file()
+
+
 def test_a_second_run_on_one_output_is_refused_and_leaves_the_first_alone(tmp_path, monkeypatch, capsys):
     frames, work = write(tmp_path / "frames", walk(COUNT)[0]), tmp_path / "out.partial"
     codes = []

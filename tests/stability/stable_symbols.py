@@ -142,7 +142,7 @@ CHANNELS = [
 
 def _coded(*arrays: np.ndarray, priors: str = "best", effort: int = 5) -> tuple[bytes, bytes]:
     writer = channels.ChannelWriter(priors, effort)
-    writer.write(arrays, [])
+    writer.write(arrays)
     return writer.finish()[:2]
 
 
@@ -151,7 +151,7 @@ def _lost_symbols(*arrays: np.ndarray) -> Found:
     for priors, effort in SETTINGS:
         codes, stream = _coded(*arrays, priors=priors, effort=effort)
         reader = channels.ChannelReader(codes, stream, sum(a.size for a in arrays))
-        wrong += int((reader.read([a.size for a in arrays], []) != np.concatenate(arrays)).sum())
+        wrong += int((reader.read([a.size for a in arrays]) != np.concatenate(arrays)).sum())
         reader.finish()
         sizes.append(len(codes) + len(stream))
     return f"{wrong} wrong symbols, {' / '.join(f'{s:,}' for s in sizes)} bytes", float(wrong)

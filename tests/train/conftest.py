@@ -6,7 +6,6 @@ from tiny import TINY, disc
 from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.model.config import PRESETS
 from pd4dgs_codec.train import phases
-from pd4dgs_codec.train.phases import levels, opening
 
 
 @pytest.fixture
@@ -22,5 +21,3 @@ def _few_anchors(monkeypatch):
 @pytest.fixture
 def short_runs_have_phases(monkeypatch):
     monkeypatch.setattr(phases, "MIN_ITERATIONS", 10)
-    monkeypatch.setattr(opening, "MIN_TRIAL", 6)
-    monkeypatch.setattr(levels, "MIN_PRACTICE", (3, 3))

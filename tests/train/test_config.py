@@ -37,7 +37,7 @@ def test_options_out_of_range_are_refused(bad, message):
 
 
 def test_a_stored_configuration_comes_back():
-    config = TrainConfig(iterations=7, background=(0.0, 0.5, 1.0), **ABLATIONS["tmc"])
+    config = TrainConfig(iterations=7, background=(0.0, 0.5, 1.0), **ABLATIONS["binary"])
     assert TrainConfig.from_json(config.to_json(), "m.pt") == config
     for broken in ("[", "[]", '{"colour": 1}', '{"iterations": [5]}', '{"background": [0, "a", 1]}'):
         with pytest.raises(TrainError, match="m.pt: its stored configuration"):
@@ -65,7 +65,7 @@ def test_the_step_scale_moves_features_scalings_and_planes_only():
 
 def test_the_schedule_is_the_papers_at_its_own_length():
     s = Schedule(30_000)
-    assert (s.progressive, s.rho_every, s.coarse_end, s.rounding) == (10_000, 200, 3_000, 20_000)
+    assert (s.progressive, s.rho_every, s.coarse_end, s.rounding) == (10_000, 300, 3_000, 20_000)
     assert s.grow.start > 500 and s.grow.stop == 15_001
     assert s.phases_not_reached(30_000) == Schedule(4).phases_not_reached(4) == []
     assert s.phases_not_reached(27_000)[0] == "exact rounding of attributes"

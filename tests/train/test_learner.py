@@ -53,13 +53,11 @@ def test_until_n_is_known_steps_stay_in_the_coarse_phase(dataset):
     [
         ("rate", {"rate", "global_rate_proxy"}),
         ("planes", {"global_rate_proxy"}),
-        ("binary", {"tmc_binary"}),
-        ("smooth", {"tmc_smooth"}),
-        ("tmc", {"tmc_binary", "tmc_smooth"}),
+        ("binary", {"binary"}),
     ],
 )
 def test_an_ablation_takes_out_its_terms_alone(dataset, part, gone):
-    terms = {"rate", "tmc_binary", "tmc_smooth", "global_rate_proxy"}
+    terms = {"rate", "binary", "global_rate_proxy"}
     steps = learner(dataset, 3, rollout="all", **ABLATIONS[part])
     records = [steps.step() for _ in range(3)]
     assert terms & set(records[-1]) == terms - gone

@@ -18,7 +18,6 @@ from pd4dgs_codec.model.model import to_scene
 from pd4dgs_codec.train import loop, phases
 from pd4dgs_codec.train.config import ABLATIONS, TrainConfig
 from pd4dgs_codec.train.loop import RecordLog, Trainer
-from pd4dgs_codec.train.phases import opening
 from pd4dgs_codec.train.phases.prune import Prune
 from pd4dgs_codec.train.schedule import PRUNING_ROUNDS, Schedule
 
@@ -27,7 +26,7 @@ def test_it_learns_and_logs_every_term(dataset, tmp_path):
     records = records_of(trainer_of(dataset, 90), tmp_path)
     assert [r["iteration"] for r in records] == list(range(90))
     assert np.mean([r["l1"] for r in records[-10:]]) < 0.6 * np.mean([r["l1"] for r in records[:5]])
-    assert {"l1", "dssim", "volume", "rate", "tmc_binary", "tmc_smooth", "rho", "pi", "anchors"} <= set(records[-1])
+    assert {"l1", "dssim", "volume", "rate", "binary", "rho", "pi", "anchors"} <= set(records[-1])
     assert all(r["level"] == 0 for r in records[: Schedule(90).coarse_end])
     assert {r["level"] for r in records} == {0, 1, 2}
     assert "rate" not in records[Schedule(90).progressive - 1] and "rate" in records[Schedule(90).progressive]
@@ -95,7 +94,6 @@ def timed(dataset, monkeypatch, clock, machine, limit: float = LIMIT) -> Trainer
     """A timed run whose steps and evaluations take the clock's time, and which is never too short to prune."""
     monkeypatch.setattr(loop, "TIMED_STEPS", 6)
     monkeypatch.setattr(phases, "MIN_ITERATIONS", 0)
-    monkeypatch.setattr(opening, "MIN_TRIAL", 6)
     trainer = trainer_of(dataset, None, max_seconds=limit)
     step, level_psnr, begun = trainer.learner.step, trainer.learner.level_psnr, clock.now
 

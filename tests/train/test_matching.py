@@ -17,15 +17,15 @@ from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.loop import Trainer
 from pd4dgs_codec.train.phases import matching, opening
 from pd4dgs_codec.train.phases.matching import Points, attraction, moving_points
+from pd4dgs_codec.train.schedule import OPENING_SHARE
 
 WHOLE_TINY = PRESETS["tiny"]  # tests have a smaller one
 
 
 @pytest.fixture
 def short_runs_match(monkeypatch, short_runs_have_phases):
-    """Short runs find points, at any depth; the trial never finds their motion steady."""
-    monkeypatch.setattr(opening, "MIN_TRIAL", 4)
-    monkeypatch.setattr(opening, "_predicted", lambda state: 0.0)
+    """Short runs find points, at any depth; time opens at once."""
+    monkeypatch.setattr(opening, "_error_beyond", lambda state: 1.0 - state.opened)
     monkeypatch.setattr(matching, "AMBIGUOUS", 1.0)
     monkeypatch.setattr(matching, "LEAST_FOUND", 0.0)
     monkeypatch.setattr(matching, "ELSEWHERE", 0.0)
@@ -75,7 +75,7 @@ def test_few_points_are_not_trusted(monkeypatch):
 
 
 def test_views_that_show_nothing_moving_have_no_points(dataset, monkeypatch):
-    monkeypatch.setattr(matching, "MOVED", 2.0)
+    monkeypatch.setattr(matching, "ALIKE", 2.0)
     found, share = moving_points(trainer_of(dataset).learner)
     assert share == 0 and [value.shape for value in found] == [(0,), (0, 3), (0, 3)]
 
@@ -103,18 +103,14 @@ def test_the_nearest_point_of_similar_colour_attracts(dataset):
     assert torch.equal(still, here.position[0])
 
 
-def test_points_far_away_or_of_other_colours_do_not_attract(dataset):
+def test_points_of_other_colours_do_not_attract(dataset):
     learner = trainer_of(dataset).learner
     unit = learner.model.deformations[1].unit
     here, colour = points([[0.0, 0.0, 0.0]], [[0.5, 0.5, 0.5]]), [[0.5, 0.5, 0.5]]
-    far = points([[(matching.STRENGTH[False].reach + 0.01) * unit, 0.0, 0.0]], colour)
     other = points([[0.3 * unit, 0.0, 0.0]], [[0.5 + 3.1 * matching.SAME_COLOUR, 0.5, 0.5]])
-    for there in (far, other):
-        assert float(attraction(learner, 1, here, there).detach()) == 0
-    learner.guided = True
-    assert float(attraction(learner, 1, here, far).detach()) == pytest.approx(
-        matching.STRENGTH[False].reach + 0.01, abs=1e-5
-    )
+    assert float(attraction(learner, 1, here, other).detach()) == 0
+    same = points([[3.0 * unit, 0.0, 0.0]], colour)
+    assert float(attraction(learner, 1, here, same).detach()) == pytest.approx(3.0, abs=1e-5)
 
 
 @pytest.mark.usefixtures("short_runs_match")
@@ -149,7 +145,7 @@ def test_points_are_drawn_without_the_numbers_of_the_other_thread(dataset):
 
 @pytest.mark.usefixtures("short_runs_match")
 def test_steady_motion_needs_no_points(dataset, monkeypatch):
-    monkeypatch.setattr(opening, "_predicted", lambda state: opening.MIN_GAIN)
+    monkeypatch.setattr(opening, "_error_beyond", lambda state: float(state.opened))
     assert not len(trainer_of(dataset, 60, steps=8).learner.match.points.time)
 
 
@@ -159,7 +155,7 @@ def test_points_guide_higher_levels_until_their_term_ends_and_the_run_resumes_bi
     trainer = Trainer(config, dataset)
     records = run_saving(trainer, tmp_path, (9,))  # before the term ends
     assert sum(record.get("moving_points", 0) for record in records)
-    with_it, end = {r["iteration"] for r in records if "match" in r}, matching.STRENGTH[True].until * 40
+    with_it, end = {r["iteration"] for r in records if "match" in r}, OPENING_SHARE * 40
     assert with_it == {r["iteration"] for r in records if r["level"] and r["iteration"] < end} != set()
     assert not len(trainer.learner.match.points.time) and not trainer.learner.guiding
     assert_resumes_bit_for_bit(config, dataset, tmp_path, (9,))

@@ -53,11 +53,11 @@ def test_box_and_depths_span_the_points(room, found):
     assert 0 < found.near < np.percentile(depths[depths > 0], 5) and found.far > np.percentile(depths, 95)
 
 
-def test_no_point_is_found_where_views_are_not_valid(room, found):
+def test_no_point_is_found_where_views_are_not_valid(room):
     left = np.arange(room.train[0].width) < room.train[0].width // 2
     masked = tuple(dataclasses.replace(view, mask=np.tile(left, (view.height, 1))) for view in room.train)
     half = with_points(dataclasses.replace(room, points=None, train=masked), 0.5).points
-    assert 0 < len(half) < len(found.points)
+    assert len(half) > len(masked) * PIXELS / 6
     seen = np.zeros(len(half), bool)
     for view in masked:
         _, column, inside = view.project(*half.T)

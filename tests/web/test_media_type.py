@@ -30,7 +30,7 @@ def _says(*command: str | Path, **environment: str) -> str:
 
 def test_file_knows_scenes_and_their_version(nameless, tmp_path):
     magic = PACKAGING / "pd4.magic"
-    assert _says("file", "-bm", magic, nameless) == "PD4 dynamic Gaussian splats, version 4.0"
+    assert _says("file", "-bm", magic, nameless) == "PD4 dynamic Gaussian splats, version 5.0"
     assert _says("file", "-bm", magic, "--mime-type", nameless) == TYPE
     (tmp_path / "other").write_bytes(nameless.read_bytes().replace(b"\r\n", b"\n", 1))  # as a text transfer breaks it
     assert "PD4" not in _says("file", "-bm", magic, tmp_path / "other")

@@ -24,7 +24,6 @@ from vectors.blocks import (
     LZMA,
     File,
     Grid,
-    Known,
     Layer,
     Prior,
     adding,
@@ -118,21 +117,19 @@ def step(rng: random.Random, values: Sequence[np.ndarray], most: int = 1) -> flo
 
 
 class Chooser:
-    """Chooses priors for the channels of a slice, also of those that the lists have. left: entries it may define."""
+    """Chooses priors for the channels of a slice, also of those that the list has. most: entries of the list."""
 
-    def __init__(self, rng: random.Random, known: Known, left: int):
-        self._rng, self._known, self._left = rng, known, left
-        self._alike = [rng.random() for _ in known]  # how often a channel has a prior of the list
+    def __init__(self, rng: random.Random, known: list[Prior], most: int):
+        self._rng, self._known, self._most = rng, known, most
+        self._alike = rng.random()  # how often a channel has a prior of the list
 
-    def __call__(self, which: int, piece: str, number: int, k: list[int]) -> Prior:
+    def __call__(self, piece: str, number: int, k: list[int]) -> Prior:
         """A choice of `blocks.Choice`."""
-        own, rng = self._known[which], self._rng
-        left = self._left - sum(not other for other in self._known if other is not own)  # each may need one entry
-        if own and (rng.random() < self._alike[which] or left < 2):
+        own, rng = self._known, self._rng
+        left = self._most - sum(prior.n for prior in own)
+        if own and (rng.random() < self._alike or left < 2):
             return rng.choice(own)
-        made = prior(rng, min(k), max(k), min(left, 1 << 14))
-        self._left -= made.n
-        return made
+        return prior(rng, min(k), max(k), min(left, 1 << 14))
 
 
 def prior(rng: random.Random, low: int, high: int, most: int) -> Prior:
@@ -298,12 +295,14 @@ class Maker:
         self.taken = set[tuple[int, ...]]()
         self.codes = self.classes = np.zeros(0, np.int64)  # of the layers so far
         self.of_base = self.codes, self.classes  # of layer 0
+        self.symbols = 0  # of the slices so far and of the base
 
     def over(self) -> Maker:
         """The maker of a file that adds to the layer 0 of what this one has made."""
         made = copy.copy(self)
         made.plan, made.table, made.base, made.adds = copy.copy(self.plan), copy.deepcopy(self.table), False, True
         made.codes, made.classes = self.of_base
+        made.symbols = len(made.codes) * (4 + (made.centres is not None) + sum(c for _, c, _, _ in made.table))
         made.base_rows, made.plan.read, made.mode = len(made.codes), 0, LZMA if self.rng.random() < 0.1 else ANS
         return made
 
@@ -356,7 +355,7 @@ class Maker:
             wide = out
         return made
 
-    def slice(self, number: int, first: bool, known: Known) -> Layer:
+    def slice(self, number: int, first: bool, known: list[Prior]) -> Layer:
         """One slice, which refers to the priors of those before."""
         rng, tables = self.rng, Tables() if not first or (self.adds and number == 0) else self.plan.layer(number)
         if self.bent and tables != Tables() and rng.random() < 0.5:
@@ -379,7 +378,8 @@ class Maker:
         grids = self.grids(replace(tables, grids=dict(sorted(tables.grids.items()))))
         chains = {i: self.chain(*ends) for i, ends in sorted(tables.chains.items())}
         planes, weights = [plane for grid in grids for plane in grid.planes()], sum(chains.values(), [])
-        counted = len(rises) + (4 + graded) * len(cells) + sum(map(np.size, (*rows, *layer_rows, *planes, *weights)))
+        self.symbols += len(rises) + (4 + graded) * len(cells)
+        self.symbols += sum(map(np.size, (*rows, *layer_rows, *planes, *weights)))
         layer = make_layer(
             number,
             cells,
@@ -394,7 +394,7 @@ class Maker:
             chains=chains,
             fill=[near(rng, 0, 255) for _ in range(3)] if rng.random() < 0.2 else None,
             steps=(step(rng, planes), step(rng, weights)),
-            choose=Chooser(rng, known, counted + (1 << 18 if first else 1 << 10)),
+            choose=Chooser(rng, known, self.symbols + (1 << 18)),
             base=self.base_rows if first else 0,
             known=known,
             first=first,
@@ -435,7 +435,7 @@ def made(rng: random.Random, maker: Maker, base: File | None = None) -> File:
     """A file of a maker, whose base is another one."""
     layers = list[Layer]()
     for number in sorted({0, *rng.sample((1, 2), rng.randrange(3))}):
-        known: Known = [[], [], []]
+        known = list[Prior]()
         count = 1 if maker.mode == LZMA else rng.choice((1, 1, 2, 3, rng.choice((5, 12))))
         own = [maker.slice(number, not index, known) for index in range(count)]
         order = morton_order(np.concatenate([x.cells for x in own]))

@@ -185,7 +185,7 @@ def put_together(parts: Parts, header: bytes | None = None) -> bytes:
     fields = {14: None} | {key: value for key, value in parts.header.items() if key != 1}
     try:
         return File(tuple(Framed(c.type, c.packed(), c.flags) for c in parts.chunks), fields, header).data()
-    except (struct.error, IndexError, TypeError) as error:
+    except (struct.error, OverflowError, TypeError) as error:
         raise ValueError("a value without a form") from error
 
 

@@ -1,6 +1,7 @@
 """Writes `.pd4` structures from explicit choices, right or wrong.
 
-This is written from the specification and shares no code with the package, so that a misreading of either is found.
+This is written from the specification and shares no code with the package but the library that packs msgpack, so that
+a misreading of either is found.
 Nothing here searches, fits or rounds: the caller names every prior, predictor and field, or it follows from the symbols
 by a rule on integers, so the bytes are the same on every machine. Lengths, scene ids and CRCs are right unless the
 caller asks for others.
@@ -18,11 +19,12 @@ from dataclasses import dataclass, field, replace
 from functools import cache, cached_property
 from typing import Any
 
+import msgpack
 import numpy as np
 
 from . import lzma2
 
-SIGNATURE, MAJOR = b"\x89PD4\r\n\x1a\n", 4
+SIGNATURE, MAJOR = b"\x89PD4\r\n\x1a\n", 5
 ANS, LZMA = 0, 1
 TOTAL = 1 << 24  # of a frequency table
 PAIRS = {sides: [*itertools.combinations(range(sides), 2)] for sides in range(2, 6)}  # the axes of a grid's planes
@@ -69,33 +71,9 @@ def words(*values: int) -> bytes:
 
 
 def pack(value: Any) -> bytes:
-    """Canonical msgpack (clause 4). struct.error for a number that has no form."""
-    if isinstance(value, bool):
-        return b"\xc3" if value else b"\xc2"
-    if isinstance(value, float):
-        return b"\xca" + struct.pack(">f", value)
-    if isinstance(value, int):
-        if -32 <= value < 128:
-            return bytes([value & 255])
-        wide = max(0, math.ceil(math.log2((value if value >= 0 else -2 * value - 1).bit_length() / 8)))
-        return bytes([(0xCC if value > 0 else 0xD0) + wide]) + struct.pack(
-            ">" + ("BHIQ" if value > 0 else "bhiq")[wide], value
-        )
-    if isinstance(value, str):
-        return _head(len(value.encode()), 0xA0, 32, 0xD9) + value.encode()
-    if isinstance(value, bytes):
-        return _head(len(value), 0, 0, 0xC4) + value
-    if isinstance(value, dict):
-        return _head(len(value), 0x80, 16, 0xDD) + b"".join(pack(x) for pair in value.items() for x in pair)
-    return _head(len(value), 0x90, 16, 0xDB) + b"".join(map(pack, value))
-
-
-def _head(size: int, fix: int, below: int, code: int) -> bytes:
-    """code: of the form with a u8, which lists and maps do not have: they are below 16 or take a u16."""
-    if size < below:
-        return bytes([fix | size])
-    wide = (size > 0xFF or below == 16) + (size > 0xFFFF)
-    return bytes([code + wide]) + struct.pack(">" + "BHI"[wide], size)
+    """Canonical msgpack (clause 4), if the keys of maps ascend. ValueError for a number that has no form."""
+    data: bytes = msgpack.packb(value, use_single_float=True)
+    return data
 
 
 def pattern(*shape: int, low: int = -3, high: int = 3, seed: int = 0) -> np.ndarray:
@@ -158,8 +136,7 @@ def normal(k: int, n: int, si: int, g: int) -> int:
 
 
 SMALL = Prior(-3, 7)
-Choice = Callable[[int, str, int, list[int]], Prior]  #: of a prior, from prior list, piece, number of channel, symbols
-Known = list[list[Prior]]  #: the three prior lists
+Choice = Callable[[str, int, list[int]], Prior]  #: of a prior, from piece, number of channel, symbols
 
 
 def default_prior(k: Sequence[int]) -> Prior:
@@ -177,21 +154,21 @@ def default_prior(k: Sequence[int]) -> Prior:
 
 @dataclass
 class Coder:
-    """Codes channels, whose symbols go to one stream."""
+    """Codes channels, whose symbols go to one stream. known: the prior list, which it extends."""
 
-    known: Known
+    known: list[Prior]
     choose: Choice
     parts: list[tuple[list[int], Prior]] = field(default_factory=list)
 
-    def codes(self, which: int, piece: str, channels: Iterable[np.ndarray]) -> bytes:
+    def codes(self, piece: str, channels: Iterable[np.ndarray]) -> bytes:
         """Tokens, priors and exceptions of channels. A prior that the list has is referred to, and symbols outside its
         window become exceptions."""
-        out, defined = b"", self.known[which]
+        out, defined = b"", self.known
         for number, channel in enumerate(channels):
             k = channel.ravel().tolist()
             if not k:
                 continue
-            prior = self.choose(which, piece, number, k)
+            prior = self.choose(piece, number, k)
             low, end = prior.kmin, prior.kmin + prior.n
             places = [at for at, v in enumerate(k) if not low <= v < end]
             if prior in defined:
@@ -237,32 +214,22 @@ def morton_order(cells: np.ndarray) -> list[int]:
 
 
 def octree(cells: np.ndarray) -> tuple[bytes, list[np.ndarray]]:
-    """Head, counts and channels of int32 [n, 3] in Morton order."""
+    """Head and channels of int32 [n, 3] in Morton order."""
     low = cells.min(axis=0)
     depth = int((cells.astype(np.int64) - low).max()).bit_length()
-    codes, patterns = [morton(cell) for cell in (cells - low).tolist()], dict[int, list[int]]()
+    codes = [morton(cell) for cell in (cells - low).tolist()]
+    patterns = {k: [byte for byte in range(256) if byte.bit_count() == k] for k in range(1, 9)}
     out, channels = zigzag(*low.tolist()) + bytes([depth]), list[list[int]]()
-    counts, only = {k: list[int]() for k in range(2, 9)}, {0: False}
+    indices = list[list[int]]()
     for level in range(depth - 1, -1, -1):
         children = dict[int, list[int]]()
         for node in sorted({code >> 3 * level for code in codes}):
             children.setdefault(node >> 3, []).append(node & 7)
         if len(children) < len(codes):
-            single = [len(own) for own in children.values()].count(1)
-            out += varint(single, sum(map(len, children.values())) - 2 * len(children) + single)
-            channels += [
-                [len(children[node]) - 1 for node in children if only[node] == alone] for alone in (True, False)
-            ]
-        channels.append([own[0] for own in children.values() if len(own) == 1])
-        only = {8 * node + c: len(own) == 1 for node, own in children.items() for c in own}
-        for own in children.values():
-            if len(own) > 1:
-                counts[len(own)].append(sum(1 << c for c in own))
-    for k in range(2, 8) if len(codes) > 1 else ():
-        patterns[k] = [byte for byte in range(256) if byte.bit_count() == k]
-        channels.append([patterns[k].index(byte) for byte in counts[k]])
-        out += varint(len(counts[k]))
-    return out, [np.array(channel, np.int64) for channel in channels]
+            channels.append([len(own) - 1 for own in children.values()])
+        for k, alike in patterns.items():
+            indices.append([alike.index(sum(1 << c for c in own)) for own in children.values() if len(own) == k])
+    return out, [np.array(channel, np.int64) for channel in channels + indices]
 
 
 # -- grids (clauses 8.6, 8.7 and 11.3) ---------------------------------------------------------------------------------
@@ -390,12 +357,11 @@ class Layer:
             "chains": self.chains,
         }
 
-    def written(self, known: Known | None = None) -> Layer:
-        """With its codes and its stream in mode ans. known: the prior lists of the slices before, which it extends."""
-        coder = Coder([[], [], []] if known is None else known, self.choose)
-        coder.known[2].clear()
+    def written(self, known: list[Prior] | None = None) -> Layer:
+        """With its codes and its stream in mode ans. known: the prior list of the slices before, which it extends."""
+        coder = Coder([] if known is None else known, self.choose)
         head, channels = (b"", []) if not len(self.cells) else self.tree or octree(self.cells)
-        pieces = {"positions": head + coder.codes(0, "positions", channels)}
+        pieces = {"positions": head + coder.codes("positions", channels)}
         for piece, channels in self.channels().items():
             if piece == "grids":
                 channels = [*grid_channels(self.residuals)]
@@ -406,7 +372,7 @@ class Layer:
                 of_base = np.arange(channels[0].size) < self.base
                 channels = [channel[own & (classes == q)] for channel in channels for own in (of_base, ~of_base)
                     for q in range(1 if self.classes is None else 7)]  # fmt: skip
-            pieces[piece] = coder.codes(2 if piece in ("grids", "chains") else 1, piece, channels)
+            pieces[piece] = coder.codes(piece, channels)
         return replace(self, pieces=pieces, stream=coder.stream())
 
     def packed(
@@ -490,7 +456,7 @@ def make_layer(
     choose: Choice | None = None,
     tree: tuple[bytes, list[np.ndarray]] | None = None,
     base: int = 0,
-    known: Known | None = None,
+    known: list[Prior] | None = None,
     first: bool = True,
 ) -> Layer:
     """A slice of `cells` (in Morton order) after `before` earlier rows. below: plane channels of the layers below.
@@ -531,7 +497,7 @@ def make_layer(
         grids,
         [array for own in made.values() for array in own],
         {key: value for key, value in meta.items() if value is not None},
-        choose or (lambda _, piece, number, k: priors.get(piece, {}).get(number) or default_prior(k)),
+        choose or (lambda piece, number, k: priors.get(piece, {}).get(number) or default_prior(k)),
         tree,
         base,
     ).written(known)
@@ -678,7 +644,7 @@ def adding(base: File, *layers: Layer, header: Mapping[int, Any] | None = None) 
 
 def slices_of(*parts: Layer) -> File:
     """A file of slices, which refer to the priors of those before."""
-    known: dict[int, Known] = {part.number: [[], [], []] for part in parts}
+    known: dict[int, list[Prior]] = {part.number: [] for part in parts}
     return make_file(*[layer.written(known[layer.number]) for layer in parts])
 
 

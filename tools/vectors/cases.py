@@ -291,17 +291,22 @@ def entries_at_limit(over: int = 0) -> File:
         own = [Prior(-(n >> 1), n, 200 + c) for c, n in enumerate([1 << 14] * 16 + [last])]
         return with_priors({c: own[c if c < 17 else 0] for c in range(68)})
 
-    layer, known = file(2).layer(0), list[list[Prior]]([[], [], []])
+    return file(2 + entries_left(file(2).layer(0)) + over)
+
+
+def entries_left(layer: Layer, later: int = 0) -> int:
+    """How many entries windows may have beside those of layer 0, with so many rows in later slices."""
+    known = list[Prior]()
     layer.written(known)
-    symbols = (68 + 4) * ROWS + sum(map(np.size, layer.chains))
-    return file(2 + (1 << 18) + symbols + over - sum(prior.n for own in known for prior in own))
+    symbols = (68 + 4) * (len(layer.cells) + later) + sum(map(np.size, layer.chains))
+    return (1 << 18) + symbols - sum(prior.n for prior in known)
 
 
 def entries_of_slices(over: int) -> File:
     """A first slice with windows of 2^18 entries, and a second one of as many as it may define, or `over` more."""
     first = make_layer(0, line(1), widths=WIDE, rows=np.zeros((68, 1), np.int32), priors={"rows": {
         c: Prior(min(c, 15) - 20, 1 << 14) for c in range(68)}})  # fmt: skip
-    wide = Prior(-20, (1 << 10) + 72 + over)
+    wide = Prior(-20, entries_left(first, 1) + over)
     return slices_of(first, later(0, line(1, z=4), widths=WIDE, rows=np.ones((68, 1), np.int32),
         codes=[3], choose=lambda *_: wide))  # fmt: skip
 
@@ -361,7 +366,7 @@ def symbols_at_limit(over: int = 0, count: int = 0, graded: bool = False) -> Fil
 
 def rows_at_limit(over: int = 0) -> File:
     """As many anchors as clause 6.5 allows a payload of 600 bytes, or `over` more."""
-    layer = make_layer(0, line((1 << 13) + 2 * 600 + over))
+    layer = make_layer(0, line((1 << 13) + 2 * 600 + over), choose=lambda piece, number, k: Prior(k[0]))
     size = len(pack(layer.parameters())) + 600 - len(layer.payload())
     return make_file(layer).with_chunk(0, payload=layer.padded(size))
 

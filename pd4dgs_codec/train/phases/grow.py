@@ -88,6 +88,7 @@ def _add(statistics: dict[str, Tensor], picture: Picture, views: int) -> None:
 def _opaque(model: Model, statistics: dict[str, Tensor], visited: Tensor) -> Tensor:
     """int64 [n]: the anchors that are neither transparent nor masked out; all if there are none."""
     faint = visited & (statistics["opacity"] < MIN_MEAN_OPACITY * statistics["anchor_visits"])
+    faint[: model.frozen] = False
     keep = (~faint & (model.masks(2).cpu() > MASK_THRESHOLD)).nonzero()[:, 0]
     return keep if len(keep) else torch.arange(len(faint))
 
@@ -128,7 +129,7 @@ def _new_cells(
         grown = torch.full((len(unique), feature.shape[1]), -math.inf)
         grown.scatter_reduce_(0, where[:, None].expand(-1, feature.shape[1]), feature[rows], "amax")
         occupied = torch.div(taken + size // 2, size, rounding_mode="floor")
-        free = ~_contained(torch.div(unique, size, rounding_mode="floor"), occupied)
+        free = ~contained(torch.div(unique, size, rounding_mode="floor"), occupied)
         sized = torch.cat([unique[free], torch.full((int(free.sum()), 1), size)], dim=1)
         found.append((sized, grown[free], strength[free]))
         taken = torch.cat([taken, unique[free]])
@@ -147,7 +148,7 @@ def _inside(model: Model, slots: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     return slots[inside], rows[inside], position[inside]
 
 
-def _contained(rows: Tensor, among: Tensor) -> Tensor:
+def contained(rows: Tensor, among: Tensor) -> Tensor:
     """bool [n]: which int64 rows [n, 3] occur in `among` [m, 3]."""
     _, index = torch.unique(torch.cat([rows, among]), dim=0, return_inverse=True)
     return torch.isin(index[: len(rows)], index[len(rows) :])

@@ -1,8 +1,8 @@
 """Selection of levels: a level of little use is removed for the rest of the run.
 
-A level is compared with the level below on views held back from training, because every level gains on training views.
-Before, the level below, which has had few steps of its own, is trained alone: on a static scene, level 1 is then no
-better. Only pixels that the level changes are compared, so that small objects count as much as large ones.
+A level is compared with a level below on views held back from training, because every level gains on training views.
+Before, the level below, which has had few steps of its own, takes over its anchors and trains alone: on a static scene
+level 0 is then as good. Where level 0 clearly lacks what moves, no comparison is needed.
 """
 
 from __future__ import annotations
@@ -10,41 +10,43 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from statistics import fmean, stdev
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import softplus
+from torch.nn.functional import avg_pool2d, softplus
 
-from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.picture import render
 from pd4dgs_codec.train import phases, workers
 from pd4dgs_codec.train.initialise import TIED
-from pd4dgs_codec.train.optimiser import Optimiser
+from pd4dgs_codec.train.schedule import COARSE_SHARE
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
-#: One in EVERY training views is held back until levels are selected, if these are at least MIN_VIEWS.
-EVERY = 16
-MIN_VIEWS = 4
-#: Levels that move stay if their gains sum to MIN_GAIN_1 dB. Shorter runs, which learn fast motion incompletely, need
-#: less in proportion, from 0 at the first of LEARNING steps to all of it at the second. Level 2 must also gain
-#: MIN_GAIN_2 dB and SHARE_2 of its gain over level 0.
-MIN_GAIN_1, LEARNING, SHARE_2, MIN_GAIN_2 = 1.5, (300, 1160), 0.15, 0.5
-#: A gain counts the pixels in which the level changes a colour by MIN_CONTRAST; if there are fewer than this, it is 0.
-MIN_CONTRAST, MIN_PIXELS = 0.02, 32
-#: Steps for which the level below is trained before: a share of the run, and the fewest for levels 0 and 1. In short
-#: runs level 0 needs more, or level 1 gains on static scenes too.
-PRACTICE, MIN_PRACTICE = 1 / 10, (150, 75)
+#: One in EVERY training views is held back until levels are selected, if these are at least MIN_VIEWS: fewer say little
+#: of a scene, here and wherever views are chosen by time.
+EVERY, MIN_VIEWS = 16, 4
+#: Standard errors by which a level must be better than the one that would take its place: few views are held back.
+NEEDED = 2.0
+#: A picture is visibly wrong if its mean squared error in a block, a part PART of the shorter side, is over LACKS. It
+#: lacks what another picture shows if it is wrong there and its error is MORE times that of the other.
+PART, LACKS, MORE = 1 / 12, 0.02, 4.0
 
-#: A timed run of fewer steps keeps its levels: fast motion is not learnt by then, and nobody asked for so few.
-MIN_TIMED = 1000
+
+class Lack(NamedTuple):
+    """at: the middle of a block, column and row. own, other: mean squared errors there, of which `own` is too large."""
+
+    at: tuple[int, int]
+    own: float
+    other: float
 
 
 class SelectLevels(phases.Phase):
-    """Removes the levels of little use, where planes and weights begin to be rounded.
+    """Removes the levels of little use: those that move, where the rate sets in or growing has ended, if level 0 alone
+    shows nothing visibly wrong; any, where planes and weights begin to be rounded.
 
-    practise: trains a level on trial for a number of steps. left_out: for each removed level, the level, its gain in
-    dB in the pixels that it changes, and the number of views.
+    practise: trains a level on trial for a number of steps. left_out: for each time that levels were removed, the
+    highest one, the level that took its place, and the mean squared errors of both.
     """
 
     def __init__(self, practise: Callable[[int, int], None]) -> None:
@@ -52,57 +54,45 @@ class SelectLevels(phases.Phase):
         self.left_out: list[dict[str, Any]] = []
 
     def due(self, state: TrainState) -> bool:
-        """At `Schedule.rounding`, if views are held back for it and a timed run has not become too slow."""
-        selects = state.reached(state.schedule.rounding) and bool(held_back_views(state))
-        return selects and (state.share is None or state.steps_in(1.0) >= MIN_TIMED)
+        """At `Schedule.progressive`, the first of `Schedule.prune` and `Schedule.rounding`, if views are held back."""
+        starts = state.schedule.progressive, state.schedule.prune.start, state.schedule.rounding
+        return any(map(state.reached, starts)) and bool(held_back_views(state))
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
-        """Removes levels from the highest down, until one stays."""
-        gains: list[float] = []
-        record["level_gains"] = gains
-        while state.model.level:
-            level, views = state.model.level, [state.views[index] for index in sorted(held_back_views(state))]
-            above = max([0.0, *(row["gain"] for row in self.left_out)])  # also before the run was resumed
-            gain, needed = self._gain(state, level, views, above)
-            tested, stays = {level: gain}, gain >= needed
-            if stays and level == 2 and gain < motion_gain(state.steps_in(1.0)):  # level 1 has to show the rest
-                tested[1], needed = self._gain(state, 1, views, gain)
-                stays = tested[1] >= needed
-            gains += tested.values()
-            if stays:
-                break
-            for level, gain in tested.items():
-                drop_level(state.model, state.optimiser, level)
-                self.left_out.append({"level": level, "gain": gain, "views": len(views)})
+        """Removes levels, and logs `left_out`."""
+        views = [state.views[index] for index in sorted(held_back_views(state))]
+        late = state.position >= state.schedule.rounding
+        wrong = workers.alike(lambda: any(_wrong(state, view, state.model.level if late else None) for view in views))
+        if not wrong:
+            self._try(state, 0, views)
+        if late and state.model.level == 2:
+            self._try(state, 1, views)
         record["left_out"] = self.left_out
 
-    def _gain(self, state: TrainState, level: int, views: list[TrainingView], above: float) -> tuple[float, float]:
-        """(the gain of `level` over the level below after a trial, dB in the pixels that it changes; the gain that it
-        needs to stay). The state is restored if the level stays. above: the gain of the level above."""
-        below = max(layer for layer in (0, *state.model.deformations) if layer < level)
-        pictures = [images(state, view, (below, level)) for view in views]
-        acts, with_it = [changes(*pair) for pair in pictures], [shown for _, shown in pictures]
-
-        def gain_over(other: int) -> float:
-            return gain_in(views, acts, [images(state, view, (other,))[0] for view in views], with_it)
-
-        needed = motion_gain(state.steps_in(1.0)) - above
-        if level == 2:
-            needed = max(MIN_GAIN_2, SHARE_2 * workers.alike(lambda: gain_over(0)))
-        if workers.alike(lambda: sum(int(mask.sum()) for mask in acts)) < MIN_PIXELS:
-            return 0.0, needed
-
-        before, logits = state.snapshot(), state.model.mask_logits
+    def _try(self, state: TrainState, below: int, views: Sequence[TrainingView]) -> None:
+        """Trains the level `below` with all anchors. Makes it the highest level if the levels above do not lower the
+        squared error by more than its noise and their bits, which training weighs against an absolute error. Otherwise
+        restores the state."""
+        top, before = state.model.level, state.snapshot()
+        errors = workers.alike(lambda: [error(state, view, top) for view in views])
+        rate = 2 * math.sqrt(fmean(errors)) * state.config.plane_rate * sum(state.plane_bits()[below:])
         with torch.no_grad():
-            logits[:, below] += softplus(logits[:, level])  # the anchors of the level, without its motion
-        gain = math.inf
+            for above in range(below + 1, 3):  # the anchors of these levels, without their motion
+                state.model.mask_logits[:, below] += softplus(state.model.mask_logits[:, above])
+        suffices = False
         try:
-            self._practise(below, max(MIN_PRACTICE[below], state.steps_in(PRACTICE)))
-            gain = workers.alike(lambda: gain_over(below))
+            self._practise(below, state.steps_in(COARSE_SHARE))
+            instead = workers.alike(lambda: [error(state, view, below) for view in views])
+            worse = [after - with_it for after, with_it in zip(instead, errors, strict=True)]
+            suffices = fmean(worse) <= NEEDED * stdev(worse) / math.sqrt(len(worse)) + rate
         finally:  # a picture that is not finite ends the phase, and the level stays
-            if gain >= needed:
+            if not suffices:
                 state.return_to(before)
-        return gain, needed
+        if suffices:
+            for level in range(top, below, -1):
+                drop_level(state, level)
+            row = {"level": top, "kept": below, "error": fmean(errors), "instead": fmean(instead), "views": len(views)}
+            self.left_out.append(row)
 
     def stored(self) -> dict[str, Any]:
         """left_out, as JSON."""
@@ -112,10 +102,38 @@ class SelectLevels(phases.Phase):
         self.left_out = list(json.loads(stored["left_out"]))
 
 
-def motion_gain(steps: int) -> float:
-    """The gain in dB that the levels that move need together in a run of so many steps."""
-    first, last = LEARNING
-    return MIN_GAIN_1 * min(max((steps - first) / (last - first), 0.0), 1.0)
+def _wrong(state: TrainState, view: TrainingView, level: int | None) -> bool:
+    """Whether level 0 lacks something in a view that `level` shows, or, without it, shows anything wrongly."""
+    own = block_errors(view, images(state, view, (0,))[0])
+    other = torch.zeros_like(own) if level is None else block_errors(view, images(state, view, (level,))[0])
+    return worst_block(view, own, other) is not None
+
+
+@torch.no_grad()
+def block_errors(view: TrainingView, image: Tensor) -> Tensor:
+    """[rows, columns], on the CPU: the mean squared errors of a picture [H, W, 3] of a view in blocks."""
+    errors = (view.exposed(image) - view.image).square().mean(-1) * (view.weights > 0)
+    return avg_pool2d(errors[None], block_side(view))[0].cpu()
+
+
+def block_side(view: TrainingView) -> int:
+    """The pixels of a block's side."""
+    return max(4, round(min(view.image.shape[:2]) * PART))
+
+
+def worst_block(view: TrainingView, own: Tensor, other: Tensor) -> Lack | None:
+    """The block in which the errors `own` exceed the errors `other` most, if it lacks something."""
+    lost = (own - other) * ((own > LACKS) & (own > MORE * other))
+    if not lost.numel() or not lost.max() > 0:
+        return None
+    row, column = divmod(int(lost.argmax()), lost.shape[1])
+    x, y = (round((k + 0.5) * block_side(view)) for k in (column, row))
+    return Lack((x, y), float(own[row, column]), float(other[row, column]))
+
+
+def error(state: TrainState, view: TrainingView, level: int) -> float:
+    """The mean squared error of a view at a level."""
+    return view.squared_error(images(state, view, (level,))[0].clamp(0, 1))
 
 
 @torch.no_grad()
@@ -125,28 +143,11 @@ def images(state: TrainState, view: TrainingView, levels: Sequence[int]) -> list
     return [render(state.model, level, view.view.time, view.view.camera, rounding).image for level in levels]
 
 
-def changes(without: Tensor, with_it: Tensor) -> Tensor:
-    """bool [H, W]: the pixels in which a colour differs by MIN_CONTRAST or more between two pictures."""
-    return (without - with_it).abs().amax(-1) >= MIN_CONTRAST
-
-
-def gain_in(
-    views: Sequence[TrainingView], where: Sequence[Tensor | None], without: Sequence[Tensor], with_it: Sequence[Tensor]
-) -> float:
-    """The gain in dB, in squared error, of the pictures `with_it` over the pictures `without`, one of each per view, in
-    the pixels `where`, bool [H, W]; None: in all."""
-    first, second = (
-        sum(view.squared_error(image.clamp(0, 1), mask) for view, mask, image in zip(views, where, drawn, strict=True))
-        for drawn in (without, with_it)
-    )
-    return 10 * math.log10(max(first, 1e-9) / max(second, 1e-9))
-
-
 def held_back_views(state: TrainState) -> set[int]:
     """Indices of the training views that select levels and are unseen until then; none if no level is selected or the
     length of the run is not known yet."""
     config = state.config
-    selects = not config.keep_layers and config.max_layer > 0 and config.rollout != "top" and phases.long_enough(state)
+    selects = not config.keep_layers and state.model.level and config.rollout != "top" and phases.long_enough(state)
     views = set(range(EVERY // 2, len(state.views), EVERY)) if selects else set()
     return views if len(views) >= MIN_VIEWS else set()
 
@@ -157,12 +158,12 @@ def other_views(state: TrainState) -> list[int]:
     return [index for index in range(len(state.views)) if index not in held_back]
 
 
-def drop_level(model: Model, optimiser: Optimiser, level: int) -> None:
+def drop_level(state: TrainState, level: int) -> None:
     """Removes the deformation of `level` from the model and its optimiser, and ties its masks to the level below."""
-    name = {1: "global_deformation", 2: "local_deformation"}[level]
+    model, name = state.model, {1: "global_deformation", 2: "local_deformation"}[level]
     field = getattr(model, name)
     if field is not None:
-        optimiser.forget(field)
+        state.optimiser.forget(field)
         setattr(model, name, None)
     with torch.no_grad():
         model.mask_logits[:, level] = TIED

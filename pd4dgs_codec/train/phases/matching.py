@@ -8,57 +8,44 @@ similar colour attracts each (iterative closest points: Besl and McKay, A method
 Large surfaces slide along themselves in such matches, so the term ends early. `opening` finds steady motion better.
 
 If most of what the views show is elsewhere in level 0, bodies would fade before their motion is learnt. Points then
-guide the run: matching is stronger and longer, pictures of levels 1 and 2 train motion alone at first, and level 0 is
+guide the run: matching is stronger, pictures of levels 1 and 2 train motion alone at first, and level 0 is
 trained near the key instant alone. Where much stands still, it would learn too little from so few pictures.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from pd4dgs_codec.data.view import View
 from pd4dgs_codec.train import phases, workers
-from pd4dgs_codec.train.phases.levels import images, other_views
+from pd4dgs_codec.train.movers import ALIKE
+from pd4dgs_codec.train.phases.levels import MIN_VIEWS, images, other_views
+from pd4dgs_codec.train.schedule import OPENING_SHARE
 from pd4dgs_codec.train.state import TrainState
-from pd4dgs_codec.train.stereo import pixel_rays
+from pd4dgs_codec.train.stereo import AMBIGUOUS, DEPTH_STEPS, LEAST_FOUND, rays_of
 
-
-class Strength(NamedTuple):
-    """weight: of the loss term at the start of a run; it falls to 0 at the share `until` of the run. instants: that a
-    step matches, each with `sample` points of the key instant. reach: the largest distance of a match that attracts."""
-
-    weight: float
-    until: float
-    instants: int
-    sample: int
-    reach: float
-
-
-#: True: if points guide the run (`TrainState.guided`). Otherwise other bodies may be nearer than the right one.
-STRENGTH = {False: Strength(0.4, 0.35, 1, 600, 0.8), True: Strength(2.0, 0.5, 8, 150, math.inf)}
+#: Weights of the loss term at the start of a run, by whether points guide it (`TrainState.guided`). They fall to 0 at
+#: OPENING_SHARE of the run.
+WEIGHT = {False: 0.4, True: 2.0}
+#: Instants that a step matches with the key instant, and points of the key instant for each.
+INSTANTS, SAMPLE = 4, 150
 #: Training views that are searched at most; more views are searched in groups of three, evenly spread.
 MOST_VIEWS = 240
-#: Pixels of a view that are searched, at random, and depths on the ray of each.
-PIXELS, DEPTHS = 400, 64
-#: A pixel shows something that moves if its mean difference from level 0 is MOVED. Its point is at the depth at which
-#: the colours of three views differ least, if by at most CONSISTENT, and if a share of at most AMBIGUOUS of the depths
+#: Pixels of a view that are searched, at random.
+PIXELS = 400
+#: A pixel shows something that moves if its mean difference from level 0 is over ALIKE. Its point is at the depth at
+#: which the colours of three views differ least, if by at most CONSISTENT, and if a share of at most AMBIGUOUS of them
 #: does.
-MOVED, CONSISTENT, AMBIGUOUS = 0.12, 0.16, 0.3
+CONSISTENT = 0.16
 #: Most of what the views show is elsewhere in level 0 if such pixels are at least this share of those that differ from
 #: the background: a body that has moved away changes the pixels that it had and those that it has.
 ELSEWHERE = 1.0
-#: If fewer of the pixels have a point, the camera moves too little between views for their depths to be trusted.
-LEAST_FOUND = 1 / 6
-#: Points of the key instant are those of KEY_VIEWS views around it.
-KEY_VIEWS = 5
 #: A match has the least distance, to which a difference in colour adds COLOUR_WEIGHT times. It attracts if the colours
 #: differ by at most SAME_COLOUR. Distances are in units of the deformation, colour differences are means over RGB.
 COLOUR_WEIGHT, SAME_COLOUR = 4.0, 0.1
@@ -107,8 +94,7 @@ class Match(phases.Phase):
 
     def weight(self, state: TrainState) -> float:
         """The weight of `term` at this step."""
-        strength = STRENGTH[state.guided]
-        return strength.weight * max(0.0, 1 - state.schedule.progress(state.position) / strength.until)
+        return WEIGHT[state.guided] * max(0.0, 1 - state.schedule.progress(state.position) / OPENING_SHARE)
 
     def term(self, state: TrainState, level: int) -> Tensor | None:
         """The mean `attraction` of points of the key instant that `level` moves to other instants; None if there are no
@@ -120,10 +106,10 @@ class Match(phases.Phase):
             return None
         if self._here is None:
             nearest = sorted(self._instants, key=lambda points: abs(float(points.time[0]) - key))
-            self._here = Points.joined(nearest[:KEY_VIEWS])
-        strength, pulls = STRENGTH[state.guided], []
-        for k in torch.randint(len(self._instants), (strength.instants,), generator=generator).tolist():
-            drawn = torch.randint(len(self._here.time), (strength.sample,), generator=generator)
+            self._here = Points.joined(nearest[:MIN_VIEWS])
+        pulls = []
+        for k in torch.randint(len(self._instants), (INSTANTS,), generator=generator).tolist():
+            drawn = torch.randint(len(self._here.time), (SAMPLE,), generator=generator)
             pulls.append(attraction(state, level, self._here.at(drawn), self._instants[k]))
         return torch.stack(pulls).mean()
 
@@ -151,8 +137,7 @@ def attraction(state: TrainState, level: int, here: Points, there: Points) -> Te
         match = (torch.cdist(moved, place) + COLOUR_WEIGHT * contrast).argmin(1)
         alike = contrast.gather(1, match[:, None])[:, 0] <= SAME_COLOUR
     distance = (moved - place[match]).norm(dim=1)
-    near = distance.detach() <= STRENGTH[state.guided].reach
-    found: Tensor = (distance * (alike & near)).mean()
+    found: Tensor = (distance * alike).mean()
     return found
 
 
@@ -190,7 +175,7 @@ def moving_points(state: TrainState) -> tuple[Points, float]:
     found, searched, moving, shown, generator = [], 0, 0, 0, torch.Generator().manual_seed(0)
     for k in range(1, len(order) - 1, stride):
         before, own, after = (evidence(order[j]) for j in (k - 1, k, k + 1))
-        pixels = (own.moved > MOVED).nonzero()
+        pixels = (own.moved > ALIKE).nonzero()
         moving, shown = moving + len(pixels), shown + own.visible
         pixels = pixels[torch.randperm(len(pixels), generator=generator)[:PIXELS]]
         searched += len(pixels)
@@ -204,26 +189,19 @@ def _points(
 ) -> Points:
     """The points of `pixels` (int64 [n, 2], row and column) of view `own`, in the box from `low` to `high` and beyond
     `near`."""
-    viewmat, K = (torch.from_numpy(np.array(matrix)) for matrix in (own.view.viewmat, own.view.K))
-    eye = -viewmat[:3, :3].T @ viewmat[:3, 3]
-    rays = pixel_rays(viewmat[:3, :3], K, *pixels.unbind(1))
-    bounds = torch.stack([(low - eye) / rays, (high - eye) / rays])
-    first, last = bounds.amin(0).amax(1).clamp(min=near), bounds.amax(0).amin(1)
-    depths = first[:, None] + (last - first)[:, None] * ((torch.arange(DEPTHS) + 0.5) / DEPTHS)
-    colour = own.colour[pixels[:, 0], pixels[:, 1]]
-    places = eye + depths[..., None] * rays[:, None]
-    contrast = torch.stack([_contrast(places, colour, other) for other in others]).amax(0)
+    rays, colour = rays_of(own.view, pixels, low, high, near), own.colour[pixels[:, 0], pixels[:, 1]]
+    contrast = torch.stack([_contrast(rays.places, colour, other) for other in others]).amax(0)
     consistent = contrast <= CONSISTENT
     best = contrast.argmin(1, keepdim=True)
-    clear = (first < last) & consistent.gather(1, best)[:, 0] & (consistent.float().mean(1) <= AMBIGUOUS)
-    beside = consistent & ((torch.arange(DEPTHS) - best).abs() <= 3)  # colours hardly tell neighbouring depths apart
-    depth = (depths * beside).sum(1)[clear] / beside.sum(1)[clear]
-    return Points(torch.full_like(depth, own.view.time), eye + depth[:, None] * rays[clear], colour[clear])
+    clear = rays.inside & consistent.gather(1, best)[:, 0] & (consistent.float().mean(1) <= AMBIGUOUS)
+    beside = consistent & ((torch.arange(DEPTH_STEPS) - best).abs() <= 3)  # colours hardly tell neighbours apart
+    place = (rays.places * beside[..., None]).sum(1)[clear] / beside.sum(1)[clear, None]
+    return Points(torch.full_like(place[:, 0], own.view.time), place, colour[clear])
 
 
 def _contrast(places: Tensor, colour: Tensor, other: Evidence) -> Tensor:
     """The mean difference [n, depths] of `colour` [n, 3] from a view's colours at `places` [n, depths, 3]; infinite
     outside the view and where it shows nothing that moves."""
     line, column, inside = map(torch.from_numpy, other.view.project(*places.numpy().transpose(2, 0, 1)))
-    seen = inside & (other.around[line, column] > MOVED)
+    seen = inside & (other.around[line, column] > ALIKE)
     return torch.where(seen, (other.colour[line, column] - colour[:, None]).abs().mean(-1), torch.inf)

@@ -3,8 +3,8 @@
 In views far from the key instant, moving objects are elsewhere, and no gradient leads there. Levels 1 and 2 therefore
 first see views near the key instant, in a window of times that grows until it holds all. Meanwhile their planes are
 linear between few instants, which carries steady motion on to later views. It does not carry on motion to and fro,
-which is learnt less well in a narrow window. A trial decides: if the motion learnt in a narrow window does not predict
-views well outside it, all views take part at once.
+which is learnt less well in a narrow window. So the run tries both: it trains in a narrow window, then instead in all
+views, compares both beyond the window, in views that the first has to predict, and goes on with the better one.
 """
 
 from __future__ import annotations
@@ -16,24 +16,20 @@ import torch
 
 from pd4dgs_codec.data.view import thinned
 from pd4dgs_codec.train import phases, workers
-from pd4dgs_codec.train.phases.levels import gain_in, images
+from pd4dgs_codec.train.phases.levels import images
+from pd4dgs_codec.train.schedule import NEAR_SHARE
 from pd4dgs_codec.train.state import TrainState
 
-#: The window, as a share of the longest time from the key instant: at first, and in the trial.
-FIRST, TRIAL = 1 / 12, 1 / 6
-#: (share, instants): the planes have so many instants while the window is below the share.
-FEW_INSTANTS = ((0.3, 3), (0.5, 5), (0.7, 9), (1.0, 17))
-#: Steps of the trial: a share of the run, and the fewest.
-TRIAL_SHARE, MIN_TRIAL = 1 / 15, 75
-#: Motion predicts if it gains MIN_GAIN dB over the static level 0 in whole pictures, so that missed motion counts, and
-#: half as much half way through the trial, ...
-MIN_GAIN = 4.5
-#: ... over at most VIEWS views whose distance from the key instant is BEYOND, from and to, times the window.
-VIEWS, BEYOND = 24, (1.5, 2.0)
+#: The planes' instants double from 3 to 17 while the window grows, at each of so many parts of it.
+DOUBLINGS = 5
+#: Share of the run for which each branch trains.
+TRIAL_SHARE = 1 / 15
+#: Most views in which they are compared, once to twice as far from the key instant as the window.
+VIEWS = 24
 
 
 class OpenTime(phases.Phase):
-    """Tests once whether motion is steady; if not, opens the window fully. practise: trains a level on trial."""
+    """Decides once whether the window opens gradually or at once. practise: trains a level on trial."""
 
     def __init__(self, practise: Callable[[int, int], None]) -> None:
         self._practise = practise
@@ -43,17 +39,22 @@ class OpenTime(phases.Phase):
         return state.reached(state.schedule.coarse_end) and window(state) < 1
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
-        """Sets `TrainState.opened` if the highest level does not predict motion in a trial, and undoes the trial."""
-        before = state.snapshot()
+        """Trains the highest level in the window, then instead in all views, and goes on with the better branch. Logs
+        the squared errors of both."""
+        before, ends = state.snapshot(), []
+        record["opening_errors"] = errors = []
         try:
-            for needed in (MIN_GAIN / 2, MIN_GAIN):
-                self._practise(state.model.level, max(MIN_TRIAL, state.steps_in(TRIAL_SHARE)) // 2)
-                record["predicted_gain"] = gain = workers.alike(lambda: _predicted(state))
-                state.opened = gain < needed
-                if state.opened:
-                    break
-        finally:
+            for state.opened in (False, True):
+                self._practise(state.model.level, state.steps_in(TRIAL_SHARE))
+                errors.append(workers.alike(lambda: _error_beyond(state)))
+                ends.append(state.snapshot())
+                state.return_to(before)
+        except BaseException:
+            state.opened = False
             state.return_to(before)
+            raise
+        state.opened = errors[True] < errors[False]
+        state.return_to(ends[state.opened])
 
 
 def window(state: TrainState) -> float:
@@ -61,13 +62,13 @@ def window(state: TrainState) -> float:
     without a key instant."""
     if state.opened or state.key is None or not phases.long_enough(state):
         return 1.0
-    return max(TRIAL if state.practising else FIRST, state.schedule.opening(state.position))
+    return max((1 + state.practising) * NEAR_SHARE, state.schedule.opening(state.position))
 
 
 def few_instants(state: TrainState) -> int | None:
     """How many instants the planes have at this step; None: all their cells along time."""
     share = window(state)
-    return next((instants for below, instants in FEW_INSTANTS if share < below), None)
+    return 2 ** min(max(int(share * DOUBLINGS + 0.5), 1), 4) + 1 if share < 1 else None
 
 
 def within(state: TrainState, among: Sequence[int]) -> list[int]:
@@ -83,10 +84,8 @@ def _distance(state: TrainState, index: int) -> float:
 
 
 @torch.no_grad()
-def _predicted(state: TrainState) -> float:
-    """The gain in dB of the highest level over level 0 in views well outside the window of the trial."""
-    least, most = (TRIAL * times for times in BEYOND)
-    far = [index for index in range(len(state.views)) if least < _distance(state, index) <= most]
+def _error_beyond(state: TrainState) -> float:
+    """The squared error of the highest level in views outside the window of the trial."""
+    far = [i for i in range(len(state.views)) if 1 < _distance(state, i) / (2 * NEAR_SHARE) <= 2]
     views = [state.picture(index) for index in thinned(far, VIEWS)]
-    still, moved = ([images(state, view, (level,))[0] for view in views] for level in (0, state.model.level))
-    return gain_in(views, [None] * len(views), still, moved)
+    return sum(view.squared_error(images(state, view, (state.model.level,))[0].clamp(0, 1)) for view in views)

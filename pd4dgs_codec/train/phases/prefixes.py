@@ -42,7 +42,7 @@ class Prefixes(Phase):
 
     def due(self, state: TrainState) -> bool:
         """At `Schedule.rounding`, if a first slice would lack anchors."""
-        trained = long_enough(state) and 0 in state.measured_levels()
+        trained = long_enough(state) and 0 in state.measured_levels() and not state.model.frozen
         return trained and state.reached(state.schedule.rounding) and state.active_anchors()[0] > FEWEST
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:

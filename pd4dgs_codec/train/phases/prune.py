@@ -25,7 +25,7 @@ from pd4dgs_codec.train.schedule import PRUNING_ROUNDS
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
 #: Training views in which an anchor is measured; each round uses others.
-VIEWS = 24
+VIEWS = 12
 #: Mask of an anchor at a level that it has left: below the threshold, so that it is neither drawn there nor coded.
 ABSENT = 1e-3
 
@@ -60,6 +60,7 @@ class Prune(Phase):
         views = state.views.spread(VIEWS, order, self.turn)
         errors = added_error(model, levels, views, state.rounding(noisy=False), omission_error).to(state.device)
         errors[:, round_of(model.anchor_q) != self.turn] = torch.inf
+        errors[:, : model.frozen] = torch.inf
         redundant = least(errors.amax(0), share)
         keep = (~redundant | redundant.all()).nonzero()[:, 0]
         state.keep_anchors(keep)

@@ -11,6 +11,7 @@ quadruples an anchor's squared error and saves the same bits for all anchors, fr
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -26,7 +27,7 @@ from pd4dgs_codec.train.phases.prune import added_error, relative_error
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
 #: Training views in which the error of a step is measured.
-VIEWS = 16
+VIEWS = 8
 #: Halvings of the interval in which the threshold of the classes is searched.
 HALVINGS = 40
 
@@ -43,6 +44,8 @@ class FitQuantisation(phases.Phase):
         model, config, rounding = state.model, state.config, state.rounding(noisy=False)
         levels, views = state.measured_levels(), state.views.spread(VIEWS)
         found: list[int] = []
+        if model.frozen:  # the features are those of the base, and steps are graded if its are
+            config = replace(config, whitening=False, grading=config.grading * bool(model.step_class.any()))
         if config.grading:
             found = grade(model, levels, views, config.grading, rounding)
         if config.whitening:
@@ -60,13 +63,15 @@ def grade(
     model: Model, levels: Sequence[int], views: Sequence[TrainingView], share: float, rounding: Rounding
 ) -> list[int]:
     """Sets the attributes' centres, and step classes whose quantisation adds at most `share` to the squared error of
-    the views at any of the levels, beyond that of class 0. Returns how many anchors each class has."""
-    errors = added_error(model, levels, views, rounding, rounding_error)
+    the views at any of the levels, beyond that of class 0. Returns how many anchors each class has. Centres and classes
+    of frozen anchors stay."""
+    errors = added_error(model, levels, views, rounding, rounding_error)[:, model.frozen :]
     met = errors.isfinite()
     worst = torch.where(met, errors, 0.0).amax(0)  # a level of large error must not set the budget of the others
     classes = classes_within(torch.where(met.any(0), worst, torch.inf), share)
-    model.step_class.copy_(classes)
-    model.centre.copy_(centre(model))
+    model.step_class[model.frozen :] = classes
+    if not model.frozen:
+        model.centre.copy_(centre(model))
     return torch.bincount(classes.long(), minlength=MAX_CLASS + 1).tolist()
 
 
