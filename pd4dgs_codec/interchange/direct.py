@@ -119,8 +119,8 @@ class Packer:
             worth = BIT * next_ * SCALAR_BITS * sum(self.ordered.channels.values())
             leaving = kept & (self._added < worth)
             self._added, joint = absence(self.deciding, kept & ~leaving)
-            if joint > JOINT * next_ / SURE * self.scalars:
-                self._reached = np.inf
+            if joint > JOINT * theta / SURE * self.scalars:
+                self._added = None
                 break
             self._leave[leaving] = self._reached = next_
         own, kept = copy(self), self._leave[self.ordered.rows] > theta
