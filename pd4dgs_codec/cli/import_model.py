@@ -189,7 +189,7 @@ def _text(name: str, made: Imported) -> str:
         rows.append((layer.layer, number(layer.bytes, 0), number(made.psnr.get(layer.layer)), ", ".join(parts)))
     found: list[Any] = [table(("level", "bytes", "dB", "bytes of its parts"), rows)]
     if made.left_out:
-        found.append(f"left out: {made.left_out:,} Gaussians that no view sees")
+        found.append(f"left out: {made.left_out:,} Gaussians that no view needs")
     size = f"{len(made.data):,} bytes, {len(made.data) / made.gaussians:.2f} a Gaussian"
     found.append(f"{name}: {size}; dB against the source from {made.views} other cameras and instants")
     return "\n".join(found)

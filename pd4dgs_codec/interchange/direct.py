@@ -9,6 +9,7 @@ all bases are nearly straight are left out. Layer 2 takes the components that ma
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import replace
 from typing import Any
 
@@ -21,6 +22,7 @@ from pd4dgs_codec.interchange.pack import (
     Ordered,
     Packed,
     Pictures,
+    absence,
     conjugate,
     log_scales,
     logits,
@@ -31,7 +33,7 @@ from pd4dgs_codec.interchange.pack import (
 from pd4dgs_codec.interchange.sampled import Sampled
 from pd4dgs_codec.interchange.splats import evenly, picture
 from pd4dgs_codec.interchange.teacher import Teacher, spread
-from pd4dgs_codec.interchange.tracks import STRAIGHT, Change, Grouping, Motion, layer
+from pd4dgs_codec.interchange.tracks import BIT, STRAIGHT, Change, Grouping, Motion, layer
 from pd4dgs_codec.kinds import splats
 from pd4dgs_codec.kinds.splats import YCOCG, Splats, product
 from pd4dgs_codec.kinds.tracks import Tracks, place
@@ -40,6 +42,10 @@ from pd4dgs_codec.scene import Camera, SceneInfo
 #: One of so many cameras measures the error and does not decide about steps: those that do look better than others. Of
 #: fewer than FEW all decide, and CHECKED of them measure.
 HOLDOUT, FEW, CHECKED = 5, 30, 12
+#: Bits of a scalar, about; the share of the first guess of theta by which Gaussians are left out; and the rounds in
+#: which they are, at twice the theta of the one before: several that hide each other's absence cannot all leave.
+SCALAR_BITS, SURE, ROUNDS = 2.8, 0.25, 5
+JOINT = 0.3  #: the most that those who left may add together, as a share of the error that is aimed at
 #: Windows are precise to PRECISE of the width that all but the share SHORT of them have.
 PRECISE, SHORT = 0.1, 0.01
 
@@ -69,7 +75,8 @@ class Packer:
         last = len(source.times) - 1
         instants = [round(t * last) for t in spread(len(deciding))]
         views = Views(lambda i: source.frame(i, bare=False), deciding, instants)
-        weights = sensitivity(Pictures(views, info.background, info.near))
+        self.deciding = Pictures(views, info.background, info.near)
+        weights = sensitivity(self.deciding)
         step()
         self.cameras = others or evenly(deciding, CHECKED)
         self.times = [model.nearest(t) for t in spread(len(self.cameras))]  # also between samples
@@ -77,13 +84,12 @@ class Packer:
         self.images = Pictures(checked, info.background, info.near).images
         self.ordered = Ordered.of(source.frame(self.key), weights)
         self.grouping: Grouping | None = None
-        self.changes = self._changes() if len(source.times) > 1 else {}
+        self.changes: dict[str, Change] = {}
+        seen = np.bincount(self.ordered.rows, minlength=len(source.means[0])) > 0
+        self._leave, self._reached = np.where(seen, np.inf, 0.0), 0.0  # theta at which each Gaussian leaves
+        self._added: np.ndarray | None = None  # to the error by the absence of each that has not left
+        self._thinned: tuple[float, Packer] | None = None
         step()
-
-    @property
-    def left_out(self) -> int:
-        """Number of the source's Gaussians that no view sees."""
-        return len(self.source.means[0]) - len(self.ordered.rows)
 
     @property
     def scalars(self) -> int:
@@ -92,17 +98,40 @@ class Packer:
 
     def scene(self, psnr: float) -> splats.SplatScene:
         """Returns the scene whose pictures have `psnr` dB against those of the source."""
-        scalars = self.scalars
-        theta = 10 ** (-psnr / 10) / scalars
-        if self.changes and not self.grouping:  # for all qualities: it takes longer than all else
-            places = place(self.ordered.values["position"], self.info.box)
-            self.grouping = Grouping.of(self.changes, places, theta)
+        error = 10 ** (-psnr / 10)
+        own = self._thin(2.0 ** np.floor(np.log2(SURE * error / self.scalars)))
 
         def build(theta: float) -> tuple[splats.SplatScene, float]:
-            scene = self._scene(theta, 10 ** (-psnr / 10))
-            return scene, self._error(scene)
+            scene = own._scene(theta, error)
+            return scene, own._error(scene)
 
-        return matched(build, psnr, theta)
+        return matched(build, psnr, error / own.scalars)
+
+    def _thin(self, theta: float) -> Packer:
+        """Returns the packer of the Gaussians whose absence would add more to the error than their bits are worth."""
+        if self._thinned and self._thinned[0] == theta:  # for several qualities: motion takes longer than all else
+            return self._thinned[1]
+        self._reached = self._reached or theta / 2**ROUNDS
+        while self._reached < theta:
+            kept, next_ = self._leave > self._reached, 2 * self._reached
+            if self._added is None:
+                self._added, _ = absence(self.deciding, kept)
+            worth = BIT * next_ * SCALAR_BITS * sum(self.ordered.channels.values())
+            leaving = kept & (self._added < worth)
+            self._added, joint = absence(self.deciding, kept & ~leaving)
+            if joint > JOINT * theta / SURE * self.scalars:
+                self._added = None
+                break
+            self._leave[leaving] = self._reached = next_
+        own, kept = copy(self), self._leave[self.ordered.rows] > theta
+        own.ordered = self.ordered.taken(kept if kept.any() else ~kept)
+        if len(self.source.times) > 1:
+            own.changes = own._changes()
+        if own.changes:
+            places = place(own.ordered.values["position"], self.info.box)
+            own.grouping = Grouping.of(own.changes, places, theta / SURE)
+        self._thinned = theta, own
+        return own
 
     def _error(self, scene: splats.SplatScene) -> float:
         """Returns the squared error of the pictures that stands for their mean PSNR."""

@@ -41,7 +41,7 @@ Progress = Callable[[str, "int | None"], AbstractContextManager[Callable[[], Non
 @dataclass(frozen=True, eq=False)
 class Imported:
     """A file. psnr: mean over `views` pictures in dB against the source's, by level. gaussians: in the file; left_out:
-    those of the source that no view sees. instants, static, order, matched: see `Sampled`."""
+    those of the source that no view needs. instants, static, order, matched: see `Sampled`."""
 
     data: bytes
     report: Report
