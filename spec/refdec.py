@@ -217,6 +217,7 @@ def read_preamble(data):
     return fields_of, hashlib.sha256(fields_of["identity"]).digest()[:8], 20 + size
 
 
+# 5.5 Digest: "The first 16 bytes of the SHA-256 of the payloads"
 # 5.1 Header map: "The time at 1 MUST NOT precede the time at 0, the background MUST lie in 0..1"
 def read_header(data):
     header = fields(unpack(data), range(1, 16), (1, 2, 3, 4, *range(6, 13), 14), "header")
@@ -250,8 +251,7 @@ def read_reference(value):
 
 # 5.2 Chunk list: "The first type MUST be 0; the types of layers among all entries MUST NOT descend."
 def read_chunk_list(rows, mode):
-    for row in a_list(rows, "the chunk list", 1, 1024):
-        kind, size = a_list(row, "a chunk", 2)
+    for kind, size in (a_list(row, "a chunk", 2) for row in a_list(rows, "the chunk list", 1, 1024)):
         limited(kind, 65535, "a chunk type")
         limited(size, MAX_LENGTH, "a payload's length")
     layers = [kind for kind, _ in rows if kind < 3]
@@ -403,6 +403,7 @@ class Layer:
 
     # 6.4 Channels: "In mode ans a slice codes the channels in this order:"
     # 8.5 Rows by step class: "the base's rows come first, by class, then all others"
+    # 11.2 Rows: "A step class MUST lie in 0..6"
     def decode_ans(self, codes, stream):
         """The voxels and the channels of items 2 to 8, none split."""
         n, graded = self.rows, self.header["graded"]
@@ -479,7 +480,6 @@ class Layer:
 
 
 # 11.2 Rows: "v = s[c] + k·2^c, then s changes" "v MUST lie in −2^23..2^23, else Malformed." "s[j] = v for every j ≥ c"
-# 11.2 Rows: "c counts as 0 in every row"
 def row_values(symbols, classes, centre, predictor):
     last, result = [centre] * 7, []
     for k, c in zip(ranged(symbols, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of a row"), classes):

@@ -78,7 +78,7 @@ class Packer:
         self.deciding = Pictures(views, info.background, info.near)
         weights = sensitivity(self.deciding)
         step()
-        self.cameras = others or evenly(deciding, CHECKED)
+        self.few, self.cameras = not others, others or evenly(deciding, CHECKED)
         self.times = [model.nearest(t) for t in spread(len(self.cameras))]  # also between samples
         checked = Views(model.splats, self.cameras, self.times)
         self.images = Pictures(checked, info.background, info.near).images
@@ -108,11 +108,12 @@ class Packer:
         return matched(build, psnr, error / own.scalars)
 
     def _thin(self, theta: float) -> Packer:
-        """Returns the packer of the Gaussians whose absence would add more to the error than their bits are worth."""
+        """Returns the packer of the Gaussians whose absence would add more to the error than their bits are worth: of
+        all that a view sees if there are few, which would not tell what other views miss."""
         if self._thinned and self._thinned[0] == theta:  # for several qualities: motion takes longer than all else
             return self._thinned[1]
         self._reached = self._reached or theta / 2**ROUNDS
-        while self._reached < theta:
+        while not self.few and self._reached < theta:
             kept, next_ = self._leave > self._reached, 2 * self._reached
             if self._added is None:
                 self._added, _ = absence(self.deciding, kept)

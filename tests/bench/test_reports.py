@@ -185,7 +185,7 @@ def test_latency_of_a_file(scene_pd4, data, capsys, monkeypatch):
 def test_the_image_of_a_sliced_level_is_that_with_all_its_slices(scene):
     data = encode(scene, effort=1, slices=1000)
     first, *_, last = info(data)["layers"]
-    assert len(first["slices"]) > 2  # the third image is of level 0
+    assert len(first["slices"]) > 1  # so the third image is not of level 2
     rate = 8 * len(data) / 1.5
     rows = latency.times(data, rate, 1)
     assert [row["level"] for row in rows] == [0, 1, 2] and rows[2]["bytes"] == last["end"]

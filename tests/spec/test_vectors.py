@@ -32,7 +32,7 @@ LARGE = {"planes-products-over-2-53", "symbols-at-limit", "symbols-over-limit"}
 LARGE |= {"symbols-of-rows-over-limit", "symbols-of-step-classes-over-limit"}
 #: Functions of the reference decoder that check on behalf of their callers.
 HELPERS = {"need", "limited", "registered", "fields", "a_list", "integers", "reals", "a_step", "ranged", "indices_of"}
-HELPERS |= {"unpack", "msgpack_items"}
+HELPERS |= {"table", "unpack", "msgpack_items"}
 
 
 def read(vector):
