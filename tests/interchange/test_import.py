@@ -72,6 +72,16 @@ def test_still_files(tmp_path, cli):
     assert quiet.code == 0 and "300 Gaussians, harmonics of degree 2, static" in quiet.err
 
 
+def test_gaussians_that_are_not_worth_their_bits_are_left_out(tmp_path, monkeypatch, cli):
+    monkeypatch.setattr(imported, "CAMERAS", 40)  # enough to tell what other views would miss
+    splats, dust = body(), body()
+    dust = replace(dust, scales=dust.scales * 0.05, opacities=np.full(300, 0.02, np.float32))
+    both = {name: np.concatenate([getattr(splats, name), getattr(dust, name)]) for name in vars(splats)}
+    (tmp_path / "a.ply").write_bytes(ply_bytes(replace(splats, **both)))
+    found = cli("import_model", tmp_path / "a.ply", "-o", tmp_path / "a.pd4", "--psnr", 40, "--json").json
+    assert found["psnr"]["0"] > 39.5 and 200 < found["gaussians"] < 330
+
+
 def test_frames_in_order_become_tracks(tmp_path, cli):
     out = tmp_path / "scene.pd4"
     result = cli("import_model", sequence(tmp_path / "set"), "-o", out, "--psnr", 40, "--fps", 4, "--json")

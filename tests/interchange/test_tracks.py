@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pd4dgs_codec.data.view import rotation_matrix
-from pd4dgs_codec.interchange.pack import Grid, Pictures, sensitivity, tensors_of, turned, voxels
+from pd4dgs_codec.interchange.pack import Grid, Pictures, absence, sensitivity, tensors_of, turned, voxels
 from pd4dgs_codec.interchange.splats import picture
 from pd4dgs_codec.interchange.tracks import Change, Grouping, _runs, between, knots, layer
 from pd4dgs_codec.kinds.splats import Splats, splats_of, unit
@@ -71,6 +71,24 @@ def test_errors_of_pictures_are_as_predicted(name):
         images = [picture(splats_of(moved), camera, (0.0, 0.0, 0.0)) for camera in cameras]
         found.append(np.mean(np.square(np.subtract(images, pictures.images))))
     assert np.mean(found) == pytest.approx(weights.sum() * values[name].shape[1] * error**2, rel=0.5)
+
+
+def test_the_absence_of_a_gaussian_adds_what_is_predicted():
+    given_, rng = cloud(60), np.random.default_rng(3)
+    cameras = [
+        Camera.look_at(3 * unit(rng.normal(size=3)), np.zeros(3), (0, 0, 1), width=64, height=64) for _ in range(16)
+    ]
+    pictures, kept = Pictures([(camera, given_) for camera in cameras]), np.arange(60) >= 10
+
+    def error(shown):
+        images = [picture(given_.taken(np.flatnonzero(shown)), camera, (0.0, 0.0, 0.0)) for camera in cameras]
+        return np.mean(np.square(np.subtract(images, pictures.images), dtype=np.float64))
+
+    added, before = absence(pictures, kept)
+    exact = np.array([error(kept & (np.arange(60) != i)) for i in range(10, 60)]) - error(kept)
+    assert before == pytest.approx(error(kept), rel=1e-3) and not added[:10].any()
+    assert added[10:].sum() == pytest.approx(exact.sum(), rel=0.3)
+    assert np.corrcoef(added[10:], exact)[0, 1] > 0.8
 
 
 def test_gaussians_that_pictures_depend_on_less_get_coarser_steps_within_bounds():
