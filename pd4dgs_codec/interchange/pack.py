@@ -131,8 +131,8 @@ def sensitivity(pictures: Pictures) -> Tensors:
 
 def absence(pictures: Pictures, kept: np.ndarray) -> tuple[np.ndarray, float]:
     """Returns (by how much the mean squared error of pictures that show only the Gaussians `kept`, bool [n], grows if
-    one more leaves them: float64 [n], 0 for the others; this error). Exact up to the random signs of `sensitivity`, since
-    a picture is linear in the opacity of one Gaussian."""
+    one more leaves them: float64 [n], 0 for the others; this error). Exact up to the random signs of `sensitivity`,
+    since a picture is linear in the opacity of one Gaussian."""
     rng, total, rows, error = np.random.default_rng(0), np.zeros(len(kept)), np.flatnonzero(kept), 0.0
     for (camera, splats), truth in zip(pictures.views, pictures.images, strict=True):
         own = splats.taken(rows)
