@@ -44,7 +44,7 @@ from pd4dgs_codec.scene import Camera, SceneInfo
 HOLDOUT, FEW, CHECKED = 5, 30, 12
 #: Bits of a scalar, about; the share of the first guess of theta by which Gaussians are left out; and the rounds in
 #: which they are, at twice the theta of the one before: several that hide each other's absence cannot all leave.
-SCALAR_BITS, SURE, ROUNDS = 2.8, 0.25, 5
+SCALAR_BITS, SURE, ROUNDS = 2.8, 0.25, 7
 JOINT = 0.3  #: the most that those who left may add together, as a share of the error that is aimed at
 #: Windows are precise to PRECISE of the width that all but the share SHORT of them have.
 PRECISE, SHORT = 0.1, 0.01
