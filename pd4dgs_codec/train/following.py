@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from pd4dgs_codec.data.view import Dataset, thinned
-from pd4dgs_codec.train.movers import AGREE, ALIKE, CELLS, NEAR, Picture
+from pd4dgs_codec.train.movers import AGREE, ALIKE, CELLS, NEAR, Photo
 
 #: Views that are searched at most.
 VIEWS = 240
@@ -39,7 +39,7 @@ class Track(NamedTuple):
 @torch.no_grad()
 def followed(dataset: Dataset, points: Tensor, key: float) -> list[Track]:
     """The tracks of the bodies to which `points` [n, 3], world, at the key instant `key` belong; none of what stays."""
-    pictures = [Picture(view) for view in thinned(sorted(dataset.train, key=lambda view: view.time), VIEWS)]
+    pictures = [Photo(view) for view in thinned(sorted(dataset.train, key=lambda view: view.time), VIEWS)]
     cell = float((dataset.box[1] - dataset.box[0]).max()) / CELLS
     near = sorted(pictures, key=lambda picture: abs(picture.time - key))[:NEAR]
     colour = torch.stack([picture.at(points)[0] for picture in near]).median(0).values
@@ -64,7 +64,7 @@ class _Body(NamedTuple):
     points: Tensor
     colour: Tensor
 
-    def alike(self, pictures: Sequence[Picture], time: float, offset: Tensor, speed: Tensor) -> Tensor:
+    def alike(self, pictures: Sequence[Photo], time: float, offset: Tensor, speed: Tensor) -> Tensor:
         """[k]: how alike, 0..1, the points are in the pictures at each of k offsets [k, 3] at `time` and speeds."""
         total = torch.zeros(2, len(offset))
         for picture in pictures:
@@ -75,7 +75,7 @@ class _Body(NamedTuple):
         return total[0] / total[1]
 
 
-def _followed(pictures: Sequence[Picture], points: Tensor, colour: Tensor, key: float, cell: float) -> Track | None:
+def _followed(pictures: Sequence[Photo], points: Tensor, colour: Tensor, key: float, cell: float) -> Track | None:
     """The track of one body; None if it stays where it is."""
     chosen = torch.randperm(len(points), generator=torch.Generator().manual_seed(0))[:SAMPLE]
     body = _Body(points[chosen], colour[chosen])
@@ -87,12 +87,12 @@ def _followed(pictures: Sequence[Picture], points: Tensor, colour: Tensor, key: 
     return Track(points, torch.tensor([time for time, _ in way]), torch.cat([offset for _, offset in way]))
 
 
-def _alike_at(pictures: Sequence[Picture], body: _Body, time: float, offset: Tensor) -> Tensor:
+def _alike_at(pictures: Sequence[Photo], body: _Body, time: float, offset: Tensor) -> Tensor:
     """As `_Body.alike`, in the pictures of one instant."""
     return body.alike([picture for picture in pictures if picture.time == time], time, offset, torch.zeros(1, 3))
 
 
-def _way(pictures: Sequence[Picture], body: _Body, key: float, cell: float) -> list[tuple[float, Tensor]]:
+def _way(pictures: Sequence[Photo], body: _Body, key: float, cell: float) -> list[tuple[float, Tensor]]:
     """(time, offset [1, 3]) of a body at each instant at which it is not lost."""
     size = max(2 * float((body.points - body.points.mean(0)).norm(dim=1).mean()), cell)
     times = sorted({picture.time for picture in pictures})

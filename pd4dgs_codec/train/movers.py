@@ -37,11 +37,11 @@ def moving_starts(dataset: Dataset, key: float) -> Tensor:
     views, none = dataset.train, torch.zeros(0, 3)
     order = sorted(range(len(views)), key=lambda index: abs(views[index].time - key))
     away = [index for index in order if abs(views[index].time - key) >= 2 * NEAR_SHARE]
-    near = [Picture(views[index]) for index in order[:NEAR] if index not in away]
+    near = [Photo(views[index]) for index in order[:NEAR] if index not in away]
     if len(near) <= AGREE or len(away) < OTHERS:
         return none
     eyes = np.stack([-view.viewmat[:3, :3].T @ view.viewmat[:3, 3] for view in views])
-    others: dict[int, Picture] = {}
+    others: dict[int, Photo] = {}
     low, high = torch.from_numpy(np.array(dataset.box, np.float32))
     background = torch.tensor(dataset.background)
     found, owners = [none], [torch.zeros(0, dtype=torch.int64)]
@@ -55,7 +55,7 @@ def moving_starts(dataset: Dataset, key: float) -> Tensor:
         rays = rays_of(own.view, pixels, low, high, dataset.near)
         distance = np.linalg.norm(eyes[away] - rays.eye.numpy(), axis=1)
         beside = [away[k] for k in distance.argsort(kind="stable")[:OTHERS]]
-        others |= {index: Picture(views[index]) for index in beside if index not in others}
+        others |= {index: Photo(views[index]) for index in beside if index not in others}
         still = torch.stack([others[index].contrast(rays.places, colour[:, None]) for index in beside])
         share = (still <= ALIKE).sum(0) / still.isfinite().sum(0).clamp(min=OTHERS // 2)
         moves = rays.inside & (share.amax(1) < STILL)
@@ -75,7 +75,7 @@ def moving_starts(dataset: Dataset, key: float) -> Tensor:
     return points[_found_twice(torch.floor(points / ((high - low).max() / CELLS)), owner)]
 
 
-class Picture:
+class Photo:
     """A view for the search, at most about twice SIZE pixels on the shorter side. colour: float32 [H, W, 3], 0..1,
     means over 3 x 3 pixels. valid: bool [H, W]. time: normalised."""
 

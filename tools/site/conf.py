@@ -55,6 +55,7 @@ CONTENTS = {
         "docs/tutorial",
         "docs/python",
         "docs/training",
+        "docs/constants",
         "docs/encoding",
         "docs/player-and-delivery",
         "docs/interchange",
