@@ -27,10 +27,10 @@ SCENES = """\
   ball flies fast), synthetic:rods (thin rods move), synthetic:bend (a column bends): as in D-NeRF, on white, with a
   camera that jumps between frames and without initial points
   synthetic:random   3 to 8 bodies, a background and a camera path, all drawn from the seed
-  synthetic:NAME?seed=S&size=WxH&frames=N&path=P varies a scene by random seed, image size and number of frames; with
-  seconds=T, static, global, local and fast go on for so long
+  synthetic:NAME?seed=S&size=WxH&frames=N&path=P varies a scene by random seed, image size and number of frames
   (default: 160x120 and 60; on white 100x100 and 150, the dancer 200x200, random 100) and by camera path: pass (once
-  along an arc), sweeps (back and forth), orbit (a full turn), jump (a random pose in each frame) or still (6 cameras)
+  along an arc), sweeps (back and forth), orbit (a full turn), jump (a random pose in each frame) or still (6 cameras);
+  seconds=T makes static, global, local and fast last so long
   teacher:PATH       renderings of explicit Gaussians: a file, folder or run that pd4dgs-import packs, or
                      module:function (a Python function from time to Gaussians)
   teacher:PATH?cameras=SOURCE takes cameras, times and held-out views from another source; otherwise

@@ -102,9 +102,8 @@ class LayerReader:
         self._scene_id = b""
         self.taken = TakenVoxels()
         self._tables = Tables()  # of the first slice of the layer in progress
-        self._known = list[
-            Prior
-        ]()  # of the layer in progress; copied for each slice, so that a fault leaves it unchanged
+        # of the layer in progress; copied for each slice, so that a fault leaves it unchanged
+        self._known: list[Prior] = []
 
     @property
     def complete(self) -> bool:

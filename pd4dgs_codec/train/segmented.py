@@ -71,10 +71,10 @@ def cuts_of(dataset: Dataset, length: float, overlap: float) -> Cuts:
     for k, (start, stop) in enumerate(ranges):
         own = instants[(instants >= start - ROUNDING) & (instants <= stop + ROUNDING)] if stop > start else ()
         if len(own) < 2:
-            low, high = low + k * step, low + (k + 1) * step
+            times = f"{low + k * step:.4g} to {low + (k + 1) * step:.4g} s"
             raise DataError(
-                f"{dataset.name}: segment {k}, {low:.4g} to {high:.4g} s, has training views of {len(own)} instants, "
-                "expected two at least; longer --segments"
+                f"{dataset.name}: segment {k}, {times}, has training views of {len(own)} instants, expected two at "
+                "least; longer --segments"
             )
     return Cuts(tuple(ranges), tuple(views), min(len(dataset.train), BASE_VIEWS))
 
