@@ -86,7 +86,7 @@ SCENES = {
         Scene("flyby", "synthetic:flyby", "a ball flies past a cube, on white, 100 x 100"),
         Scene("dart", "synthetic:dart", "a small ball flies fast, on white, 100 x 100"),
         Scene("rods", "synthetic:rods", "thin rods move, on white, 100 x 100"),
-        Scene("bend", "synthetic:bend", "a column bends, on white, 100 x 100"),
+        Scene("dancer", "synthetic:dancer", "a figure dances with a lantern, on white, 200 x 200"),
         Scene("mutant-200", MUTANT, "D-NeRF, 200 x 200", 4, "small", 8_000, "3dgs"),
         Scene("mutant-400", MUTANT, "D-NeRF, 400 x 400", 2, training=ALL_VIEW, **LARGE),
         Scene("mutant", MUTANT, "D-NeRF, 800 x 800", **LARGE),
@@ -95,7 +95,7 @@ SCENES = {
     )
 }
 #: Where a second kind of scene says more, where it would say little, and where many trainings are compared.
-TWO, ONE, TINY = ("shelf-hand", "mutant-200"), ("shelf-hand",), ("bend",)
+TWO, ONE, TINY = ("shelf-hand", "mutant-200"), ("shelf-hand",), ("flyby",)
 #: The scene of --quick.
 QUICK = Scene("quick", "synthetic:local?size=48x36&frames=4", "a few pixels", iterations=10)
 

@@ -30,7 +30,6 @@ import delivery
 import paper
 import quality
 import refining_gif
-import selection
 from common import QUICK, ROOT, SCENES, Benchmark, Row, Run, available, commit, git, say
 from page import write
 
@@ -41,7 +40,6 @@ from pd4dgs_codec.errors import DataError, Pd4Error
 ALL = (
     quality.BENCHMARK,
     delivery.SLICES,
-    selection.BENCHMARK,
     paper.PAPER,
     paper.DIAL,
     codec.CODERS,

@@ -24,8 +24,8 @@ SCENES = """\
   synthetic:local    large objects move slowly, and small parts of them on their own
   synthetic:fast     fast motion
   synthetic:dancer (a figure dances with a lantern), synthetic:flyby (a ball flies past a cube), synthetic:dart (a small
-  ball flies fast), synthetic:rods (thin rods move), synthetic:bend (a column bends): as in D-NeRF, on white, with a
-  camera that jumps between frames and without initial points
+  ball flies fast), synthetic:rods (thin rods move): as in D-NeRF, on white, with a camera that jumps between frames and
+  without initial points
   synthetic:random   3 to 8 bodies, a background and a camera path, all drawn from the seed
   synthetic:NAME?seed=S&size=WxH&frames=N&path=P varies a scene by random seed, image size and number of frames
   (default: 160x120 and 60; on white 100x100 and 150, the dancer 200x200, random 100) and by camera path: pass (once

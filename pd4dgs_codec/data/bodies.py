@@ -384,31 +384,17 @@ pi = np.pi
 
 @dataclass(frozen=True)
 class Thing:
-    """A body of a scene on white: half sizes, centre, rotation and stretch, as functions of t = 0..1 if they change."""
+    """A body of a scene on white: half sizes, centre and rotation, as functions of t = 0..1 if they change."""
 
     shape: str
     size: Point
     at: Point | Callable[[float], Point | np.ndarray]
     turn: Callable[[float], np.ndarray] = lambda t: np.eye(3)
-    stretch: Callable[[float], float | Point] = lambda t: 1.0
 
     def pose(self, t: float) -> Pose:
         """A and c at an instant."""
         at = self.at(t) if callable(self.at) else self.at
-        return self.turn(t) @ np.diag(np.multiply(self.size, self.stretch(t))), np.asarray(at, float)
-
-
-def _slice(k: int) -> Thing:
-    """The k-th of 10 slices of a column that bends, twists and breathes."""
-
-    def at(t: float) -> Point:
-        angle = 0.11 * k * np.sin(4 * pi * t)
-        return 0.075 * k * np.sin(angle), 0.0, 0.125 * k * np.cos(angle / 2) - 0.6
-
-    def turn(t: float) -> np.ndarray:
-        return np.asarray(rotation(1, 0.14 * k * np.sin(4 * pi * t)) @ rotation(2, 0.11 * k * np.sin(2 * pi * t)))
-
-    return Thing("box", (0.28, 0.28, 0.085), at, turn, lambda t: (w := 1 + 0.25 * np.sin(6 * pi * t - 0.4 * k), w, 1.0))
+        return self.turn(t) @ np.diag(self.size), np.asarray(at, float)
 
 
 #: The bodies of the scenes on white, within 1.2 of the origin.
@@ -430,7 +416,6 @@ THINGS: dict[str, tuple[Thing, ...]] = {
         Thing("box", (0.02, 0.8, 0.02), lambda t: (0.9 * np.cos(2 * pi * t), 0.0, 0.7)),
         Thing("cylinder", (0.03, 0.03, 0.6), (0.6, 0.0, -0.2)),
     ),
-    "bend": tuple(map(_slice, range(10))),  # a column bends, twists and breathes
 }
 
 

@@ -97,7 +97,7 @@ def test_bad_options(blender, refused):
 
 
 SYNTHETIC = {
-    "": "expected synthetic:static|global|local|fast|flyby|dart|rods|bend|dancer|random[?seed=n&size=WxH&frames=N",
+    "": "expected synthetic:static|global|local|fast|flyby|dart|rods|dancer|random[?seed=n&size=WxH&frames=N",
     "Static": "expected synthetic:static",
     "nothing?seed=1": "expected synthetic:static",
     **{
@@ -107,7 +107,7 @@ SYNTHETIC = {
     },
     "static?size=7x160": "size is '7x160'; expected for example size=960x540, each 8 to 8192",
     "static?seconds=0": "seconds is '0'; expected for example seconds=60, 1 to 3600",
-    "bend?seconds=5": "found seconds, expected them of synthetic:static|global|local|fast alone",
+    "rods?seconds=5": "found seconds, expected them of synthetic:static|global|local|fast alone",
     "static?frames=2": "frames is '2'; expected for example frames=300, 3 to 10000",
     **{
         f"static?{query}": "expected each of seed, size, frames, seconds, path once at most, as key=value"
