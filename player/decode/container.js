@@ -1,7 +1,8 @@
 // Clause 3: preamble and chunk frames.
 
 import { DecodeError } from "./errors.js";
-import { crc32, hex, sha256 } from "./digests.js";
+import { crc32, hex } from "./digests.js";
+import { SCENE_ID_SIZE } from "./header.js";
 import { MAX_HEADER, MAX_PAYLOAD } from "./limits.js";
 
 const SIGNATURE = [0x89, 0x50, 0x44, 0x34, 0x0d, 0x0a, 0x1a, 0x0a];
@@ -12,7 +13,6 @@ export const LONGEST_HEADER = PREAMBLE_SIZE + MAX_HEADER;
 const CHUNK_HEAD = 16;
 /** Bytes of a chunk around its payload. */
 export const CHUNK_OVERHEAD = CHUNK_HEAD + 4;
-export const SCENE_ID_SIZE = 8;
 const ANCILLARY = 1;
 const MORE = 2;
 /** Bits 2..5. */
@@ -94,11 +94,6 @@ export function readChunk(bytes, { listed, sceneId, offset, index }) {
     number: flags >> NUMBER_SHIFT,
     payload: bytes.subarray(CHUNK_HEAD, end),
   };
-}
-
-/** The scene id (3.3) in hexadecimal. @param {Uint8Array} described the header's bytes behind its chunk list */
-export function sceneIdOf(described) {
-  return hex(sha256(described).subarray(0, SCENE_ID_SIZE));
 }
 
 /** @param {Uint8Array} bytes @param {number} size @param {string} what @param {number} offset

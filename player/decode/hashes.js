@@ -3,8 +3,8 @@
 import { channelsOf } from "./channels.js";
 import { Column } from "./columns.js";
 import { hex, sha256 } from "./digests.js";
+import { widthOf } from "./fields.js";
 import { readAll } from "./reader.js";
-import { widthOf } from "./rows.js";
 import { mortonOrder } from "./voxels.js";
 /** @import { Slice } from "./slice.js" */
 /** @import { Tensors } from "./tensors.js" */

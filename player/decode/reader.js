@@ -5,7 +5,6 @@ import { CHUNK_OVERHEAD, PREAMBLE_SIZE, readChunk, readPreamble } from "./contai
 import { hex, sha256 } from "./digests.js";
 import { DecodeError, limitExceeded, malformed, unsupported } from "./errors.js";
 import { LAYER_TYPES, readHeader } from "./header.js";
-import { unpack } from "./msgpack.js";
 import { dequantise, rowsOf } from "./rows.js";
 import { LEAST_OWN_CODE, MOST_CODE, chainsOf, decodeSlice, gridsOf } from "./slice.js";
 import { VoxelTable, mortonOrder } from "./voxels.js";
@@ -69,16 +68,18 @@ export class Base {
     const [layer] = this.reader.tensors().layers;
     if (layer.rowTensors.length) throw malformed("the base has layer rows in layer 0, expected none");
     this.header = /** @type {Header} */ (this.reader.header);
-    const parts = [packed.subarray(unpack(packed, "header").firstEntryEnd)];
+    const digests = [this.header.identity];
+    this.bytes = this.header.described;
     let at = PREAMBLE_SIZE + packed.length;
     for (const { type, length } of this.header.chunks) {
-      if (type === 0) parts.push(bytes.subarray(at, at + CHUNK_OVERHEAD + length));
-      at += CHUNK_OVERHEAD + length;
+      const size = CHUNK_OVERHEAD + length;
+      if (type === 0) {
+        digests.push(sha256(bytes.subarray(at, at + size)));
+        this.bytes += size;
+      }
+      at += size;
     }
-    const digests = new Uint8Array(32 * parts.length);
-    parts.forEach((part, i) => digests.set(sha256(part), 32 * i));
-    this.digest = hex(sha256(digests));
-    this.bytes = parts.reduce((sum, { length }) => sum + length, 0);
+    this.digest = hex(sha256(Uint8Array.from(digests.flatMap((digest) => [...digest]))));
     this.rows = layer.codes.length;
     this.taken = new VoxelTable();
     this.taken.add(this.reader.tensors().voxels);
@@ -88,7 +89,7 @@ export class Base {
    * @param {Header} header @param {GivenBase} given */
   static of({ base: named, kind, rows, centres, info: { voxelSize } }, given) {
     if (!named) return null;
-    const wanted = `the file adds to layer 0 of scene ${named.sceneId}`;
+    const wanted = `the file adds to layer 0 of scene ${hex(named.sceneId)}`;
     if (!given) throw new DecodeError("BaseMissing", `${wanted}, and no base is given`);
     let base;
     try {
@@ -98,7 +99,7 @@ export class Base {
       throw new DecodeError(error.kind === "Truncated" ? "BaseMismatch" : error.kind, `the base: ${error.message}`);
     }
     const { header } = base;
-    if (named.sceneId !== header.sceneId || named.digest !== base.digest) {
+    if (hex(named.sceneId) !== header.sceneId || hex(named.digest) !== base.digest) {
       throw new DecodeError("BaseMismatch", `${wanted}, the base given is another one, of scene ${header.sceneId}`);
     }
     if (named.rows !== base.rows || named.bytes !== base.bytes) {
