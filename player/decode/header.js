@@ -60,7 +60,7 @@ export function readHeader(packed) {
   const { chunks, mode, kind, rows, centres, base, ...described } = HEADER(value, "header");
   const layers = chunks.map(({ type }) => type).filter((type) => type < LAYER_TYPES);
   const fall = layers.findIndex((layer, i) => layer < layers[i - 1]);
-  if (fall > 0) throw malformed(`header: layer ${layers[fall]} after layer ${layers[fall - 1]}, expected ascending ones`);
+  if (fall > 0) throw malformed(`header: layer ${layers[fall]} after ${layers[fall - 1]}, expected ascending ones`);
   if (chunks[0].type !== 0) throw malformed(`header: the first chunk is of type ${chunks[0].type}, expected layer 0`);
   const width = widthOf(rows);
   if (centres && centres.length !== width) throw malformed(`header: ${centres.length} centres, expected ${width}`);

@@ -70,7 +70,7 @@ const PARAMETERS = map([1, 2, 3, 4, 5, 6, 7], {
 
 /**
  * The parameters of a slice's payload; all counts are held against the limits and the payload. rises: one for each row
- * of the layers before, in a later slice none. layerRows: those of the layer, with a row for each rise and each own row.
+ * of the layers before, in a later slice none. layerRows: those of the layer, with a row for each rise and own row.
  * declared: by the slices so far, this one included.
  *
  * @param {Uint8Array} payload @param {Pick<Header, "width" | "centres" | "base">} header
