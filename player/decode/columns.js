@@ -20,35 +20,27 @@ export class Column {
     return /** @type {A} */ (this._room.subarray(0, this.rows * this._width));
   }
 
-  /** Makes room for so many more rows. @param {number} count @param {number} growth about how many times as many as with
-   * these there will be */
-  reserve(count, growth) {
-    const rows = this.rows + count;
+  /** Makes room for these rows too. @param {ArrayLike<number>} values @param {number} growth about how many times as
+   * many as with these there will be; of 1 an empty column takes the array itself, which nobody may write to then */
+  reserve(values, growth) {
+    const rows = this.rows + values.length / this._width;
     if (rows * this._width <= this._room.length) return;
-    const { values } = this;
-    this._room = this._allocated(rows, growth);
-    this._room.set(values);
+    if (!this.rows && growth === 1) this._room = /** @type {A} */ (values);
+    else this._grow(rows, growth, this.values);
   }
 
-  /** Becomes an array of whole rows, nobody else's any more, where there were none. @param {A} values */
-  become(values) {
-    this._room = values;
-    this.rows = values.length / this._width;
+  /** @param {ArrayLike<number>} values of whole rows @param {number} growth as in reserve */
+  append(values, growth) {
+    this.reserve(values, growth);
+    if (this._room !== values) this._room.set(values, this.rows * this._width);
+    this.rows += values.length / this._width;
   }
 
-  /** @param {ArrayLike<number>} values of whole rows @param {number} [growth] as in reserve */
-  append(values, growth = 1) {
-    const count = values.length / this._width;
-    this.reserve(count, growth);
-    this._room.set(values, this.rows * this._width);
-    this.rows += count;
-  }
-
-  /** Sorts the rows from `first` on, in a copy. @param {number} first @param {Uint32Array} order @param {number} growth */
+  /** Sorts the rows from `first` on, in a copy. @param {number} first @param {Uint32Array} order
+   * @param {number} growth as in reserve */
   reorder(first, order, growth) {
     const { _width: width, values } = this;
-    this._room = this._allocated(this.rows, growth);
-    this._room.set(values.subarray(0, first * width));
+    this._grow(this.rows, growth, values.subarray(0, first * width));
     let at = first * width;
     for (const row of order) {
       const from = (first + row) * width;
@@ -56,8 +48,21 @@ export class Column {
     }
   }
 
-  /** @param {number} rows @param {number} growth */
-  _allocated(rows, growth) {
-    return new this._type(Math.floor(rows * Math.min(growth, MOST_GROWTH)) * this._width);
+  /** @param {number} rows @param {number} growth @param {Values} values that come along */
+  _grow(rows, growth, values) {
+    this._room = new this._type(Math.floor(rows * Math.min(growth, MOST_GROWTH)) * this._width);
+    this._room.set(values);
   }
+}
+
+/** Arrays one behind the other. @template {Uint8Array | Int32Array} A @param {new (length: number) => A} type
+ * @param {A[]} arrays */
+export function joined(type, arrays) {
+  const all = new type(arrays.reduce((sum, { length }) => sum + length, 0));
+  let at = 0;
+  for (const array of arrays) {
+    all.set(array, at);
+    at += array.length;
+  }
+  return all;
 }

@@ -12,19 +12,14 @@
  *
  * `kind` is the name of clause 15; `offset` the byte offset in the file where the fault was found, `chunk` the index of
  * the chunk at fault in file order, null where they are unknown or the fault lies in no chunk. `reason` is the message
- * without the place; `message` is one line with it.
+ * without the place; `message` is one line with it. `needs`: of Truncated, how many bytes of the file the step takes
+ * that found too few.
  */
 export class DecodeError extends Error {
-  /**
-   * @param {ErrorKind} kind
-   * @param {string} reason what was found, what was expected
-   * @param {{offset?: number | null, chunk?: number | null, needs?: number}} [place] needs: of Truncated, so many bytes
-   * of the file the step takes that found too few
-   */
+  /** @param {ErrorKind} kind @param {string} reason what was found, what was expected
+   * @param {{offset?: number | null, chunk?: number | null, needs?: number}} [place] */
   constructor(kind, reason, { offset = null, chunk = null, needs = 0 } = {}) {
-    const where = [];
-    if (chunk !== null) where.push(`chunk ${chunk}`);
-    if (offset !== null) where.push(`offset ${offset}`);
+    const where = [...(chunk === null ? [] : [`chunk ${chunk}`]), ...(offset === null ? [] : [`offset ${offset}`])];
     super(reason + (where.length ? ` (${where.join(", ")})` : ""));
     this.name = "DecodeError";
     this.kind = kind;
@@ -35,11 +30,11 @@ export class DecodeError extends Error {
   }
 }
 
-/** @param {string} reason @returns {DecodeError} */
-export const malformed = (reason) => new DecodeError("Malformed", reason);
+/** A fault of a kind, at an offset if it is known. @param {ErrorKind} kind */
+const fault = (kind) => (/** @type {string} */ reason, /** @type {number | null} */ offset = null) => {
+  return new DecodeError(kind, reason, { offset });
+};
 
-/** @param {string} reason @returns {DecodeError} */
-export const limitExceeded = (reason) => new DecodeError("LimitExceeded", reason);
-
-/** @param {string} reason @returns {DecodeError} */
-export const unsupported = (reason) => new DecodeError("UnsupportedFeature", reason);
+export const malformed = fault("Malformed");
+export const limitExceeded = fault("LimitExceeded");
+export const unsupported = fault("UnsupportedFeature");

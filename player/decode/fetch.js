@@ -1,6 +1,5 @@
 // A file on a web server, slice by slice: bytes are decoded as they arrive, and a download that is cut resumes.
 
-import { LONGEST_HEADER, PREAMBLE_SIZE, headerLength } from "./container.js";
 import { DecodeError } from "./errors.js";
 import { Stream } from "./stream.js";
 /** @import { Scene } from "../kinds/index.js" */
@@ -90,8 +89,6 @@ export class SceneSource {
     this._requested = { at: 0, received: 0 };
     /** Where the file was fetched anew after damage. */
     this._repairedAt = -1;
-    /** Preamble of the file. */
-    this._head = new Uint8Array(PREAMBLE_SIZE);
     this._gathered = new Uint8Array(GATHERED);
     signal?.addEventListener("abort", () => this._abort(signal.reason), { once: true });
   }
@@ -182,11 +179,7 @@ export class SceneSource {
    * @param {number} maxLayer @param {number | undefined} bytes @param {number} until */
   _end(maxLayer, bytes, until) {
     const { layerEnds: ends, consumed } = this.decoder;
-    if (!ends.length) {
-      // nothing behind the header is decoded before the budget is checked
-      if (this.received < PREAMBLE_SIZE) return PREAMBLE_SIZE;
-      return Math.min(PREAMBLE_SIZE + headerLength(this._head), LONGEST_HEADER);
-    }
+    if (!ends.length) return this.decoder.needs; // nothing behind the header is decoded before the budget is checked
     const limit = bytes ?? MOST_BYTES;
     if (ends[0].end > limit && bytes === undefined && maxLayer >= 0) {
       throw new DecodeError("LimitExceeded", `layer 0 ends at byte ${ends[0].end}, limit ${MOST_BYTES}`);
@@ -264,7 +257,6 @@ export class SceneSource {
       const piece = all ? rest : rest.subarray(0, room);
       body.rest = all ? NOTHING : rest.subarray(room);
       if (!piece.length) continue;
-      if (this.received < PREAMBLE_SIZE) this._head.set(piece, this.received);
       this.received += piece.length;
       this._progress?.(this.received, this.total);
       if (piece.length >= wanted) return piece;

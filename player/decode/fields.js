@@ -1,142 +1,128 @@
-// Typed, bounded access to what msgpack held. Every getter checks type and range (clauses 4 and 15).
+// Readers of what msgpack held: each checks type and range (clauses 4 and 15). The tables of the header (5) and of a
+// slice's parameters (6) are put together from them.
 
 import { limitExceeded, malformed, unsupported } from "./errors.js";
-import { MAX_ID } from "./limits.js";
+import { MAX_CHANNELS, MAX_ID, MAX_KIND, MAX_ROW_CHANNELS, MAX_ROW_TENSORS } from "./limits.js";
 import { Real } from "./msgpack.js";
 /** @import { Value } from "./msgpack.js" */
 
+/** Undefined, where a key is missing, has no type. where: names the value in messages.
+ * @template T @typedef {(value: Value | undefined, where: string) => T} Read */
+
+/** What the readers of a table make. @template {Record<string, Read<any>>} S
+ * @typedef {{[K in keyof S]: ReturnType<S[K]>}} Made */
+
 /** Unknown keys from here on are ignored; unknown ones below change what the file means. */
 const FIRST_IGNORED_KEY = 64;
-const SMALLEST_NORMAL = 2 ** -126;
 
-/**
- * An integer in least..limit.
- *
- * @param {Value | undefined} value @param {number} least @param {number} limit @param {string} where
- */
-export function asInteger(value, least, limit, where) {
-  if (typeof value !== "number") throw malformed(`${where}: ${nameOf(value)}, expected an integer`);
+/** @param {Value | undefined} value @param {string} where @param {string} expected */
+function mistyped(value, where, expected) {
+  let found = value === undefined ? "nothing" : `a ${typeof value}`;
+  for (const [type, name] of NAMES) if (value instanceof type) found = name;
+  return malformed(`${where}: ${found}, expected ${expected}`);
+}
+
+const NAMES = /** @type {const} */ ([[Real, "a real"], [Uint8Array, "bytes"], [Map, "a map"], [Array, "a list"]]);
+
+/** @param {number} least @param {number} limit @returns {Read<number>} */
+export const integer = (least, limit) => (value, where) => {
+  if (typeof value !== "number") throw mistyped(value, where, "an integer");
   if (value > limit) throw limitExceeded(`${where}: ${value}, limit ${limit}`);
   if (value < least) throw malformed(`${where}: ${value}, expected at least ${least}`);
   return value;
-}
+};
 
-/**
- * An integer out of a registry that has 0..count - 1.
- *
- * @param {Value | undefined} value @param {number} count @param {string} where
- */
-export function asRegistered(value, count, where) {
-  const number = asInteger(value, -Infinity, Infinity, where);
+/** An integer out of a registry that has 0..count - 1. @param {number} count @returns {Read<number>} */
+export const registered = (count) => (value, where) => {
+  const number = integer(-Infinity, Infinity)(value, where);
   if (number < 0 || number >= count) throw unsupported(`${where}: ${number}, expected 0..${count - 1}`);
   return number;
-}
+};
 
-/**
- * A list, of `length` items if given.
- *
- * @param {Value | undefined} value @param {string} where @param {number} [length]
- * @returns {Value[]}
- */
-export function asList(value, where, length) {
-  if (!Array.isArray(value)) throw malformed(`${where}: ${nameOf(value)}, expected a list`);
-  if (length !== undefined && value.length !== length) {
-    throw malformed(`${where}: a list of ${value.length}, expected ${length}`);
-  }
-  return value;
-}
+/** An exact binary32 value. @param {number} [least] @param {number} [most] @returns {Read<number>} */
+export const real = (least = -Infinity, most = Infinity) => (value, where) => {
+  if (!(value instanceof Real)) throw mistyped(value, where, "a real");
+  if (value.value >= least && value.value <= most) return value.value;
+  throw malformed(`${where}: ${value.value}, expected ${least}..${most}`);
+};
 
-/** A list of least..limit items. @param {Value | undefined} value @param {number} least @param {number} limit
- * @param {string} where */
-export function asItems(value, least, limit, where) {
-  const list = asList(value, where);
-  asInteger(list.length, least, limit, `${where}: length`);
-  return list;
-}
+/** A step is positive and normal. */
+export const step = real(2 ** -126);
 
-/** @param {Value[]} list @param {number} least @param {number} limit @param {string} where */
-export const asIntegers = (list, least, limit, where) => list.map((item) => asInteger(item, least, limit, where));
-
-/**
- * What `read` makes of each tensor of a table, a list that begins with an id; ids ascend.
- *
- * @template T
- * @param {Value[]} table @param {string} where @param {(id: number, rest: Value[], where: string) => T} read
- */
-export function asTensors(table, where, read) {
-  let last = -1;
-  return table.map((tensor) => {
-    const [id, ...rest] = asItems(tensor, 1, Infinity, where);
-    if (asInteger(id, 0, MAX_ID, `${where}: id`) <= last) throw malformed(`${where}: id ${id} after ${last}`);
-    last = /** @type {number} */ (id);
-    return read(last, rest, where);
-  });
-}
-
-/** @param {Value | undefined} value @param {string} where @returns {number} an exact binary32 value */
-function asReal(value, where) {
-  if (!(value instanceof Real)) throw malformed(`${where}: ${nameOf(value)}, expected a real`);
-  return value.value;
-}
-
-/** These bytes; raises if they are not `size` bytes. @param {Value | undefined} value @param {number} size
- * @param {string} where */
-export function checkBytes(value, size, where) {
-  if (!(value instanceof Uint8Array)) throw malformed(`${where}: ${nameOf(value)}, expected bytes`);
+/** @param {number} size @returns {Read<Uint8Array>} */
+export const bytes = (size) => (value, where) => {
+  if (!(value instanceof Uint8Array)) throw mistyped(value, where, "bytes");
   if (value.length !== size) throw malformed(`${where}: ${value.length} bytes, expected ${size}`);
   return value;
+};
+
+/** @type {Read<any>} */
+export const anything = (value) => value;
+
+/** A list of least..limit items, or of exactly `least`. @template T @param {Read<T>} read reads an item
+ * @param {number} least @param {number} [limit] @returns {Read<T[]>} */
+export const list = (read, least, limit = least) => (value, where) => {
+  if (!Array.isArray(value)) throw mistyped(value, where, "a list");
+  if (least < limit) integer(least, limit)(value.length, `${where}: length`);
+  else if (value.length !== least) throw malformed(`${where}: a list of ${value.length}, expected ${least}`);
+  return value.map((item) => read(item, where));
+};
+
+/** A list with an item for each name. @template {Record<string, Read<any>>} S @param {S} table
+ * @returns {Read<Made<S>>} */
+export const record = (table) => (value, where) => {
+  const items = list(anything, Object.keys(table).length)(value, where);
+  return made(table, (i) => items[i], where);
+};
+
+/** A map with registered keys. @template {Record<string, Read<any>>} S @param {number[]} keys one for each name
+ * @param {S} table @returns {Read<Made<S>>} */
+export const map = (keys, table) => (value, where) => {
+  if (!(value instanceof Map)) throw mistyped(value, where, "a map");
+  for (const key of value.keys()) {
+    if (key < FIRST_IGNORED_KEY && !keys.includes(key)) throw unsupported(`${where}: unknown key ${key}`);
+  }
+  return made(table, (i) => value.get(keys[i]), where);
+};
+
+/** @template {Record<string, Read<any>>} S @param {S} table @param {(i: number) => Value | undefined} valueOf
+ * @param {string} where */
+function made(table, valueOf, where) {
+  const entries = Object.entries(table).map(([name, read], i) => [name, read(valueOf(i), `${where}: ${name}`)]);
+  return /** @type {Made<S>} */ (Object.fromEntries(entries));
 }
 
-/** A step: a real that is positive and normal. @param {Value | undefined} value @param {string} where */
-export function asStep(value, where) {
-  const step = asReal(value, where);
-  if (!(step >= SMALLEST_NORMAL)) throw malformed(`${where}: ${step}, expected a positive normal binary32 value`);
-  return step;
-}
+/** What may be missing. @template T, D @param {Read<T>} read @param {D} missing what is taken then
+ * @returns {Read<T | D>} */
+export const optional = (read, missing) => (value, where) => (value === undefined ? missing : read(value, where));
 
-/** @param {Value | undefined} value */
-function nameOf(value) {
-  if (value === undefined) return "nothing";
-  if (value instanceof Real) return "a real";
-  if (value instanceof Uint8Array) return "bytes";
-  if (value instanceof Map) return "a map";
-  if (Array.isArray(value)) return "a list";
-  return typeof value === "number" ? "an integer" : `a ${typeof value}`;
-}
-
-/** A map of registered keys, with a name for messages. */
-export class Fields {
-  /** @param {Value | undefined} value @param {string} where @param {number[]} known keys */
-  constructor(value, where, known) {
-    if (!(value instanceof Map)) throw malformed(`${where}: ${nameOf(value)}, expected a map`);
-    for (const key of value.keys()) {
-      if (key < FIRST_IGNORED_KEY && !known.includes(key)) throw unsupported(`${where}: unknown key ${key}`);
-    }
-    this.where = where;
-    /** @type {Map<number, Value>} */
-    this.map = value;
+/** A list of 1..limit tensors, whose ids ascend. @template {{id: number}} T @param {Read<T>} read
+ * @param {number} limit @returns {Read<T[]>} */
+export const tensors = (read, limit) => (value, where) => {
+  const found = list(read, 1, limit)(value, where);
+  for (let i = 1; i < found.length; i++) {
+    const [{ id: before }, { id }] = found.slice(i - 1);
+    if (id <= before) throw malformed(`${where}: id ${id} after ${before}`);
   }
+  return found;
+};
 
-  /** @param {number} key */
-  has(key) {
-    return this.map.has(key);
-  }
+export const id = integer(0, MAX_ID);
 
-  /** The value of a key that must be there. @param {number} key @returns {Value} */
-  get(key) {
-    const value = this.map.get(key);
-    if (value === undefined) throw malformed(`${this.where}: key ${key} is missing`);
-    return value;
-  }
+/** A kind's number and parameters, whatever they mean. */
+export const kind = list(integer(0, 65535), 1, MAX_KIND);
 
-  /** @param {number} key @param {string} what */
-  real(key, what) {
-    return asReal(this.get(key), `${this.where}: ${what}`);
-  }
+/** How many predictors of rows 11.2 has. */
+const ROW_PREDICTORS = 3;
+const ROW_TENSOR = { id, channels: integer(1, MAX_CHANNELS), step, predictor: registered(ROW_PREDICTORS) };
 
-  /** @param {number} key @param {number} length @param {string} what */
-  reals(key, length, what) {
-    const where = `${this.where}: ${what}`;
-    return asList(this.get(key), where, length).map((item) => asReal(item, where));
-  }
-}
+/** Tensors of rows of the header or of a layer. @type {Read<Made<typeof ROW_TENSOR>[]>} */
+export const rows = (value, where) => {
+  const found = tensors(record(ROW_TENSOR), MAX_ROW_TENSORS)(value, where);
+  const width = widthOf(found);
+  if (width > MAX_ROW_CHANNELS) throw limitExceeded(`${where}: ${width} channels, limit ${MAX_ROW_CHANNELS}`);
+  return found;
+};
+
+/** Channels of all these tensors. @param {{channels: number}[]} tensors */
+export const widthOf = (tensors) => tensors.reduce((sum, { channels }) => sum + channels, 0);

@@ -6,8 +6,6 @@ import { MAX_SYMBOL } from "./limits.js";
 /** @import { ChannelReader } from "./channels.js" */
 /** @import { PlaneShape } from "./parameters.js" */
 
-/** How many predictors 11.3 has. */
-export const PREDICTORS = 2;
 /** Classes of a plane channel that is split. */
 const CLASSES = 8;
 /** Relative magnitudes of residuals below this come from a table. */

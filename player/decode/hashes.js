@@ -1,10 +1,10 @@
 // Clause 12.4: digests of what a file decodes to.
 
 import { channelsOf } from "./channels.js";
-import { Column } from "./columns.js";
+import { joined } from "./columns.js";
 import { hex, sha256 } from "./digests.js";
+import { widthOf } from "./fields.js";
 import { readAll } from "./reader.js";
-import { widthOf } from "./rows.js";
 import { mortonOrder } from "./voxels.js";
 /** @import { Slice } from "./slice.js" */
 /** @import { Tensors } from "./tensors.js" */
@@ -20,17 +20,6 @@ function digest(arrays) {
   }));
   if (!LITTLE_ENDIAN) for (let at = 0; at < bytes.length; at += 4) bytes.subarray(at, at + 4).reverse();
   return hex(sha256(bytes));
-}
-
-/** One behind the other, from `first` on in another order if given. @template {Uint8Array | Int32Array} A
- * @param {new (length: number) => A} type @param {A[]} arrays @param {Uint32Array | null} [order] @param {number} [first]
- * @returns {A} */
-function joined(type, arrays, order = null, first = 0) {
-  const all = new Column(type, 1);
-  all.reserve(arrays.reduce((sum, { length }) => sum + length, 0), 1);
-  for (const array of arrays) all.append(array);
-  if (order) all.reorder(first, order, 1);
-  return all.values;
 }
 
 /**
@@ -57,14 +46,17 @@ export function hashes(bytes, options = {}) {
  * @param {Slice[]} slices of it */
 function symbolsOf({ header: { width }, voxels, layers }, i, first, slices) {
   const order = slices.length > 1 ? mortonOrder(joined(Int32Array, slices.map((slice) => slice.voxels))) : null;
-  const [{ rises, stepClasses, planes, weights }] = slices;
-  const { codes, rowTensors } = layers[i];
   /** Channels of all slices, which first have so many rows of earlier layers. @param {number} count
    * @param {(slice: Slice) => Int32Array} of @param {number} [earlier] */
   const channels = (count, of, earlier = 0) => {
     const parts = slices.map((slice) => channelsOf(of(slice), count));
-    return Array.from({ length: count }, (_, c) => joined(Int32Array, parts.map((part) => part[c]), order, earlier));
+    return Array.from({ length: count }, (_, c) => {
+      const came = joined(Int32Array, parts.map((part) => part[c]));
+      return order ? came.map((v, k) => (k < earlier ? v : came[earlier + order[k - earlier]])) : came;
+    });
   };
+  const [{ rises, stepClasses, planes, weights }] = slices;
+  const { codes, rowTensors } = layers[i];
   const classes = stepClasses ? channels(1, (slice) => /** @type {Int32Array} */ (slice.stepClasses)) : [];
   const rows = channels(width, (slice) => slice.rows);
   const layerRows = channels(widthOf(rowTensors), (slice) => slice.layerRows, first);

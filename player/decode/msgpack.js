@@ -19,6 +19,20 @@ export class Real {
 
 const UTF8 = /* @__PURE__ */ new TextDecoder("utf-8", { fatal: true, ignoreBOM: true });
 
+/** By first byte: what follows, the bytes of the number before it, and the least number that has no shorter form; of
+ * integers below 0, the least of -1 - n. @type {Record<number, {kind: string, size: number, least: number}>} */
+const FORMS = {};
+for (const [kind, first, sizes, bits] of /** @type {[string, number, number[], number[]][]} */ ([
+  ["bytes", 0xc4, [1, 2, 4], [0, 8, 16]],
+  ["integer", 0xcc, [1, 2, 4, 8], [7, 8, 16, 32]],
+  ["negative", 0xd0, [1, 2, 4, 8], [5, 7, 15, 31]],
+  ["text", 0xd9, [1, 2, 4], [5, 8, 16]],
+  ["list", 0xdc, [2, 4], [4, 16]],
+  ["map", 0xde, [2, 4], [4, 16]],
+])) {
+  sizes.forEach((size, i) => (FORMS[first + i] = { kind, size, least: bits[i] && 2 ** bits[i] }));
+}
+
 /**
  * The one value that `bytes` hold. firstEntryEnd: the offset behind the first entry of the outermost map, 0 if there is
  * none.
@@ -59,37 +73,21 @@ class Reader {
     return rest.reduce((n, byte) => 256 * n + byte, signed && first > 127 ? first - 256 : first);
   }
 
-  /**
-   * An unsigned integer that would not fit in a shorter form.
-   *
-   * @param {number} size bytes: `smallest`, or twice or four times or eight times as many
-   * @param {number} least integer that does not fit in a form without a size @param {number} [smallest]
-   */
-  shortest(size, least, smallest = 1) {
-    const n = this.integer(size);
-    if (n < (size > smallest ? 2 ** (4 * size) : least)) {
-      throw this.fault("a number or length that is not in its shortest form");
-    }
-    return n;
-  }
-
   /** @param {number} depth number of lists and maps around the value @returns {Value} */
   value(depth) {
     const b = this.integer(1);
-    if (b < 0x80) return b;
-    if (b < 0x90) return this.map(b & 15, depth);
-    if (b < 0xa0) return this.list(b & 15, depth);
+    if (b < 0x80 || b >= 0xe0) return b < 0x80 ? b : b - 256;
+    if (b < 0xa0) return this.items(b < 0x90 ? "map" : "list", b & 15, depth);
     if (b < 0xc0) return this.text(b & 31);
-    if (b >= 0xe0) return b - 256;
     if (b === 0xc2 || b === 0xc3) return b === 0xc3;
-    if (b >= 0xc4 && b <= 0xc6) return this.take(this.shortest(1 << (b - 0xc4), 0)).slice();
     if (b === 0xca) return this.real();
-    if (b >= 0xcc && b <= 0xcf) return this.shortest(1 << (b - 0xcc), 128);
-    if (b >= 0xd0 && b <= 0xd3) return this.negative(1 << (b - 0xd0));
-    if (b >= 0xd9 && b <= 0xdb) return this.text(this.shortest(1 << (b - 0xd9), 32));
-    if (b === 0xdc || b === 0xdd) return this.list(this.shortest(2 << (b - 0xdc), 16, 2), depth);
-    if (b >= 0xde) return this.map(this.shortest(2 << (b - 0xde), 16, 2), depth);
-    throw this.fault(`type byte 0x${b.toString(16)}, which canonical msgpack does not have`);
+    if (!FORMS[b]) throw this.fault(`type byte 0x${b.toString(16)}, which canonical msgpack does not have`);
+    const { kind, size, least } = FORMS[b];
+    const n = this.integer(size, kind === "negative");
+    if ((kind === "negative" ? -1 - n : n) < least) throw this.fault("a number or length not in its shortest form");
+    if (kind === "integer" || kind === "negative") return n;
+    if (kind === "bytes") return this.take(n).slice();
+    return kind === "text" ? this.text(n) : this.items(kind, n, depth);
   }
 
   real() {
@@ -97,14 +95,6 @@ class Reader {
     const real = new DataView(buffer, byteOffset).getFloat32(0);
     if (!Number.isFinite(real)) throw this.fault(`${real}, expected a finite real`);
     return new Real(real);
-  }
-
-  /** A negative integer that would not fit in a shorter form. @param {number} size bytes */
-  negative(size) {
-    const n = this.integer(size, true);
-    const least = size > 1 ? -(2 ** (4 * size - 1)) : -32; // of a shorter form
-    if (n >= least) throw this.fault("an integer that is not in its shortest form");
-    return n;
   }
 
   /** @param {number} size bytes */
@@ -117,35 +107,21 @@ class Reader {
     }
   }
 
-  /** @param {number} depth */
-  enter(depth) {
+  /** A list, or a map. @param {string} kind @param {number} size @param {number} depth */
+  items(kind, size, depth) {
     if (depth >= MAX_NESTING) throw this.fault(`lists and maps nested more than ${MAX_NESTING} deep`);
-  }
-
-  /** @param {number} size @param {number} depth */
-  list(size, depth) {
-    this.enter(depth);
     /** @type {Value[]} */
     const list = [];
-    for (let i = 0; i < size; i++) list.push(this.value(depth + 1)); // raises at the end of the bytes
-    return list;
-  }
-
-  /** @param {number} size @param {number} depth */
-  map(size, depth) {
-    this.enter(depth);
     /** @type {Map<number, Value>} */
     const map = new Map();
-    let last = -1;
-    for (let i = 0; i < size; i++) {
-      const key = this.value(depth + 1);
-      if (typeof key !== "number" || key <= last || key > 0xffffffff) {
+    for (let i = 0, last = -1; i < size; i++) {
+      const item = this.value(depth + 1); // raises at the end of the bytes
+      if (kind === "list") list.push(item);
+      else if (typeof item !== "number" || item <= last || item > 0xffffffff) {
         throw this.fault("a key, expected ascending integers from 0 to 2^32 - 1");
-      }
-      last = key;
-      map.set(key, this.value(depth + 1));
+      } else map.set((last = item), this.value(depth + 1));
       if (depth === 0 && i === 0) this.firstEntryEnd = this.at;
     }
-    return map;
+    return kind === "list" ? list : map;
   }
 }

@@ -2,18 +2,14 @@
 
 import { channelsOf, checkRange, groupByClass } from "./channels.js";
 import { malformed } from "./errors.js";
+import { widthOf } from "./fields.js";
 import { MAX_SYMBOL } from "./limits.js";
 /** @import { ChannelReader } from "./channels.js" */
 /** @import { RowTensor } from "./tensors.js" */
 
-/** How many predictors of rows 11.2 has. */
-export const ROW_PREDICTORS = 3;
 /** The one that step classes do not concern. */
 const WHOLE = 2;
 export const STEP_CLASSES = 7;
-
-/** Channels of all these tensors. @param {RowTensor[]} tensors */
-export const widthOf = (tensors) => tensors.reduce((sum, { channels }) => sum + channels, 0);
 
 /**
  * The values in steps of tensors of rows, [channels, count] of all tensors one behind the other.

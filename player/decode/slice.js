@@ -12,10 +12,11 @@ import { STEP_CLASSES, decodeRows, dequantise } from "./rows.js";
 /** @import { RowTensor } from "./tensors.js" */
 
 /**
- * What earlier slices leave to those behind them. classes: the step classes of all rows so far, empty if rows have none.
+ * What earlier slices leave to those behind them. classes: the step classes of all rows so far, null if rows have none.
  * layer: what the slices of the same layer before left, null if there are none.
  *
- * @typedef {{declared: Declared, classes: Uint8Array, layer: {rowTensors: RowTensor[], priors: Prior[]} | null}} Before
+ * @typedef {{declared: Declared, classes: Uint8Array | null, layer: Known | null}} Before
+ * @typedef {{rowTensors: RowTensor[], priors: Prior[]}} Known
  *
  * The symbols of a slice with n rows of its own and E earlier ones, none in a later slice of its layer. Of rows they are
  * the values in steps (11.2), of planes the samples (11.3).
@@ -42,15 +43,14 @@ export const MOST_CODE = 255;
 /**
  * The symbols of a slice's payload, each in the range that 11 allows.
  *
- * @param {Uint8Array} payload @param {number} layer @param {Header} header
- * @param {Before} before the slice's priors are added to those of its layer
+ * @param {Uint8Array} payload @param {number} layer @param {Header} header @param {Before} before
  * @returns {Slice}
  */
 export function decodeSlice(payload, layer, header, before) {
   const known = before.layer;
   const parameters = readParameters(payload, header, before.declared, known?.rowTensors ?? null, layer);
   const { rows: n, rises: earlier, grids, chains, codes: bytes, stream, declared } = parameters;
-  const priors = known?.priors ?? [];
+  const priors = [...(known?.priors ?? [])];
   const reader = new ChannelReader(bytes, stream, priors, declared.symbols + FREE_ENTRIES);
   const voxels = n ? decodePositions(reader, n) : new Int32Array(0);
   const rises = reader.read(earlier, 0, layer ? MOST_CODE : 1, "a rise of a mask code");
@@ -58,8 +58,8 @@ export function decodeSlice(payload, layer, header, before) {
   const stepClasses = header.centres && reader.read(n, 0, STEP_CLASSES - 1, "a step class");
   const rows = decodeRows(reader, header.rows, n, stepClasses, header.centres);
   const classes = stepClasses && new Uint8Array(earlier + n);
-  classes?.set(before.classes.subarray(0, earlier));
-  classes?.set(/** @type {Int32Array} */ (stepClasses), earlier);
+  if (earlier && before.classes) classes?.set(before.classes);
+  if (stepClasses) classes?.set(stepClasses, earlier);
   const base = known ? 0 : header.base?.rows;
   const layerRows = decodeRows(reader, parameters.layerRows, earlier + n, classes, null, base);
   const planes = decodePlanes(reader, grids.list.flatMap((grid) => grid.planes));

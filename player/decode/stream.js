@@ -1,45 +1,23 @@
 // Clause 12.3: bytes as they arrive, to scenes.
 
 import { RULES, sceneOf } from "../kinds/index.js";
+import { Column } from "./columns.js";
+import { PREAMBLE_SIZE } from "./container.js";
 import { DecodeError } from "./errors.js";
 import { TensorReader } from "./reader.js";
 /** @import { Scene } from "../kinds/index.js" */
 
-const SMALLEST_BUFFER = 1 << 16;
-
 /** A decoder that takes a file in pieces of any size. Its scenes do not depend on where the pieces are cut. */
-export class Stream {
+export class Stream extends TensorReader {
   /** @param {Omit<import("./index.js").Options, "allowPartial">} [options] layers above maxLayer are not looked at */
   constructor({ maxLayer = null, base = null } = {}) {
-    this._reader = new TensorReader(maxLayer, RULES, base);
-    this._buffer = new Uint8Array(0);
-    /** The bytes of the file from `consumed` on stand here in the buffer. */
-    this._start = 0;
-    this._filled = 0;
-    /** Bytes of the file before which nothing is to be found out. */
-    this._needs = 0;
+    super(maxLayer, RULES, base);
+    /** Bytes of the file before which nothing is found out. */
+    this.needs = PREAMBLE_SIZE;
     /** @type {DecodeError | null} */
     this._error = null;
-  }
-
-  /** Whether every layer that was asked for has arrived. */
-  get complete() {
-    return this._reader.complete;
-  }
-
-  /** How many bytes of the file are decoded and no longer held: where a fetch that begins anew may go on. */
-  get consumed() {
-    return this._reader.offset;
-  }
-
-  /** Each slice's layer with the end of its chunk in the file, in file order; empty until the header is there. */
-  get layerEnds() {
-    return this._reader.layerEnds;
-  }
-
-  /** Bytes of the file as its header has them, null until it is there. */
-  get end() {
-    return this._reader.end;
+    /** Bytes of the file from `consumed` on. @type {Column<Uint8Array>} */
+    this._held = new Column(Uint8Array, 1);
   }
 
   /**
@@ -54,71 +32,50 @@ export class Stream {
    */
   feed(bytes) {
     if (this._error) throw this._error;
-    if (this.complete && this._reader.maxLayer !== null) return [];
-    this._append(bytes);
-    if (this.consumed + this._filled - this._start < this._needs) return [];
+    if (this.complete && this.maxLayer !== null) return [];
+    const { _held: held, consumed } = this;
+    const alone = !held.rows; // nothing is copied before it is known to be needed again
+    if (!alone) held.append(bytes, 2);
+    const all = alone ? bytes : held.values;
     /** @type {Scene[]} */
     const scenes = [];
     let pending = false;
     try {
-      while (this._next()) {
-        pending = !this._reader.whole;
-        if (!pending) scenes.push(sceneOf(this._reader.tensors()));
+      if (consumed + all.length >= this.needs) {
+        this.read(all, () => {
+          pending = !this.whole;
+          if (!pending) scenes.push(sceneOf(this.tensors()));
+        });
       }
     } catch (error) {
       if (!(error instanceof DecodeError)) throw error;
-      this._needs = error.needs;
+      this.needs = error.needs;
       if (error.kind !== "Truncated") {
         this._error = error;
         if (!scenes.length && !pending) throw error;
       }
     }
-    if (pending) scenes.push(sceneOf(this._reader.tensors()));
+    if (alone || this.consumed > consumed) this._hold(all.subarray(this.consumed - consumed));
+    if (pending) scenes.push(sceneOf(this.tensors()));
     return scenes;
   }
 
   /** Says that no bytes follow: raises the pending fault, or Truncated if a slice is missing. */
   finish() {
     if (this._error) throw this._error;
-    this._next();
+    this.read(this._held.values);
   }
 
   /** Forgets a fault and the bytes that are not decoded: feed the file from byte `consumed` on next. */
   rewind() {
     this._error = null;
-    this._start = this._filled = this._needs = 0;
-    this._buffer = new Uint8Array(0);
+    this.needs = PREAMBLE_SIZE;
+    this._hold(new Uint8Array(0));
   }
 
-  /** Whether one more slice was read. */
-  _next() {
-    const before = this._reader.offset;
-    try {
-      return this._reader.next(this._buffer.subarray(this._start, this._filled)) !== null;
-    } finally {
-      this._start += this._reader.offset - before;
-      if (this._start === this._filled) {
-        this._start = this._filled = 0;
-        this._buffer = new Uint8Array(0);
-      }
-    }
-  }
-
-  /** @param {Uint8Array} bytes */
-  _append(bytes) {
-    if (this._filled + bytes.length > this._buffer.length) {
-      const held = this._buffer.subarray(this._start, this._filled);
-      const size = held.length + bytes.length;
-      const doubled = Math.min(2 * this._buffer.length, size + (1 << 26));
-      // where half of the buffer is free already, what it holds moves to its front
-      const fits = size <= this._buffer.length / 2;
-      const target = fits ? this._buffer : new Uint8Array(Math.max(SMALLEST_BUFFER, size, doubled));
-      target.set(held);
-      this._buffer = target;
-      this._start = 0;
-      this._filled = held.length;
-    }
-    this._buffer.set(bytes, this._filled);
-    this._filled += bytes.length;
+  /** @param {Uint8Array} bytes of the file from `consumed` on, which are copied */
+  _hold(bytes) {
+    this._held = new Column(Uint8Array, 1);
+    this._held.append(bytes, 2);
   }
 }

@@ -11,6 +11,23 @@ export class VoxelTable {
     this._count = 0;
     /** Index of the voxel of each slot, -1 where it is empty. */
     this._slots = new Int32Array(0);
+    /** Those that are not in the table yet: nothing is looked up before a second slice. @type {Int32Array[]} */
+    this._loose = [];
+  }
+
+  /** Adds voxels, none of which is there. @param {Int32Array} voxels [n, 3] */
+  add(voxels) {
+    this._loose.push(voxels);
+  }
+
+  /** The first of these voxels that is there, null if none is. @param {Int32Array} voxels [n, 3] */
+  common(voxels) {
+    if (voxels.length) for (const part of this._loose.splice(0)) this._enter(part);
+    for (let i = 0; i < voxels.length && this._count; i += 3) {
+      const slot = this._slot(voxels[i], voxels[i + 1], voxels[i + 2]);
+      if (this._slots[slot] >= 0) return voxels.subarray(i, i + 3);
+    }
+    return null;
   }
 
   /** The slot that has this voxel, or would take it. @param {number} x @param {number} y @param {number} z */
@@ -26,13 +43,8 @@ export class VoxelTable {
     }
   }
 
-  /** Whether the table has this voxel. @param {number} x @param {number} y @param {number} z */
-  has(x, y, z) {
-    return this._count > 0 && this._slots[this._slot(x, y, z)] >= 0;
-  }
-
-  /** Adds voxels, none of which is there. @param {Int32Array} voxels [n, 3] */
-  add(voxels) {
+  /** @param {Int32Array} voxels [n, 3] */
+  _enter(voxels) {
     const first = this._count;
     this._count += voxels.length / 3;
     const grown = 3 * this._count > this._voxels.length;
