@@ -117,10 +117,15 @@ export class Clip extends EventTarget {
   /** Goes to a time; what is no number changes nothing. @param {number} seconds of the scene's time */
   seek(seconds) {
     if (isNaN(seconds)) return;
+    this._go(seconds);
+    this._changed();
+  }
+
+  /** @param {number} seconds as `seek` */
+  _go(seconds) {
     const [start, end] = this.timeRange;
     this._time = this._scene ? Math.min(Math.max(seconds, start), Math.max(start, end)) : seconds;
     this._follow();
-    this._changed();
     this._emit("timeupdate", { time: this.time });
   }
 
@@ -215,7 +220,7 @@ export class Clip extends EventTarget {
       }
       this._follow();
     } else if (scene) this._scene = scene;
-    if (first) this.seek(this.time); // into the scene's range
+    if (first) this._go(this.time); // into the scene's range
     return first;
   }
 

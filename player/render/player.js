@@ -25,6 +25,8 @@ import { WORKERS } from "./workers.js";
  * @property {number | null} [speed] seconds of the scene's time per second, default 1
  * @property {number | null} [bytes] how much of the file to load at most
  * @property {number | null} [seconds] how long to load beyond the first slice
+ * @property {number | null} [held] so many bytes of a file show less than the poster that covers the canvas: with them,
+ * nothing counts as shown, or plays, unless the viewer acts, another start than the poster's is asked for, or no more comes
  * @property {"gpu" | "cpu" | null} [evaluator] default: the faster one of the machine
  * @property {boolean} [degrade] whether a slow machine gets fewer pixels while something moves, default true
  * @property {import("./camera.js").Fit} [fit] what a window of another shape shows, default contain
@@ -83,6 +85,8 @@ export class Player extends Clip {
     this._sorter = new Remote(WORKERS.sort);
     /** Whether it plays as soon as what it begins with is there. */
     this._starts = false;
+    /** As the option, 0 once a picture counts. */
+    this._held = 0;
     /** The highest level that loading went for. */
     this._loadedLevel = Infinity;
     /** @type {Pick<Status, "bytes" | "total" | "loading" | "ends">} */
@@ -118,7 +122,7 @@ export class Player extends Clip {
     /** Ends of draws in the last second, of slower ones the last four. @type {number[]} */
     this._draws = [];
     this._started = performance.now();
-    /** When scenes came. @type {WeakMap<Scene, {arrived: number, decoded: number}>} */
+    /** When scenes came, and of how many bytes. @type {WeakMap<Scene, {arrived: number, decoded: number, consumed: number}>} */
     this._came = new WeakMap();
     /** Pictures drawn and evaluations made so far. */
     this.counts = { drawn: 0, evaluated: 0 };
@@ -167,6 +171,7 @@ export class Player extends Clip {
     this._open(source);
     this._scene = null;
     this._starts = false;
+    this._held = this._options.time == null ? (this._options.held ?? 0) : 0;
     this._shownLevel = null;
     this._camera = null;
     this._gpu?.free(this._front?.splats.field, this._spare?.field);
@@ -174,7 +179,7 @@ export class Player extends Clip {
     this._time = this._options.time ?? null;
     this._status = { bytes: 0, total: null, loading: true, ends: [] };
     this._started = performance.now();
-    this._changed();
+    this._dirty = true;
     this._unfit = false;
     const loading = this._loadOn();
     if (this._inView || equipped.size < MOST_CONTEXTS) this._equip(); // which takes longer than to ask a server
@@ -192,12 +197,53 @@ export class Player extends Clip {
     if (loader !== this._loader) return;
     this._status.loading = false;
     if ((this._level ?? Infinity) > this._loadedLevel) await this._loadOn(); // raised meanwhile
+    else this._holdNoMore();
   }
 
   /** Stops loading; layers that have arrived stay. */
   stopLoading() {
     super.stopLoading();
     this._status.loading = false;
+    this._holdNoMore();
+  }
+
+  /** @param {number} seconds of the scene's time */
+  seek(seconds) {
+    if (seconds !== this.time) this._release();
+    super.seek(seconds);
+  }
+
+  play() {
+    this._release();
+    super.play();
+  }
+
+  /** As no more comes, the newest counts. */
+  _holdNoMore() {
+    if (!this._held) return;
+    this._held = this._scene ? Math.min(this._held, this._consumed(this._scene) - 1) : 0;
+    this._wake();
+    this._begin();
+  }
+
+  /** Bytes that a scene is made of. @param {Scene} scene */
+  _consumed(scene) {
+    return this._came.get(scene)?.consumed ?? Infinity;
+  }
+
+  /** From now on what is drawn counts. */
+  _release() {
+    if (!this._held) return;
+    this._held = 0;
+    this._changed();
+    this._begin();
+  }
+
+  /** Plays, if that was asked for and what it begins with is there. */
+  _begin() {
+    if (!this._starts || this._held || this.awaited) return;
+    this._starts = false;
+    this.play();
   }
 
   /** The scene as far as it has arrived. */
@@ -234,6 +280,7 @@ export class Player extends Clip {
 
   set camera(camera) {
     this._camera = camera;
+    this._release();
     this._changed();
   }
 
@@ -290,6 +337,7 @@ export class Player extends Clip {
    */
   present(now, head, eyes, target) {
     this._head = head;
+    this._release();
     if (!this._gpu || !this._scene) return;
     this._step(now);
     if (this._draw(eyes, target)) this._shown(/** @type {{state: State}} */ (this._front).state, now);
@@ -305,6 +353,7 @@ export class Player extends Clip {
   /** Frees everything; the player cannot be used again. */
   close() {
     if (this.closed) return;
+    this._held = 0;
     super.close();
     cancelAnimationFrame(this._frameRequest);
     this._resize.disconnect();
@@ -320,20 +369,18 @@ export class Player extends Clip {
 
   /** @param {import("./loader-worker.js").News} news */
   _told(news) {
-    const { scene, arrived, decoded, bytes, total, ends } = news;
+    const { scene, arrived, decoded, consumed, bytes, total, ends } = news;
     Object.assign(this._status, { bytes, total, ends });
     this._emit("progress", { bytes, total });
     if (scene) {
       const start = performance.timeOrigin + this._started;
-      this._came.set(scene, { arrived: (arrived - start) / 1000, decoded: (decoded - start) / 1000 });
+      this._came.set(scene, { arrived: (arrived - start) / 1000, decoded: (decoded - start) / 1000, consumed });
     }
     const first = super._told(news);
     this._starts ||= first && !!this._options.autoplay;
-    if (this._starts && !this.awaited) {
-      this._starts = false;
-      this.play();
-    }
-    if (scene) this._changed();
+    this._begin();
+    this._dirty ||= !!scene; // which is no movement, for which pictures would have fewer pixels
+    this._wake();
     return first;
   }
 
@@ -405,7 +452,7 @@ export class Player extends Clip {
 
   /** @param {number} now */
   _moving(now) {
-    return this._playing || this._status.loading || now - this._lastMoved < REST_MS;
+    return this._playing || now - this._lastMoved < REST_MS;
   }
 
   _scale() {
@@ -421,7 +468,8 @@ export class Player extends Clip {
     }
     this._step(now);
     const size = this._size(now);
-    if (this._front && !this._drawing && (this._dirty || !this._isSized(size))) this._show(size);
+    const counts = this._front && this._consumed(this._front.state.scene) > this._held;
+    if (counts && !this._drawing && (this._dirty || !this._isSized(size))) this._show(size);
     if (this._playing || !this._isSettled()) this._wake();
   }
 
@@ -431,9 +479,16 @@ export class Player extends Clip {
       this._advance(this._lastFrame ? Math.min((now - this._lastFrame) / 1000, 0.25) : 0);
       this._lastFrame = now;
     }
-    const undrawn = this._front && this._shownLevel === null; // the first picture does not wait for the second
-    if (!this._evaluating && !undrawn && !this._isEvaluated()) this._evaluate();
+    if (!this._evaluating && !this._waits() && !this._isEvaluated()) this._evaluate();
     this._sort();
+  }
+
+  /** Whether nothing is to be evaluated yet: the first picture does not wait for the second, and while the poster is held
+   * what is there only makes the shaders ready. */
+  _waits() {
+    if (!this._front || this._shownLevel !== null) return false;
+    const [front, next] = [this._front.state.scene, this._scene].map((scene) => this._consumed(/** @type {Scene} */ (scene)));
+    return front > this._held || next <= this._held;
   }
 
   /** The state to show. @returns {State} */
@@ -459,6 +514,7 @@ export class Player extends Clip {
       this._isEvaluated() &&
       this._isSorted() &&
       !this._moving(now) &&
+      !this._status.loading &&
       this._isSized(this._size(now))
     );
   }
@@ -625,6 +681,8 @@ export class Player extends Clip {
 
   /** A picture of a state is on the screen. @param {State} state @param {number} now */
   _shown({ scene, level }, now) {
+    this._held = 0;
+    this._begin();
     const before = this._shownLevel;
     const { rows } = levelOf(scene, level);
     const more = before !== null && (level > before || (level === before && rows > this._shownRows));

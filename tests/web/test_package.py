@@ -12,9 +12,11 @@ from common import ROOT, SHARED
 from strategies import LAYER_SETS, make_scene
 
 from pd4dgs_codec import decode, encode
+from pd4dgs_codec.cli.package import _still
 from pd4dgs_codec.errors import DeliveryError, Malformed, Truncated
 from pd4dgs_codec.format import reader
 from pd4dgs_codec.format.container import read_preamble, write_chunk, write_preamble
+from pd4dgs_codec.format.decoder import every_prefix
 from pd4dgs_codec.format.header import pack_header, unpack_header
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.web import manifests
@@ -237,6 +239,15 @@ def test_scenes_that_make_no_video(cli, tmp_path, time_range, camera, says):
     assert not (tmp_path / "out" / "fallback.mp4").exists()
 
 
+def test_a_picture_is_worth_the_bytes_that_show_less():
+    """It is compared with what each prefix shows, and leaves before the first of those that all show more."""
+    pytest.importorskip("numba")
+    data = (ROOT / "pd4dgs_codec" / "samples" / "dancer.pd4").read_bytes()
+    first, *_, whole = every_prefix(data)
+    prefixes = [(10, whole), (20, first), (30, whole)]
+    assert [_still(whole, iter(prefixes[:n])).worth for n in (1, 3)] == [0, 20]
+
+
 def test_a_rendered_video_is_packaged(cli, folder, tmp_path, monkeypatch):
     pytest.importorskip("torch")
     pytest.importorskip("imageio_ffmpeg")
@@ -251,7 +262,7 @@ def test_a_rendered_video_is_packaged(cli, folder, tmp_path, monkeypatch):
     monkeypatch.setattr(reader, "read_slice", lambda *args: read.append(args[1]) or read_slice(*args))
     done = cli("package", folder / "small.pd4", "-o", tmp_path / "out", "--fps", 10, "--json")
     assert done.code == 0 and done.json["video"] is True, done.err
-    assert read == [0, 1, 2]  # each layer is decoded once, for the check and for the video
+    assert read == 2 * [0, 1, 2]  # for check and video, and for what prefixes show beside the page's picture
     init, pieces = manifests.fragments((tmp_path / "out" / "fallback.mp4").read_bytes())
     low, high = scene.info.time_range
     assert sum(piece.samples for piece in pieces) == round((high - low) * 10) and len(pieces) == 2
