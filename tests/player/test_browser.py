@@ -704,14 +704,14 @@ def test_an_evaluation_that_ends_after_its_scene_was_replaced_is_not_shown(harne
         """async (url, arrived) => {
           const { player } = harness;
           await player.settled();
-          const evaluated = player._gaussians;
+          const evaluated = player._main._gaussians;
           let release = () => {};
           const held = new Promise((resolve) => (release = resolve));
           const begun = new Promise((resolve) => {
-            player._gaussians = async (...args) => {
-              player._gaussians = evaluated;
+            player._main._gaussians = async (...args) => {
+              player._main._gaussians = evaluated;
               resolve();
-              const result = await player._gaussians(...args);
+              const result = await player._main._gaussians(...args);
               await held;
               return result;
             };
@@ -835,10 +835,10 @@ def test_a_slow_machine_shows_smaller_pictures_never_a_lower_level(page, server)
     page.evaluate(
         f"""() => {{
           const {{ player }} = {ELEMENT};
-          const evaluated = player._gaussians;
-          player._gaussians = async (...args) => {{
+          const evaluated = player._main._gaussians;
+          player._main._gaussians = async (...args) => {{
             await new Promise((resolve) => setTimeout(resolve, 450)); // more than a level may take, in older players
-            return evaluated.apply(player, args);
+            return evaluated.apply(player._main, args);
           }};
           player._pace._step = 3;
           player.play();
