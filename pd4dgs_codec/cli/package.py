@@ -100,8 +100,8 @@ def _package(args: argparse.Namespace, console: Console) -> int:
         say(f"pd4dgs-package: no {what}: {missing[what]}")
         return None
 
-    def render(scene: AnyScene) -> Video | None:
-        return None if "2D video" in missing else made("2D video", lambda: _render(scene, args.fps))
+    def render(scene: AnyScene, share: float) -> Video | None:
+        return None if "2D video" in missing else made("2D video", lambda: _render(scene, share, args.fps))
 
     def draw(scene: AnyScene, prefixes: Iterator[tuple[int, AnyScene]]) -> Still | None:
         return made("picture in the page", lambda: _still(scene, prefixes))
@@ -141,7 +141,8 @@ def _write(args: argparse.Namespace, files: Iterable[tuple[str, bytes]]) -> list
     return [{"name": name, "bytes": size} for name, size in sizes.items()]
 
 
-def _render(scene: AnyScene, fps: float) -> Video:
+def _render(scene: AnyScene, share: float, fps: float) -> Video:
+    """The video of a share of the scene's time, from its start on."""
     from PIL import Image
 
     from pd4dgs_codec.quality.frames import check_mp4, own_frames, write_mp4
@@ -153,7 +154,7 @@ def _render(scene: AnyScene, fps: float) -> Video:
     check_mp4()
     if scene.info.camera is None:
         raise RenderError("the file has no camera")
-    count = max(2, round(presentation_seconds(*scene.info.time_range) * fps))
+    count = max(2, round(share * presentation_seconds(*scene.info.time_range) * fps))
     if count > MAX_FRAMES:
         raise RenderError(f"found {count:,} frames, expected at most {MAX_FRAMES:,}; lower --fps")
     frames, level, poster = own_frames(scene.info, count), level_of(scene), BytesIO()
@@ -162,7 +163,7 @@ def _render(scene: AnyScene, fps: float) -> Video:
 
         def pictures() -> Iterator[np.ndarray]:
             for i, frame in enumerate(frames):
-                picture = to_uint8(level.picture(frame.camera, frame.time))
+                picture = to_uint8(level.picture(frame.camera, share * frame.time))
                 if i == len(frames) // 2:
                     Image.fromarray(picture).save(poster, "jpeg", quality=85)
                 yield picture
@@ -175,7 +176,7 @@ def _render(scene: AnyScene, fps: float) -> Video:
 
 
 def _still(scene: AnyScene, prefixes: Iterator[tuple[int, AnyScene]]) -> Still:
-    """The scene as the player shows it first, seen by its own camera, and what lies around that picture. Its worth are the
+    """The scene as the player shows it first, seen by its own camera, and what lies around that picture. Its worth: the
     bytes of the last prefix whose picture has fewer dB against the scene's than this one scaled up."""
     import numpy as np
     from PIL import Image

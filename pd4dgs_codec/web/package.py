@@ -42,6 +42,8 @@ VIDEO, VIDEO_PLAYLIST, POSTER = "fallback.mp4", "fallback.m3u8", "poster.jpg"
 #: Link rates, bits per second, for which the index gives the time of the first picture.
 RATES = {"2M": 2e6, "10M": 1e7, "50M": 5e7}
 STILL_SECONDS = 1.0  #: presentation time of a static scene
+#: What renders a share of a scene's time, from its start on.
+Render = Callable[[AnyScene, float], Video | None]
 #: What draws a page's still: of the scene, and of (bytes, scene) of what a client has of it before and at the end.
 Draw = Callable[[AnyScene, Iterator[tuple[int, AnyScene]]], Still | None]
 
@@ -53,7 +55,7 @@ def presentation_seconds(low: float, high: float) -> float:
 
 def package(
     data: bytes,
-    render: Callable[[AnyScene], Video | None] = lambda scene: None,
+    render: Render = lambda scene, share: None,
     draw: Draw = lambda scene, prefixes: None,
     *,
     immutable: bool = False,
@@ -71,7 +73,7 @@ def package(
     if seconds > MAX_SECONDS:
         raise DeliveryError(f"found a scene of {seconds:g} s, expected at most {MAX_SECONDS:,} s for DASH")
     segments, slices = _segments(data, about, seconds)
-    video = render(scene)
+    video = render(scene, 1.0)
     media = {SCENE: data, SEGMENTS: segments}
     if video is not None:
         media |= {VIDEO: video.data} | ({POSTER: video.poster} if video.poster else {})
@@ -107,16 +109,16 @@ def package(
 
 def package_segments(
     folder: Path,
-    render: Callable[[AnyScene], Video | None] = lambda scene: None,
+    render: Render = lambda scene, share: None,
     draw: Draw = lambda scene, prefixes: None,
     *,
     immutable: bool = False,
 ) -> Iterator[tuple[str, bytes]]:
     """Yields (name, content) of every file of the package of a folder of segments; those that name others come last.
 
-    render, draw: as for `package`; `render` is called with each segment, `draw` with the first. `index.json` has the
-    slices of each file; `segments.json`, which players fetch first, has not. Raises DataError or DecodeError for a file
-    that is missing or damaged.
+    render, draw: as for `package`; `render` is called with each segment and the share of its time before the next one
+    begins, `draw` with the first. `index.json` has the slices of each file; `segments.json`, which players fetch first,
+    has not. Raises DataError or DecodeError for a file that is missing or damaged.
     """
     place, index = read_index(folder)
     rows: dict[str, list[dict[str, Any]]] = {"bases": [], "segments": []}
@@ -143,7 +145,8 @@ def package_segments(
             held = segment.base, read_base(read_file(place, index.bases[segment.base]))
         scene = decode(data, base=held and held[1])
         yield from media(segment, data, end - start)
-        if (video := render(scene)) is not None:
+        until = index.segments[number + 1].time_range[0] if number + 1 < len(index.segments) else end
+        if (video := render(scene, (until - start) / (end - start))) is not None:
             name = f"fallback-{number:05d}.mp4"
             name = addressed(name, video.data) if immutable else name
             yield name, video.data
@@ -152,7 +155,7 @@ def package_segments(
         begun = scene if number == 0 else begun
         shared = [] if segment.base is None else rows["bases"][segment.base]["layers"]
         shared = [row for row in shared if row["layer"] == 0]
-        periods.append(Period(rows["segments"][-1]["layers"], end - start, tracks[-1] if video else None, shared))
+        periods.append(Period(rows["segments"][-1]["layers"], until - start, tracks[-1] if video else None, shared))
     files = {MPD: dash(periods), PLAYLIST: hls(INDEX, tracks[0] if tracks else None, VIDEO_PLAYLIST)}
     files |= {VIDEO_PLAYLIST: hls_video(tracks)} if tracks else {}
     files |= {POSTER: poster} if poster else {}

@@ -41,7 +41,7 @@ def fake_video(fps: float = 20.0, samples: tuple[int, ...] = (40, 40, 7)) -> Vid
 
 @pytest.fixture(scope="module", params=[False, True], ids=["layers only", "with video"])
 def packaged(request, scene_bytes) -> dict[str, bytes]:
-    return package(scene_bytes, lambda scene: fake_video() if request.param else None)
+    return package(scene_bytes, lambda scene, share: fake_video() if request.param else None)
 
 
 def _sets(files: dict[str, bytes]) -> list[ElementTree.Element]:
@@ -108,7 +108,7 @@ def test_the_manifest_is_valid(layers, video):
     etree = pytest.importorskip("lxml.etree")
     schema = etree.XMLSchema(etree.parse(str(SCHEMA)))
     data = encode(make_scene(3, layers=layers, anchors=3), layers=2, effort=1)
-    document = etree.fromstring(package(data, lambda scene: video)[MPD])
+    document = etree.fromstring(package(data, lambda scene, share: video)[MPD])
     schema.assertValid(document)
     document[0][-1][-1].set("codecs", "application/x-pd4")  # the check can fail
     assert not schema.validate(document)
@@ -124,7 +124,7 @@ def test_a_manifest_grows_with_the_slices_and_no_faster():
 
 def test_the_video_is_listed_fragment_by_fragment(scene_bytes):
     video = fake_video()
-    files = package(scene_bytes, lambda scene: video)
+    files = package(scene_bytes, lambda scene, share: video)
     init, pieces = manifests.fragments(video.data)
     assert [piece.samples for piece in pieces] == [40, 40, 7]
     playlist = files["fallback.m3u8"].decode().splitlines()
