@@ -10,6 +10,7 @@ from __future__ import annotations
 import argparse
 import base64
 import gzip
+import io
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -19,12 +20,15 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
+import numpy as np
 from browser import ELEMENT, TIMEOUT_MS, launched, until
 from common import ONE, TWO, Benchmark, Row, Run, Scene, command, levels, number, package, seconds_at, table
+from PIL import Image
 
 from pd4dgs_codec.bench.latency import python
 from pd4dgs_codec.bench.report import drawing
 from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.quality.image import mpsnr
 
 # -- latency -----------------------------------------------------------------------------------------------------------
 
@@ -220,7 +224,8 @@ PAINTED = "performance.getEntriesByName('first-contentful-paint')[0]?.startTime 
 
 def measure_paint(folder: Path, out: Path, visits: int = 5) -> list[Row]:
     """A row per rate: seconds, median and least of the visits, to the first paint and the first rendered picture of the
-    package's page. Writes the screenshots RATE-SECONDS.png, and RATE-end.png of the settled page, to `out`."""
+    package's page; and (seconds, dB against the settled page) of what it shows meanwhile. Writes the screenshots
+    RATE-SECONDS.png, and RATE-end.png of the settled page, to `out`."""
     rows, out_names = [], {rate: f"{rate / 1e3:g}k" for rate in SLOW}
     out.mkdir(parents=True, exist_ok=True)
     page_bytes = (folder / "index.html").read_bytes()
@@ -237,7 +242,7 @@ def measure_paint(folder: Path, out: Path, visits: int = 5) -> list[Row]:
                     seen.append((page.evaluate(PAINTED), page.evaluate("noted[0].shown")))
                     page.context.close()
                 painted, drawn = ((median(times), min(times)) for times in zip(*seen, strict=True))
-                rows.append({"rate": rate, **sizes, "painted": painted, "drawn": drawn})
+                rows.append({"rate": rate, **sizes, "painted": painted, "drawn": drawn, "film": film(browser, url)})
                 page = opened(browser)
                 camera = page.context.new_cdp_session(page)
                 page.goto(f"{url}?autoplay=0", wait_until="commit")
@@ -253,6 +258,26 @@ def measure_paint(folder: Path, out: Path, visits: int = 5) -> list[Row]:
     return rows
 
 
+def film(browser: Any, url: str) -> list[tuple[float, float]]:
+    """(seconds since the navigation began, dB against the settled page) of screenshots of a page, one after the other;
+    one that is the settled page has infinitely many."""
+    page = opened(browser)
+    camera, shots = page.context.new_cdp_session(page), list[tuple[float, bytes]]()
+
+    def shoot() -> None:
+        shot = base64.b64decode(camera.send("Page.captureScreenshot")["data"])
+        shots.append((page.evaluate("performance.now() / 1000"), shot))
+
+    page.goto(f"{url}?autoplay=0&controls=0", wait_until="commit")
+    while not page.evaluate(f"{ELEMENT}?.player?._isSettled() && {ELEMENT}.player.scene.layers.length > 1"):
+        shoot()
+    time.sleep(0.5)  # until nothing fades
+    shoot()
+    page.context.close()
+    pictures = [np.asarray(Image.open(io.BytesIO(shot)).convert("RGB")) for _, shot in shots]
+    return [(seconds, mpsnr(shown, pictures[-1])) for (seconds, _), shown in zip(shots, pictures, strict=True)]
+
+
 def paint_text(rows: Sequence[Row]) -> str:
     """A row per rate."""
     cells = [
@@ -261,7 +286,13 @@ def paint_text(rows: Sequence[Row]) -> str:
         for r in rows
     ]
     head = ("Mbps", "bytes of the page", "gzip", "first paint s (least)", "first picture s (least)")
-    return table(head, cells)
+    text = table(head, cells)
+    for r in rows:
+        seen = [(s, dB) for s, dB in r["film"] if s >= r["painted"][0]]
+        fall = max((a - b for (_, a), (_, b) in pairwise(seen) if a != b), default=0.0)
+        curve = ", ".join(f"{dB:.1f} at {s:.1f} s" for s, dB in seen)
+        text += f"\n\n{r['rate'] / 1e6:g} Mbps: largest fall {max(fall, 0):.1f} dB; dB against the end: {curve}"
+    return text
 
 
 LATENCY = Benchmark("latency", "First picture", ONE, measure_latency, latency_text, measured=package("delivery"))

@@ -7,7 +7,7 @@
 // contain or cover; free, whether the camera may leave what was captured; label, the scene's name; level, the highest
 // to load and show; max-bytes and max-seconds, how much of the file to load, and how long beyond its first slice. A
 // change of autoplay, max-bytes or max-seconds acts on the next file. What the element contains, such as a picture,
-// covers the canvas until the first frame.
+// covers the canvas until the first frame; the first poster-bytes of the file show less than it does.
 
 import { Orbit } from "./render/orbit.js";
 import { SCALES, SIZE_NAMES } from "./render/pace.js";
@@ -45,9 +45,9 @@ const STYLE = `
 canvas, img { position: absolute; inset: 0; width: 100%; height: 100%; }
 canvas:focus-visible { outline: 2px solid #6bf; outline-offset: -2px; }
 img { object-fit: contain; pointer-events: none; }
-slot { display: block; position: absolute; inset: 0; overflow: hidden; background: inherit; pointer-events: none;
-  transition: opacity .3s, visibility .3s; }
-slot.past { opacity: 0; visibility: hidden; }
+slot { display: block; position: absolute; inset: 0; overflow: hidden; background: inherit; pointer-events: none; }
+slot, img { transition: opacity .2s, visibility .2s; }
+.past { opacity: 0; visibility: hidden; }
 :host([fit="cover"]) img { object-fit: cover; }
 .error { position: absolute; inset: 0 0 auto; margin: 0; padding: 8px 12px; background: #611e;
   overflow-wrap: anywhere; }
@@ -288,6 +288,7 @@ export class Pd4Player extends HTMLElement {
       fit: /** @type {import("./render/camera.js").Fit} */ (this.getAttribute("fit") === "cover" ? "cover" : "contain"),
       bytes: number(this.getAttribute("max-bytes")),
       seconds: number(this.getAttribute("max-seconds")),
+      held: number(this.getAttribute("poster-bytes")),
     };
   }
 
@@ -314,8 +315,8 @@ export class Pd4Player extends HTMLElement {
     const poster = this.getAttribute("poster");
     const drawn = this._player?.status.level !== null;
     if (poster !== null && !drawn) this._poster.src = poster;
-    this._poster.hidden = poster === null || drawn;
-    this._slot.classList.toggle("past", drawn);
+    this._poster.hidden = poster === null;
+    for (const cover of [this._poster, this._slot]) cover.classList.toggle("past", drawn);
   }
 
   _showControls() {

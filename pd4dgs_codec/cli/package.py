@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -31,7 +32,7 @@ AdaptationSet of its own, which names the slice before it) and scene.m3u8 (HLS, 
 DASH clients can fetch the slices, but need a .pd4 decoder to show them. DASH and HLS players without one (dash.js,
 Shaka Player, hls.js) show a 2D video, fallback.mp4, of the scene from its own camera. Video and page's picture need
 numba (the extra [train]) and a file with a camera, the video ffmpeg as well; otherwise they are left out. The picture,
-at most 3 kB, lies in the page and is shown until the player has drawn one.
+at most 3 kB, lies in the page and is shown until the player has drawn a better one.
 
 --immutable puts a checksum into the names of the files that others refer to, so that a CDN may cache them forever.
 index.json lists the Cache-Control header of each file. For a folder of packages, pd4dgs-package writes library.json and
@@ -52,6 +53,8 @@ FRAGMENT_SECONDS = 2
 #: The page's picture: pixels of the camera's longer side, how much wider and higher than the camera's picture it is,
 #: and bytes, so that it arrives within 0.2 s at 200 kbps.
 STILL_SIDE, STILL_REACH, STILL_BYTES = 160, 1.8, 3000
+#: It is compared with what the player draws at the camera's size, of which the longer side has at most so many pixels.
+COMPARED_SIDE = 480
 
 
 def parser() -> options.Parser:
@@ -97,11 +100,11 @@ def _package(args: argparse.Namespace, console: Console) -> int:
         say(f"pd4dgs-package: no {what}: {missing[what]}")
         return None
 
-    def render(scene: AnyScene) -> Video | None:
-        return None if "2D video" in missing else made("2D video", lambda: _render(scene, args.fps))
+    def render(scene: AnyScene, share: float) -> Video | None:
+        return None if "2D video" in missing else made("2D video", lambda: _render(scene, share, args.fps))
 
-    def draw(scene: AnyScene) -> Still | None:
-        return made("picture in the page", lambda: _still(scene))
+    def draw(scene: AnyScene, prefixes: Iterator[tuple[int, AnyScene]]) -> Still | None:
+        return made("picture in the page", lambda: _still(scene, prefixes))
 
     if whole:
         contents: Iterable[tuple[str, bytes]] = package(
@@ -138,7 +141,8 @@ def _write(args: argparse.Namespace, files: Iterable[tuple[str, bytes]]) -> list
     return [{"name": name, "bytes": size} for name, size in sizes.items()]
 
 
-def _render(scene: AnyScene, fps: float) -> Video:
+def _render(scene: AnyScene, share: float, fps: float) -> Video:
+    """The video of a share of the scene's time, from its start on."""
     from PIL import Image
 
     from pd4dgs_codec.quality.frames import check_mp4, own_frames, write_mp4
@@ -150,7 +154,7 @@ def _render(scene: AnyScene, fps: float) -> Video:
     check_mp4()
     if scene.info.camera is None:
         raise RenderError("the file has no camera")
-    count = max(2, round(presentation_seconds(*scene.info.time_range) * fps))
+    count = max(2, round(share * presentation_seconds(*scene.info.time_range) * fps))
     if count > MAX_FRAMES:
         raise RenderError(f"found {count:,} frames, expected at most {MAX_FRAMES:,}; lower --fps")
     frames, level, poster = own_frames(scene.info, count), level_of(scene), BytesIO()
@@ -159,7 +163,7 @@ def _render(scene: AnyScene, fps: float) -> Video:
 
         def pictures() -> Iterator[np.ndarray]:
             for i, frame in enumerate(frames):
-                picture = to_uint8(level.picture(frame.camera, frame.time))
+                picture = to_uint8(level.picture(frame.camera, share * frame.time))
                 if i == len(frames) // 2:
                     Image.fromarray(picture).save(poster, "jpeg", quality=85)
                 yield picture
@@ -171,32 +175,44 @@ def _render(scene: AnyScene, fps: float) -> Video:
         return Video(path.read_bytes(), *size, fps, poster.getvalue())
 
 
-def _still(scene: AnyScene) -> Still:
-    """The scene as the player shows it first, seen by its own camera, and what lies around that picture."""
-    from dataclasses import replace
-
+def _still(scene: AnyScene, prefixes: Iterator[tuple[int, AnyScene]]) -> Still:
+    """The scene as the player shows it first, seen by its own camera, and what lies around that picture. Its worth: the
+    bytes of the last prefix whose picture has fewer dB against the scene's than this one scaled up."""
     import numpy as np
     from PIL import Image
 
-    from pd4dgs_codec.quality.image import to_uint8
+    from pd4dgs_codec.quality.image import mpsnr, to_uint8
     from pd4dgs_codec.quality.levels import level_of
     from pd4dgs_codec.web.page import Still
 
     camera = scene.info.camera
     if camera is None:
         raise RenderError("the file has no camera")
-    scale = STILL_SIDE / max(camera.width, camera.height)
-    width, height = (max(1, round(STILL_REACH * scale * side)) for side in (camera.width, camera.height))
-    K = camera.K * np.array([[scale], [scale], [1]], np.float32)
-    K[:2, 2] += (width - scale * camera.width) / 2, (height - scale * camera.height) / 2
-    picture = level_of(scene).picture(replace(camera, K=K, width=width, height=height), 0.0)
+
+    def drawn(scene: AnyScene, side: int, reach: float = 1.0) -> np.ndarray:
+        """Its picture at the start. side: pixels of the longer one of the camera's picture. reach: as in `Still`."""
+        scale = side / max(camera.width, camera.height)
+        width, height = (max(1, round(reach * scale * n)) for n in (camera.width, camera.height))
+        K = camera.K * np.array([[scale], [scale], [1]], np.float32)
+        K[:2, 2] += (width - scale * camera.width) / 2, (height - scale * camera.height) / 2
+        return level_of(scene).picture(replace(camera, K=K, width=width, height=height), 0.0)
+
+    picture = to_uint8(drawn(scene, STILL_SIDE, STILL_REACH))
     for quality in (70, 50, 30, 10, 0):
         file = BytesIO()
-        Image.fromarray(to_uint8(picture)).save(file, "webp", quality=quality, method=6)
+        Image.fromarray(picture).save(file, "webp", quality=quality, method=6)
         if file.tell() <= STILL_BYTES:
             break
+    side = min(COMPARED_SIDE, max(camera.width, camera.height))
+    whole = drawn(scene, side)
+    blurred = Image.open(file).convert("RGB")
+    inset = (1 - 1 / STILL_REACH) / 2
+    box = (inset * blurred.width, inset * blurred.height, (1 - inset) * blurred.width, (1 - inset) * blurred.height)
+    shown = np.asarray(blurred.resize(whole.shape[1::-1], Image.Resampling.BILINEAR, box))
+    least = mpsnr(shown, to_uint8(whole))
+    worth = max((size for size, prefix in prefixes if mpsnr(drawn(prefix, side), whole) < least), default=0)
     red, green, blue = to_uint8(np.array(scene.background()))
-    return Still(file.getvalue(), STILL_REACH, camera.width / camera.height, f"rgb({red},{green},{blue})")
+    return Still(file.getvalue(), STILL_REACH, camera.width / camera.height, f"rgb({red},{green},{blue})", worth)
 
 
 def _text(result: dict[str, Any]) -> str:

@@ -15,7 +15,7 @@ from typing import Any
 from urllib.parse import quote
 
 from pd4dgs_codec.errors import DeliveryError, printable
-from pd4dgs_codec.format.decoder import decode
+from pd4dgs_codec.format.decoder import decode, every_prefix
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.format.reader import Base, read_base
 from pd4dgs_codec.kinds import AnyScene
@@ -42,6 +42,10 @@ VIDEO, VIDEO_PLAYLIST, POSTER = "fallback.mp4", "fallback.m3u8", "poster.jpg"
 #: Link rates, bits per second, for which the index gives the time of the first picture.
 RATES = {"2M": 2e6, "10M": 1e7, "50M": 5e7}
 STILL_SECONDS = 1.0  #: presentation time of a static scene
+#: What renders a share of a scene's time, from its start on.
+Render = Callable[[AnyScene, float], Video | None]
+#: What draws a page's still: of the scene, and of (bytes, scene) of what a client has of it before and at the end.
+Draw = Callable[[AnyScene, Iterator[tuple[int, AnyScene]]], Still | None]
 
 
 def presentation_seconds(low: float, high: float) -> float:
@@ -51,8 +55,8 @@ def presentation_seconds(low: float, high: float) -> float:
 
 def package(
     data: bytes,
-    render: Callable[[AnyScene], Video | None] = lambda scene: None,
-    draw: Callable[[AnyScene], Still | None] = lambda scene: None,
+    render: Render = lambda scene, share: None,
+    draw: Draw = lambda scene, prefixes: None,
     *,
     immutable: bool = False,
 ) -> dict[str, bytes]:
@@ -69,7 +73,7 @@ def package(
     if seconds > MAX_SECONDS:
         raise DeliveryError(f"found a scene of {seconds:g} s, expected at most {MAX_SECONDS:,} s for DASH")
     segments, slices = _segments(data, about, seconds)
-    video = render(scene)
+    video = render(scene, 1.0)
     media = {SCENE: data, SEGMENTS: segments}
     if video is not None:
         media |= {VIDEO: video.data} | ({POSTER: video.poster} if video.poster else {})
@@ -82,7 +86,8 @@ def package(
     if track is not None:
         files[VIDEO_PLAYLIST] = hls_video([track])
     files[PLAYLIST] = hls(INDEX, track, VIDEO_PLAYLIST)
-    files[PAGE] = page(names[SCENE], data, draw(scene)).encode()
+    ends = (row["range"][1] for row in slices)
+    files[PAGE] = page(names[SCENE], data, draw(scene, zip(ends, every_prefix(data), strict=True))).encode()
     index = {
         "file": names[SCENE],
         "format_version": about["format_version"],
@@ -104,20 +109,20 @@ def package(
 
 def package_segments(
     folder: Path,
-    render: Callable[[AnyScene], Video | None] = lambda scene: None,
-    draw: Callable[[AnyScene], Still | None] = lambda scene: None,
+    render: Render = lambda scene, share: None,
+    draw: Draw = lambda scene, prefixes: None,
     *,
     immutable: bool = False,
 ) -> Iterator[tuple[str, bytes]]:
     """Yields (name, content) of every file of the package of a folder of segments; those that name others come last.
 
-    render, draw: as for `package`; `render` is called with each segment, `draw` with the first. `index.json` has the
-    slices of each file; `segments.json`, which players fetch first, has not. Raises DataError or DecodeError for a file
-    that is missing or damaged.
+    render, draw: as for `package`; `render` is called with each segment and the share of its time before the next one
+    begins, `draw` with the first. `index.json` has the slices of each file; `segments.json`, which players fetch first,
+    has not. Raises DataError or DecodeError for a file that is missing or damaged.
     """
     place, index = read_index(folder)
     rows: dict[str, list[dict[str, Any]]] = {"bases": [], "segments": []}
-    periods, tracks, still, poster = list[Period](), list[Track](), None, b""
+    periods, tracks, begun, poster = list[Period](), list[Track](), None, b""
     held: tuple[int, Base] | None = None
 
     def media(file: File, data: bytes, seconds: float) -> Iterator[tuple[str, bytes]]:
@@ -140,26 +145,27 @@ def package_segments(
             held = segment.base, read_base(read_file(place, index.bases[segment.base]))
         scene = decode(data, base=held and held[1])
         yield from media(segment, data, end - start)
-        if (video := render(scene)) is not None:
+        until = index.segments[number + 1].time_range[0] if number + 1 < len(index.segments) else end
+        if (video := render(scene, (until - start) / (end - start))) is not None:
             name = f"fallback-{number:05d}.mp4"
             name = addressed(name, video.data) if immutable else name
             yield name, video.data
             tracks.append(Track.of(name, video))
             poster = poster or video.poster
-        still = draw(scene) if number == 0 else still
+        begun = scene if number == 0 else begun
         shared = [] if segment.base is None else rows["bases"][segment.base]["layers"]
         shared = [row for row in shared if row["layer"] == 0]
-        periods.append(Period(rows["segments"][-1]["layers"], end - start, tracks[-1] if video else None, shared))
+        periods.append(Period(rows["segments"][-1]["layers"], until - start, tracks[-1] if video else None, shared))
     files = {MPD: dash(periods), PLAYLIST: hls(INDEX, tracks[0] if tracks else None, VIDEO_PLAYLIST)}
     files |= {VIDEO_PLAYLIST: hls_video(tracks)} if tracks else {}
     files |= {POSTER: poster} if poster else {}
-    first = read_file(
-        place, index.segments[0] if index.segments[0].base is None else index.bases[index.segments[0].base]
-    )
-    files[PAGE] = page(SEGMENTS_INDEX, first, still).encode()
     bases = [replace(file, file=row["file"]) for file, row in zip(index.bases, rows["bases"], strict=True)]
     parts = [replace(file, file=row["file"]) for file, row in zip(index.segments, rows["segments"], strict=True)]
     content = Index(tuple(bases), tuple(parts)).packed()
+    shown = index.segments[0] if index.segments[0].base is None else index.bases[index.segments[0].base]
+    first = read_file(place, shown)
+    prefixes = [(len(content) + shown.bytes, decode(first))] if index.segments[0].base is not None else []
+    files[PAGE] = page(SEGMENTS_INDEX, first, draw(begun, iter(prefixes)) if begun else None).encode()
     low, high = index.time_range
     about = {
         "file": SEGMENTS_INDEX,

@@ -102,12 +102,14 @@ def player_folder() -> Path:
 class Still:
     """The picture that a page shows until the player has drawn one. data: a WebP file that shows `reach` times the
     width and height of the scene's camera around its picture, so that windows of other shapes are filled. aspect: width
-    of the camera's picture per height. background: CSS colour."""
+    of the camera's picture per height. background: CSS colour. worth: so many bytes of the scene show less than it
+    does."""
 
     data: bytes
     reach: float
     aspect: float
     background: str
+    worth: int = 0
 
 
 #: Bytes of the code before the loader, a multiple of 3 for base64. A first slice of some 50 kB and the rest of the code
@@ -148,7 +150,8 @@ def page(source: bytes | str | None = None, about: bytes | None = None, still: S
     if isinstance(source, str):
         head = head.replace("<html ", f'<html data-src="{html.escape(source)}" ', 1)
     if still is not None:
-        head = head.replace("</pd4-player>", f"{_img(still)}</pd4-player>", 1)
+        held = f' poster-bytes="{still.worth}"' if still.worth else ""
+        head = head.replace("<pd4-player></pd4-player>", f"<pd4-player{held}>{_img(still)}</pd4-player>", 1)
     zipped = gzip.compress(code.encode(), 9, mtime=0)
     parts = [_held('id="scene"', source)] if isinstance(source, bytes) else []
     parts += [_held('class="code"', zipped[:AHEAD]), early, _held('class="code"', zipped[AHEAD:]), UNPACK]

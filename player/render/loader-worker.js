@@ -18,7 +18,8 @@ const REST = 4;
  * @property {import("../kinds/index.js").Scene} [scene]
  * @property {number} arrived when the last byte of the scene came
  * @property {number} decoded when it was decoded
- * @property {number} bytes
+ * @property {number} consumed bytes that the scene is made of
+ * @property {number} bytes that have arrived
  * @property {number | null} total
  * @property {{layer: number, end: number}[]} ends where in the file each slice ends, empty until the header is there
  * @property {import("./timeline.js").Segment[]} [segments] of a scene that is cut in time, once
@@ -46,8 +47,11 @@ let segments = null;
 let told = 0;
 let arrived = 0;
 const epochNow = () => performance.timeOrigin + performance.now();
+/** @typedef {Pick<News, "arrived" | "decoded" | "consumed">} Origin */
+/** @param {number} consumed @returns {Origin} of what is decoded now */
+const origin = (consumed) => ({ arrived, decoded: epochNow(), consumed });
 
-/** The newest scene, until it is told. @type {{scene: Scene, arrived: number, decoded: number} | null} */
+/** The newest scene, until it is told. @type {({scene: Scene} & Origin) | null} */
 let newest = null;
 /** When the next scene may be told, performance.now(), and what will tell it. */
 let free = 0;
@@ -55,7 +59,7 @@ let timer = /** @type {ReturnType<typeof setTimeout> | 0} */ (0);
 
 /** Tells the scene now, or the newest one as soon as the last one is dealt with. @param {Scene} scene */
 function offer(scene) {
-  newest = { scene, arrived, decoded: epochNow() };
+  newest = { scene, ...origin(source.decoder.consumed) };
   const wait = free - performance.now();
   if (wait <= 0) flush();
   else if (!timer) timer = setTimeout(flush, wait);
@@ -67,11 +71,11 @@ function flush() {
   timer = 0;
   if (!newest) return;
   const start = performance.now();
-  const { scene, ...times } = newest;
+  const { scene, ...from } = newest;
   newest = null;
   /** @type {Transferable[]} */
   const transfer = [];
-  report(own(scene, transfer), transfer, times);
+  report(own(scene, transfer), transfer, from);
   const now = performance.now();
   free = now + REST * (now - start);
 }
@@ -99,10 +103,10 @@ function own(scene, transfer) {
   return copy(scene);
 }
 
-/** @param {Scene} [scene] @param {Transferable[]} [transfer] of it @param {{arrived: number, decoded: number}} [times] */
-function report(scene, transfer, times = { arrived, decoded: epochNow() }) {
+/** @param {Scene} [scene] @param {Transferable[]} [transfer] of it @param {Origin} [from] */
+function report(scene, transfer, from = origin(source.decoder.consumed)) {
   const { received: bytes, total, decoder } = source;
-  tell({ told: { ...(scene && { scene }), bytes, total, ends: decoder.layerEnds, ...times } }, transfer);
+  tell({ told: { ...(scene && { scene }), bytes, total, ends: decoder.layerEnds, ...from } }, transfer);
   told = performance.now();
 }
 
@@ -111,10 +115,10 @@ function hand({ scene, ...part }) {
   const { received: bytes, index } = /** @type {Segments} */ (segments);
   /** @type {Transferable[]} */
   const transfer = [];
-  const times = { arrived, decoded: epochNow() };
   const own_ = scene && own(scene, transfer);
   const first = index && !told && { segments: index.segments };
-  tell({ told: { ...(own_ && { scene: own_ }), ...part, ...first, bytes, total: null, ends: [], ...times } }, transfer);
+  const from = { bytes, total: null, ends: [], ...origin(bytes) };
+  tell({ told: { ...(own_ && { scene: own_ }), ...part, ...first, ...from } }, transfer);
   if (index) told = performance.now();
 }
 

@@ -1,7 +1,7 @@
 // What Player and Playback share: the worker that fetches and decodes, and the scene's time.
 
 import { Remote } from "./remote.js";
-import { segmentAt } from "./timeline.js";
+import { segmentsAt, weightAt } from "./timeline.js";
 import { WORKERS } from "./workers.js";
 /** @import { Scene } from "../kinds/index.js" */
 /** @import { News } from "./loader-worker.js" */
@@ -58,38 +58,45 @@ export class Clip extends EventTarget {
     this._parts = new Map();
     /** Why segments do not come. @type {Map<number, string>} */
     this._problems = new Map();
-    /** The segment at hand. @type {number} */
-    this._segment = -1;
+    /** The segments that show the time at hand, the later one first. @type {number[]} */
+    this._needed = [];
+    /** Where two segments overlap and both are there: the earlier one, and its share of the picture.
+     * @type {{scene: Scene, share: number} | null} */
+    this.fading = null;
     /** @type {import("../decode/fetch.js").Budget} */
     this._budget = {};
   }
 
-  /** Why the segment at hand does not come, "" if it is there or on its way. */
+  /** Why a segment at hand does not come, "" if it is there or on its way. */
   get problem() {
-    return this._problems.get(this._segment) ?? "";
+    return this._needed.map((k) => this._problems.get(k)).find(Boolean) ?? "";
   }
 
-  /** The range of time, seconds, of the segment at hand while it is on its way. */
+  /** The range of time, seconds, of a segment at hand while it is on its way. */
   get awaited() {
-    const there = !this._segments || this._segment < 0 || this._parts.has(this._segment) || this.problem;
-    return there ? null : /** @type {import("./timeline.js").Segment[]} */ (this._segments)[this._segment].range;
+    const lacking = this._needed.find((k) => !this._parts.has(k) && !this._problems.has(k));
+    return lacking === undefined ? null : /** @type {import("./timeline.js").Segment[]} */ (this._segments)[lacking].range;
   }
 
   /** Shows the part that belongs to the time at hand, or its base, and sees to what comes next. */
   _follow() {
     const segments = this._segments;
     if (!segments) return;
-    const now = segmentAt(segments, this.time);
-    if (now !== this._segment) {
-      const moved = this._segment >= 0;
-      this._segment = now;
-      const bases = [now, now + 1].map((k) => -1 - (segments[k]?.base ?? NaN));
-      for (const k of [...this._parts.keys()]) if (k !== now && k !== now + 1 && !bases.includes(k)) this._parts.delete(k);
-      this._problems.clear();
+    const shown = segmentsAt(segments, this.time);
+    const [now] = shown;
+    if (shown.join() !== this._needed.join()) {
+      const moved = this._needed.length && shown.some((k) => !this._needed.includes(k));
+      this._needed = shown;
+      const near = [...shown, now + 1];
+      const kept = near.flatMap((k) => [k, -1 - (segments[k]?.base ?? NaN)]);
+      for (const k of [...this._parts.keys()]) if (!kept.includes(k)) this._parts.delete(k);
+      for (const k of [...this._problems.keys()]) if (moved || !shown.includes(k)) this._problems.delete(k);
       if (moved && this._loader) this._load(this._budget);
     }
-    const scene = this._parts.get(now) ?? this._parts.get(-1 - (segments[now].base ?? NaN));
-    if (!scene || scene === this._scene) return;
+    const [scene = this._parts.get(-1 - (segments[now].base ?? NaN)), earlier] = shown.flatMap((k) => this._parts.get(k) ?? []);
+    const before = this.fading?.share;
+    this.fading = scene && earlier ? { scene: earlier, share: 1 - weightAt(segments, now, this.time) } : null;
+    if (!scene || (scene === this._scene && this.fading?.share === before)) return;
     this._scene = scene;
     this._changed();
   }
@@ -117,10 +124,15 @@ export class Clip extends EventTarget {
   /** Goes to a time; what is no number changes nothing. @param {number} seconds of the scene's time */
   seek(seconds) {
     if (isNaN(seconds)) return;
+    this._go(seconds);
+    this._changed();
+  }
+
+  /** @param {number} seconds as `seek` */
+  _go(seconds) {
     const [start, end] = this.timeRange;
     this._time = this._scene ? Math.min(Math.max(seconds, start), Math.max(start, end)) : seconds;
     this._follow();
-    this._changed();
     this._emit("timeupdate", { time: this.time });
   }
 
@@ -215,7 +227,7 @@ export class Clip extends EventTarget {
       }
       this._follow();
     } else if (scene) this._scene = scene;
-    if (first) this.seek(this.time); // into the scene's range
+    if (first) this._go(this.time); // into the scene's range
     return first;
   }
 

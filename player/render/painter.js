@@ -5,6 +5,12 @@ import { MIN_OPACITY } from "./level.js";
 /** @import { Splats } from "./evaluator.js" */
 /** @import { Field, Gpu } from "./gl.js" */
 
+/** The order in which a scene's Gaussians are drawn, in a texture of some rows. @typedef {{texture: WebGLTexture,
+ * rows: number, count: number}} Order */
+
+/** A scene in a picture. fill: RGB behind its Gaussians. near: scene units.
+ * @typedef {{splats: Splats, order: Order, fill: ArrayLike<number>, near: number}} Drawn */
+
 /** A picture of several views, as an XRWebGLLayer describes it. @typedef {{framebuffer: WebGLFramebuffer | null,
  * framebufferWidth: number, framebufferHeight: number}} Target */
 
@@ -84,11 +90,16 @@ void main() {
   color = vec4(paint.rgb * alpha, alpha);
 }`;
 
-/** Copies the float picture onto the canvas. */
+/** Copies the float picture onto the canvas, blended with that of a second scene. */
 const SHOW = `
-uniform sampler2DArray picture;
+uniform sampler2DArray picture, second;
+uniform float share;
 out vec4 color;
-void main() { color = vec4(texelFetch(picture, ivec3(gl_FragCoord.xy, 0), 0).rgb, 1); }`;
+void main() {
+  ivec3 p = ivec3(gl_FragCoord.xy, 0);
+  color = vec4(texelFetch(picture, p, 0).rgb, 1);
+  if (share > 0.) color.rgb = mix(min(color.rgb, 1.), min(texelFetch(second, p, 0).rgb, 1.), share);
+}`;
 
 export class Painter {
   /** @param {Gpu} gpu */
@@ -102,13 +113,9 @@ export class Painter {
     gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, gl.createBuffer());
     gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
-    /** @type {WebGLTexture | null} */
-    this._order = null;
-    this._orderRows = 0;
-    /** Gaussians that are drawn. */
-    this.count = 0;
-    /** The picture in floats, as eight bits would round at every blend. @type {Field | null} */
-    this._picture = null;
+    /** Pictures in floats, as eight bits would round at every blend: of a scene, and of a second one.
+     * @type {(Field | null)[]} */
+    this._pictures = [null, null];
     this._warm();
   }
 
@@ -117,24 +124,25 @@ export class Painter {
     const gpu = this._gpu;
     const { gl } = gpu;
     const nothing = gpu.field(1, 1, 4);
-    this.setOrder(new Uint32Array(1));
+    const order = this.ordered(null, new Uint32Array(1));
     const K = new Float32Array([1, 0, 1, 0, 1, 1, 0, 0, 1]);
-    this.draw({ field: nothing }, [{ viewmat: new Float32Array(16), K, width: 2, height: 2 }], [0, 0, 0], 1);
-    this.count = 0;
-    gpu.free(nothing);
+    const drawn = { splats: { field: nothing }, order, fill: [0, 0, 0], near: 1 };
+    this.draw([drawn], [{ viewmat: new Float32Array(16), K, width: 2, height: 2 }]);
+    gpu.free(nothing, order.texture);
     gl.flush();
   }
 
-  /** Sets the drawing order, back to front. @param {Uint32Array} order texels of the splats */
-  setOrder(order) {
+  /** An order in place of an earlier one. @param {Order | null} had @param {Uint32Array} order texels of the splats, back
+   * to front @returns {Order} */
+  ordered(had, order) {
     const { gl } = this._gpu;
     const rows = Math.ceil(order.length / ORDER_WIDTH);
-    if (rows > this._orderRows) {
-      this._gpu.free(this._order);
-      this._orderRows = Math.ceil(1.25 * rows);
-      this._order = this._gpu.plain(ORDER_WIDTH, this._orderRows, new Uint32Array(ORDER_WIDTH * this._orderRows));
+    if (!had || rows > had.rows) {
+      this._gpu.free(had?.texture);
+      const room = Math.ceil(1.25 * Math.max(rows, 1));
+      had = { texture: this._gpu.plain(ORDER_WIDTH, room, new Uint32Array(ORDER_WIDTH * room)), rows: room, count: 0 };
     }
-    gl.bindTexture(gl.TEXTURE_2D, this._order);
+    gl.bindTexture(gl.TEXTURE_2D, had.texture);
     /** @param {number} row @param {number} height @param {number} width */
     const put = (row, height, width) => {
       const from = row * ORDER_WIDTH;
@@ -143,48 +151,61 @@ export class Painter {
     const whole = Math.floor(order.length / ORDER_WIDTH);
     if (whole) put(0, whole, ORDER_WIDTH);
     if (whole < rows) put(whole, 1, order.length - whole * ORDER_WIDTH);
-    this.count = order.length;
+    had.count = order.length;
+    return had;
   }
 
   /**
    * Draws onto the canvas, which has the camera's size, or for the eyes of a headset.
    *
-   * @param {Splats} splats @param {(Camera & {x?: number, y?: number})[]} views and where in the picture they are,
-   * pixels @param {ArrayLike<number>} background RGB @param {number} near scene units @param {Target} [target]
+   * @param {Drawn[]} scenes one, or two to blend @param {(Camera & {x?: number, y?: number})[]} views and where in the
+   * picture they are, pixels @param {number} [share] of the second scene; without floats, the one of more is drawn
+   * @param {Target} [target]
    */
-  draw(splats, views, background, near, target) {
+  draw(scenes, views, share = 0, target) {
     const gpu = this._gpu;
     const { gl } = gpu;
     const width = target?.framebufferWidth ?? views[0].width;
     const height = target?.framebufferHeight ?? views[0].height;
     const framebuffer = target?.framebuffer ?? null;
-    if (gpu.pictureFormat) {
-      this._picture = gpu.renewed(this._picture, width, height, 1, gpu.pictureFormat);
-      gpu.bindTarget(this._picture, 0, 1);
-    } else {
+    if (!gpu.pictureFormat) {
       gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+      this._drawScene(scenes[Math.round(share)], views);
+      return;
     }
-    gl.clearColor(background[0], background[1], background[2], 1);
-    gl.clear(gl.COLOR_BUFFER_BIT);
-    for (const view of views) this._drawView(splats, view, near);
-    if (this._picture) {
-      const program = gpu.program(SHOW);
-      gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
-      gpu.use(program, { picture: this._picture });
-      gl.viewport(0, 0, width, height);
-      gl.drawArrays(gl.TRIANGLES, 0, 3);
-    }
+    const [picture, second = picture] = scenes.map((scene, i) => {
+      const field = (this._pictures[i] = gpu.renewed(this._pictures[i], width, height, 1, gpu.pictureFormat));
+      gpu.bindTarget(field, 0, 1);
+      this._drawScene(scene, views);
+      return field;
+    });
+    const program = gpu.program(SHOW);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+    gpu.use(program, { picture, second });
+    gl.uniform1f(program.uniform("share"), share);
+    gl.viewport(0, 0, width, height);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  /** @param {Splats} splats @param {Camera & {x?: number, y?: number}} view @param {number} near */
-  _drawView(splats, { viewmat, K, width, height, x = 0, y = 0 }, near) {
-    if (!this._order || !this.count) return;
+  /** @param {Drawn} scene @param {(Camera & {x?: number, y?: number})[]} views */
+  _drawScene(scene, views) {
+    const { gl } = this._gpu;
+    const { fill } = scene;
+    gl.clearColor(fill[0], fill[1], fill[2], 1);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    for (const view of views) this._drawView(scene, view);
+  }
+
+  /** @param {Drawn} scene @param {Camera & {x?: number, y?: number}} view */
+  _drawView({ splats, order, near }, { viewmat, K, width, height, x = 0, y = 0 }) {
+    const { texture, count } = order;
+    if (!count) return;
     const gpu = this._gpu;
     const { gl } = gpu;
     gl.viewport(x, y, width, height);
     const program = gpu.program(FRAGMENT, VERTEX);
-    gpu.use(program, { splats: splats.field, order: this._order });
-    gl.uniform1i(program.uniform("count"), this.count);
+    gpu.use(program, { splats: splats.field, order: texture });
+    gl.uniform1i(program.uniform("count"), count);
     gl.uniform4fv(program.uniform("view"), viewmat.subarray(0, 12));
     gl.uniform4f(program.uniform("lens"), K[0], K[4], K[2], K[5]);
     gl.uniform4f(
@@ -199,7 +220,7 @@ export class Painter {
     gl.enable(gl.BLEND);
     gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
     gl.bindVertexArray(this._array);
-    gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(this.count / BATCH));
+    gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(count / BATCH));
     gl.bindVertexArray(null);
     gl.disable(gl.BLEND);
   }

@@ -1,19 +1,14 @@
 // A player on a canvas. It loads, evaluates, sorts and draws, each step only when its inputs have changed.
 
-import { drawing } from "../kinds/drawing.js";
 import { centreOf, defaultCamera, fitted } from "./camera.js";
-import { CpuEvaluator } from "./cpu.js";
-import { SPLAT_BLOCKS } from "./evaluator.js";
+import { Drawable } from "./drawable.js";
 import { Gpu } from "./gl.js";
-import { levelOf, sameState, stateOf } from "./level.js";
+import { levelOf, stateOf } from "./level.js";
 import { Clip } from "./loader.js";
 import { Pace } from "./pace.js";
 import { Painter } from "./painter.js";
-import { Remote } from "./remote.js";
-import { WORKERS } from "./workers.js";
 /** @import { Camera } from "../decode/tensors.js" */
 /** @import { Scene } from "../kinds/index.js" */
-/** @import { Evaluated, Splats } from "./evaluator.js" */
 /** @import { State } from "./level.js" */
 
 /**
@@ -25,6 +20,8 @@ import { WORKERS } from "./workers.js";
  * @property {number | null} [speed] seconds of the scene's time per second, default 1
  * @property {number | null} [bytes] how much of the file to load at most
  * @property {number | null} [seconds] how long to load beyond the first slice
+ * @property {number | null} [held] so many bytes of a file show less than the poster that covers the canvas: with them,
+ * nothing counts as shown, or plays, unless the viewer acts, another start than the poster's is asked for, or no more comes
  * @property {"gpu" | "cpu" | null} [evaluator] default: the faster one of the machine
  * @property {boolean} [degrade] whether a slow machine gets fewer pixels while something moves, default true
  * @property {import("./camera.js").Fit} [fit] what a window of another shape shows, default contain
@@ -80,9 +77,10 @@ export class Player extends Clip {
     /** @type {number | null} */
     this._level = options.level ?? null;
     this._pace = new Pace();
-    this._sorter = new Remote(WORKERS.sort);
     /** Whether it plays as soon as what it begins with is there. */
     this._starts = false;
+    /** As the option, 0 once a picture counts. */
+    this._held = 0;
     /** The highest level that loading went for. */
     this._loadedLevel = Infinity;
     /** @type {Pick<Status, "bytes" | "total" | "loading" | "ends">} */
@@ -92,21 +90,11 @@ export class Player extends Clip {
     this._gpu = null;
     /** @type {Painter | null} */
     this._painter = null;
-    /** @type {import("../kinds/drawing.js").OnGpu | null} */
-    this._evaluator = null;
-    /** @type {CpuEvaluator | null} */
-    this._cpu = null;
-    /** Whether shaders do not take the file's networks. */
-    this._unfit = false;
-    /** The Gaussians on show, and their state. @type {{splats: Splats, state: State} | null} */
-    this._front = null;
-    /** @type {Splats | null} */
-    this._spare = null;
-    this._evaluating = false;
-    this._sorting = false;
+    /** Draws the scene. */
+    this._main = new Drawable(options.evaluator);
+    /** Draws the one that it is blended with, once there was one. @type {Drawable | null} */
+    this._second = null;
     this._drawing = false;
-    /** Row of the view matrix that the order is for. @type {ArrayLike<number> | null} */
-    this._sortedRow = null;
     this._dirty = true;
     /** @type {number | null} */
     this._shownLevel = null;
@@ -118,7 +106,7 @@ export class Player extends Clip {
     /** Ends of draws in the last second, of slower ones the last four. @type {number[]} */
     this._draws = [];
     this._started = performance.now();
-    /** When scenes came. @type {WeakMap<Scene, {arrived: number, decoded: number}>} */
+    /** When scenes came, and of how many bytes. @type {WeakMap<Scene, {arrived: number, decoded: number, consumed: number}>} */
     this._came = new WeakMap();
     /** Pictures drawn and evaluations made so far. */
     this.counts = { drawn: 0, evaluated: 0 };
@@ -167,18 +155,17 @@ export class Player extends Clip {
     this._open(source);
     this._scene = null;
     this._starts = false;
+    this._held = this._options.time == null ? (this._options.held ?? 0) : 0;
     this._shownLevel = null;
     this._camera = null;
-    this._gpu?.free(this._front?.splats.field, this._spare?.field);
-    this._front = this._spare = null;
+    for (const drawable of this._drawables()) drawable.clear();
     this._time = this._options.time ?? null;
     this._status = { bytes: 0, total: null, loading: true, ends: [] };
     this._started = performance.now();
-    this._changed();
-    this._unfit = false;
+    this._dirty = true;
     const loading = this._loadOn();
     if (this._inView || equipped.size < MOST_CONTEXTS) this._equip(); // which takes longer than to ask a server
-    if (this._options.evaluator === "cpu" || this._gpu?.software) this._cpu ??= new CpuEvaluator();
+    if (this._options.evaluator === "cpu" || this._gpu?.software) this._main.prepare();
     await loading;
   }
 
@@ -192,12 +179,53 @@ export class Player extends Clip {
     if (loader !== this._loader) return;
     this._status.loading = false;
     if ((this._level ?? Infinity) > this._loadedLevel) await this._loadOn(); // raised meanwhile
+    else this._holdNoMore();
   }
 
   /** Stops loading; layers that have arrived stay. */
   stopLoading() {
     super.stopLoading();
     this._status.loading = false;
+    this._holdNoMore();
+  }
+
+  /** @param {number} seconds of the scene's time */
+  seek(seconds) {
+    if (seconds !== this.time) this._release();
+    super.seek(seconds);
+  }
+
+  play() {
+    this._release();
+    super.play();
+  }
+
+  /** As no more comes, the newest counts. */
+  _holdNoMore() {
+    if (!this._held) return;
+    this._held = this._scene ? Math.min(this._held, this._consumed(this._scene) - 1) : 0;
+    this._wake();
+    this._begin();
+  }
+
+  /** Bytes that a scene is made of. @param {Scene} scene */
+  _consumed(scene) {
+    return this._came.get(scene)?.consumed ?? Infinity;
+  }
+
+  /** From now on what is drawn counts. */
+  _release() {
+    if (!this._held) return;
+    this._held = 0;
+    this._changed();
+    this._begin();
+  }
+
+  /** Plays, if that was asked for and what it begins with is there. */
+  _begin() {
+    if (!this._starts || this._held || this.awaited) return;
+    this._starts = false;
+    this.play();
   }
 
   /** The scene as far as it has arrived. */
@@ -234,6 +262,7 @@ export class Player extends Clip {
 
   set camera(camera) {
     this._camera = camera;
+    this._release();
     this._changed();
   }
 
@@ -246,7 +275,7 @@ export class Player extends Clip {
       levels: this._scene?.layers ?? [],
       fps: this._moving(now) ? this._rate(now) : 0,
       scale: this._moving(now) ? this._scale() : 1,
-      gaussians: this._painter?.count ?? 0,
+      gaussians: this._drawables().reduce((sum, { front, order }) => sum + ((front && order?.count) || 0), 0),
       software: this._gpu?.software ?? false,
       problem: this.problem,
       awaited: this.awaited,
@@ -290,9 +319,11 @@ export class Player extends Clip {
    */
   present(now, head, eyes, target) {
     this._head = head;
+    this._release();
     if (!this._gpu || !this._scene) return;
     this._step(now);
-    if (this._draw(eyes, target)) this._shown(/** @type {{state: State}} */ (this._front).state, now);
+    const state = this._draw(eyes, target);
+    if (state) this._shown(state, now);
   }
 
   /** Draws on the canvas again. */
@@ -305,13 +336,13 @@ export class Player extends Clip {
   /** Frees everything; the player cannot be used again. */
   close() {
     if (this.closed) return;
+    this._held = 0;
     super.close();
     cancelAnimationFrame(this._frameRequest);
     this._resize.disconnect();
     this._seen.disconnect();
     this._listening.abort();
-    this._sorter.close();
-    this._cpu?.close();
+    for (const drawable of this._drawables()) drawable.close();
     this._giveUp();
     this.canvas.width = this.canvas.height = 1;
   }
@@ -320,20 +351,18 @@ export class Player extends Clip {
 
   /** @param {import("./loader-worker.js").News} news */
   _told(news) {
-    const { scene, arrived, decoded, bytes, total, ends } = news;
+    const { scene, arrived, decoded, consumed, bytes, total, ends } = news;
     Object.assign(this._status, { bytes, total, ends });
     this._emit("progress", { bytes, total });
     if (scene) {
       const start = performance.timeOrigin + this._started;
-      this._came.set(scene, { arrived: (arrived - start) / 1000, decoded: (decoded - start) / 1000 });
+      this._came.set(scene, { arrived: (arrived - start) / 1000, decoded: (decoded - start) / 1000, consumed });
     }
     const first = super._told(news);
     this._starts ||= first && !!this._options.autoplay;
-    if (this._starts && !this.awaited) {
-      this._starts = false;
-      this.play();
-    }
-    if (scene) this._changed();
+    this._begin();
+    this._dirty ||= !!scene; // which is no movement, for which pictures would have fewer pixels
+    this._wake();
     return first;
   }
 
@@ -376,7 +405,8 @@ export class Player extends Clip {
 
   /** Forgets a GPU whose context is lost, and with it all that it held. */
   _dropGpu() {
-    this._gpu = this._painter = this._evaluator = this._front = this._spare = null;
+    this._gpu = this._painter = null;
+    for (const drawable of this._drawables()) drawable.drop();
     equipped.delete(this);
   }
 
@@ -405,7 +435,7 @@ export class Player extends Clip {
 
   /** @param {number} now */
   _moving(now) {
-    return this._playing || this._status.loading || now - this._lastMoved < REST_MS;
+    return this._playing || now - this._lastMoved < REST_MS;
   }
 
   _scale() {
@@ -421,7 +451,9 @@ export class Player extends Clip {
     }
     this._step(now);
     const size = this._size(now);
-    if (this._front && !this._drawing && (this._dirty || !this._isSized(size))) this._show(size);
+    const { _front: front } = this;
+    const counts = front && this._consumed(front.scene) > this._held;
+    if (counts && !this._drawing && (this._dirty || !this._isSized(size))) this._show(size, front);
     if (this._playing || !this._isSettled()) this._wake();
   }
 
@@ -431,21 +463,71 @@ export class Player extends Clip {
       this._advance(this._lastFrame ? Math.min((now - this._lastFrame) / 1000, 0.25) : 0);
       this._lastFrame = now;
     }
-    const undrawn = this._front && this._shownLevel === null; // the first picture does not wait for the second
-    if (!this._evaluating && !undrawn && !this._isEvaluated()) this._evaluate();
-    this._sort();
+    this._assign();
+    for (const [drawable, state] of this._states()) {
+      const waits = drawable.evaluating || this._waits() || drawable.isEvaluated(state);
+      if (!waits) this._evaluate(drawable, state);
+      this._sort(drawable);
+    }
   }
 
-  /** The state to show. @returns {State} */
-  _state() {
-    const scene = /** @type {Scene} */ (this._scene);
+  /** All that draw. */
+  _drawables() {
+    return this._second ? [this._main, this._second] : [this._main];
+  }
+
+  /** Gives the scene, and the one that it is blended with, to what has their Gaussians. */
+  _assign() {
+    const { _scene: scene, fading, _main: main, _second: second } = this;
+    if (fading && !second) this._second = new Drawable(this._options.evaluator);
+    if (this._second && scene !== main.scene && (second?.scene === scene || main.scene === fading?.scene)) {
+      [this._main, this._second] = [this._second, main];
+    }
+    if (!fading && this._second?.scene) this._second.clear();
+  }
+
+  /** What draws, and the state to show of each. @returns {[Drawable, State][]} */
+  _states() {
+    const { fading, _second: second } = this;
+    const main = this._state(/** @type {Scene} */ (this._scene));
+    return fading && second ? [[this._main, main], [second, this._state(fading.scene)]] : [[this._main, main]];
+  }
+
+  /** The state on show, of two the one of the scene. @returns {State | null} */
+  get _front() {
+    const [last] = this._fronts().slice(-1);
+    return last?.front?.state ?? null;
+  }
+
+  /** What is there of scenes to draw: that which fades, and the scene. Another one only if neither is there. */
+  _fronts() {
+    const { fading, _second: second, _main: main, _scene: scene } = this;
+    const wanted = fading && second?.scene === fading.scene ? [second, main] : [main];
+    const there = wanted.filter((drawable) => drawable.scene && (drawable === second || drawable.scene === scene));
+    return there.length || !main.front ? there : [main];
+  }
+
+  /** Whether nothing is to be evaluated yet: the first picture does not wait for the second, and while the poster is held
+   * what is there only makes the shaders ready. */
+  _waits() {
+    if (!this._front || this._shownLevel !== null) return false;
+    const [front, next] = [this._front.scene, this._scene].map((scene) => this._consumed(/** @type {Scene} */ (scene)));
+    return front > this._held || next <= this._held;
+  }
+
+  /** The state to show of a scene. @param {Scene} scene @returns {State} */
+  _state(scene) {
     const camera = /** @type {Camera} */ (this.camera);
     const level = this._front ? (this._level ?? 2) : 0; // the first picture is the one that comes soonest
     return stateOf(scene, Math.max(level, 0), this.time, centreOf(camera));
   }
 
   _isEvaluated() {
-    return !!this._front && sameState(this._front.state, this._state());
+    return this._states().every(([drawable, state]) => drawable.isEvaluated(state));
+  }
+
+  _isSorted() {
+    return this._states().every(([drawable]) => drawable.isSorted(this._row()));
   }
 
   _isSettled() {
@@ -454,11 +536,11 @@ export class Player extends Clip {
       !!this._front &&
       !this._dirty &&
       !this._drawing &&
-      !this._evaluating &&
-      !this._sorting &&
+      !this._drawables().some(({ evaluating, sorting }) => evaluating || sorting) &&
       this._isEvaluated() &&
       this._isSorted() &&
       !this._moving(now) &&
+      !this._status.loading &&
       this._isSized(this._size(now))
     );
   }
@@ -467,105 +549,34 @@ export class Player extends Clip {
     return /** @type {Camera} */ (this.camera).viewmat.slice(8, 12);
   }
 
-  _isSorted() {
-    const row = this._row();
-    return !!this._sortedRow && row.every((value, k) => value === this._sortedRow?.[k]);
-  }
-
-  /** Evaluates the Gaussians of the state to show. */
-  async _evaluate() {
-    const gpu = /** @type {Gpu} */ (this._gpu);
-    const opened = this._started;
-    const state = this._state();
-    this._evaluating = true;
+  /** Brings a scene's Gaussians to a state. @param {Drawable} drawable @param {State} state */
+  async _evaluate(drawable, state) {
+    const { _gpu: gpu, _painter: painter } = this;
     try {
-      const spare = this._spare;
-      this._spare = null;
-      const { splats, means } = await this._gaussians(gpu, state, spare);
-      if (gpu === this._gpu) this._spare = splats;
-      if (this._isStale(gpu, opened)) return;
-      if (means || !this._isSorted()) await this._order(state.scene, means);
-      if (this._isStale(gpu, opened)) return;
-      this._spare = this._front?.splats ?? null;
-      this._front = { splats, state };
+      if (!gpu || !painter) return;
+      if (!(await drawable.evaluate(gpu, painter, state, () => this._row()))) return;
       this.counts.evaluated++;
       this._dirty = true;
     } catch (error) {
-      if (this._isStale(gpu, opened)) return;
-      if (this._onCpu(gpu, state.scene)) {
-        this._fail(error);
-        this._scene = null;
-        return;
-      }
-      this._unfit = true; // networks that shaders cannot hold, or a driver that cannot compile them
-      this._evaluator?.free();
-      this._evaluator = null;
+      this._fail(error);
+      this._scene = null;
     } finally {
-      this._evaluating = false;
       this._wake();
     }
   }
 
-  /** @param {Gpu} gpu @param {Scene} scene */
-  _onCpu(gpu, scene) {
-    const { evaluator } = this._options;
-    const kind = drawing(scene);
-    if (evaluator === "cpu" || this._unfit || !gpu.floats || !kind.gpu) return true;
-    return evaluator !== "gpu" && gpu.software && scene.anchor.length <= 3 * kind.few;
-  }
-
-  /** @param {Gpu} gpu @param {State} state @param {Splats | null} into what may be overwritten
-   * @returns {Promise<Evaluated>} */
-  async _gaussians(gpu, state, into) {
-    const { scene, level, t, eye } = state;
-    const { gpu: evaluatorOn } = drawing(scene);
-    const onCpu = !evaluatorOn || this._onCpu(gpu, scene);
-    if (onCpu || this._evaluator?.scene !== scene) {
-      this._evaluator?.free();
-      this._evaluator = null;
-    }
-    if (onCpu) {
-      const cpu = (this._cpu ??= new CpuEvaluator());
-      const { count, data, means, width, height, still, changing } = await cpu.evaluate(state);
-      const field = gpu.renewed(into?.field, width, height, SPLAT_BLOCKS);
-      const blocks = into?.field === field && still && into.still === still ? changing : [0, 1, 2, 3];
-      for (const block of blocks) gpu.write(field, data, Math.ceil(count / width), block, 1);
-      return { splats: { field, still }, means };
-    }
-    this._evaluator ??= evaluatorOn(gpu, scene, (this._cpu ??= new CpuEvaluator()));
-    return this._evaluator.evaluate(level, t, eye, into, (opacities, ...rest) =>
-      this._sorter.call("list", [opacities, ...rest], [opacities.buffer]),
-    );
-  }
-
-  /** Brings the order to the camera. */
-  async _sort() {
-    if (!this._front || this._sorting || this._isSorted()) return;
-    this._sorting = true;
+  /** Brings a scene's order to the camera. @param {Drawable} drawable */
+  async _sort(drawable) {
+    const { _painter: painter } = this;
+    if (!painter || !drawable.front || drawable.sorting || drawable.isSorted(this._row())) return;
     try {
-      await this._order(this._front.state.scene, null);
+      await drawable.sort(painter, this._row());
+      this._dirty = true;
     } catch (error) {
       if (!this.closed) this._fail(error);
     } finally {
-      this._sorting = false;
       this._wake();
     }
-  }
-
-  /**
-   * Sorts Gaussians for the camera: others than before, or the sorter's. It answers calls in their order, so that an
-   * order on its way is for the Gaussians that are on show when it arrives.
-   *
-   * @param {Scene} scene @param {Float32Array | null} means
-   */
-  async _order({ info }, means) {
-    const gpu = this._gpu;
-    const row = this._row();
-    const order = await this._sorter.call("sort", [row, info.near, means], means ? [means.buffer] : []);
-    if (gpu !== this._gpu) return;
-    this._painter?.setOrder(order);
-    this._sortedRow = row;
-    this._dirty = true;
   }
 
   /** Width and height to draw, pixels. @param {number} now @returns {[number, number]} */
@@ -584,18 +595,17 @@ export class Player extends Clip {
     return width === this.canvas.width && height === this.canvas.height;
   }
 
-  /** Draws, and records when that is done. @param {[number, number]} size */
-  async _show(size) {
+  /** Draws, and records when that is done. @param {[number, number]} size @param {State} state the one on show */
+  async _show(size, state) {
     const gpu = /** @type {Gpu} */ (this._gpu);
     if (!this._isSized(size)) [this.canvas.width, this.canvas.height] = size;
     const opened = this._started;
     const started = performance.now();
-    const alone = !this._evaluating;
+    const alone = !this._drawables().some(({ evaluating }) => evaluating);
     const moving = this._moving(started);
     this._dirty = false;
     this._drawing = true;
     try {
-      const { state } = /** @type {{state: State}} */ (this._front);
       this._draw();
       await gpu.finished();
       if (this._isStale(gpu, opened)) return;
@@ -613,18 +623,24 @@ export class Player extends Clip {
   }
 
   /** Draws immediately. @param {(Camera & {x: number, y: number})[]} [eyes]
-   * @param {import("./painter.js").Target} [target] @returns {boolean} whether there were Gaussians */
+   * @param {import("./painter.js").Target} [target] @returns {State | null} the one on show, null without Gaussians */
   _draw(eyes, target) {
-    const { camera, _painter: painter, _front: front } = this;
-    if (!camera || !painter || !front) return false;
-    const { scene, level } = front.state;
+    const { camera, _painter: painter } = this;
+    const scenes = this._fronts().flatMap(({ front, order }) => {
+      if (!front || !order) return [];
+      const { scene, level } = front.state;
+      return [{ splats: front.splats, order, fill: levelOf(scene, level).fill, near: scene.info.near }];
+    });
+    if (!camera || !painter || !scenes.length) return null;
     const views = eyes ?? [fitted(camera, this.canvas.width, this.canvas.height, this.fit)];
-    painter.draw(front.splats, views, levelOf(scene, level).fill, scene.info.near, target);
-    return true;
+    painter.draw(scenes, views, scenes.length > 1 ? 1 - (this.fading?.share ?? 0) : 0, target);
+    return this._front;
   }
 
   /** A picture of a state is on the screen. @param {State} state @param {number} now */
   _shown({ scene, level }, now) {
+    this._held = 0;
+    this._begin();
     const before = this._shownLevel;
     const { rows } = levelOf(scene, level);
     const more = before !== null && (level > before || (level === before && rows > this._shownRows));

@@ -2,7 +2,7 @@
 
 import { SceneSource } from "../decode/fetch.js";
 import { Base, Stream } from "../decode/index.js";
-import { MOST_BYTES, parseIndex, segmentAt } from "./timeline.js";
+import { MOST_BYTES, parseIndex, segmentsAt } from "./timeline.js";
 /** @import { Scene } from "../kinds/index.js" */
 /** @import { Index } from "./timeline.js" */
 
@@ -66,10 +66,10 @@ export class Segments {
   }
 
   /**
-   * Brings the segment at a time, and the next one; base first. A later call ends an earlier one. What cannot be brought
+   * Brings the segments at a time, and the next one; bases first. A later call ends an earlier one. What cannot be brought
    * is told of, and the rest goes on.
    *
-   * @param {{time?: number | null, maxLayer?: number, bytes?: number}} budget bytes: of base and both segments
+   * @param {{time?: number | null, maxLayer?: number, bytes?: number}} budget bytes: of bases and segments
    * @returns {Promise<boolean>} whether it was not ended
    */
   async load({ time, maxLayer = Infinity, bytes = Infinity }) {
@@ -78,13 +78,16 @@ export class Segments {
     try {
       this.index ??= parseIndex(await this._text(run.signal));
       const { segments } = this.index;
-      const now = segmentAt(segments, time ?? -Infinity);
-      const near = [now, now + 1].filter((k) => k < segments.length);
+      const shown = segmentsAt(segments, time ?? -Infinity);
+      const [now] = shown;
+      const near = [...shown, now + 1].filter((k) => k < segments.length);
       this._have = new Set(near.filter((k) => this._have.has(k) && maxLayer <= this._level));
       this._level = maxLayer;
+      const based = new Set();
       for (const k of near) {
         const { base } = segments[k];
-        if (base !== null) bytes -= base === segments[now].base && k > now ? 0 : this.index.bases[base].bytes;
+        if (base !== null && !based.has(base)) bytes -= this.index.bases[base].bytes;
+        based.add(base);
         if (bytes < segments[k].bytes && k > now) break;
         if (!this._have.has(k)) await this._bring(k, { maxLayer, bytes }, run.signal);
         bytes -= segments[k].bytes;

@@ -24,6 +24,20 @@ export function segmentAt(segments, seconds) {
   return low;
 }
 
+/** The numbers of the segments that show a time, the later one first.
+ * @param {{range: [number, number]}[]} segments @param {number} seconds */
+export function segmentsAt(segments, seconds) {
+  const now = segmentAt(segments, seconds);
+  return now && seconds < segments[now - 1].range[1] ? [now, now - 1] : [now];
+}
+
+/** The weight of a segment where the one before it overlaps it. @param {{range: [number, number]}[]} segments
+ * @param {number} k of the segment @param {number} seconds */
+export function weightAt(segments, k, seconds) {
+  const [from, to] = [segments[k].range[0], segments[k - 1].range[1]];
+  return Math.min(Math.max((seconds - from) / (to - from), 0), 1);
+}
+
 /** Reads an index, which is not trusted. @param {string} text @returns {Index} */
 export function parseIndex(text) {
   const content = JSON.parse(text);
@@ -49,8 +63,10 @@ export function parseIndex(text) {
   for (const { file, bytes, base, time_range } of segments) {
     const [start, end] = Array.isArray(time_range) ? time_range : [];
     const before = found[found.length - 1]?.range ?? [-Infinity, Infinity];
+    const second = found[found.length - 2]?.range ?? [-Infinity, -Infinity];
     const ordered = Number.isFinite(start) && Number.isFinite(end) && start < end;
     expect(ordered && start > before[0] && start <= before[1] && (end > before[1] || !found.length), "times out of order");
+    expect(start >= second[1], "three segments at a time");
     expect(base === null || (Number.isInteger(base) && base >= 0 && base < bases.length), "an unknown base");
     found.push({ file, bytes, base, range: [start, end] });
   }

@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 
 import { Segments } from "../render/segments.js";
-import { parseIndex, segmentAt } from "../render/timeline.js";
+import { parseIndex, segmentAt, segmentsAt, weightAt } from "../render/timeline.js";
 
 const FILE = { file: "a.pd4", bytes: 9, base: 0, time_range: [0, 2] };
 const INDEX = {
@@ -20,6 +20,12 @@ test("an index is read", () => {
   assert.deepEqual([-1, 0, 1.4, 1.5, 9].map((t) => segmentAt(segments, t)), [0, 0, 0, 1, 1]); // prettier-ignore
 });
 
+test("two segments show a time at which they overlap", () => {
+  const { segments } = parseIndex(JSON.stringify(INDEX));
+  assert.deepEqual([1.4, 1.5, 1.9, 2, 9].map((t) => segmentsAt(segments, t)), [[0], [1, 0], [1, 0], [1], [1]]); // prettier-ignore
+  assert.deepEqual([1.5, 1.625, 2, 9].map((t) => weightAt(segments, 1, t)), [0, 0.25, 1, 1]); // prettier-ignore
+});
+
 for (const [name, change] of Object.entries({
   version: { segments_version: 2 },
   "no segments": { segments: [] },
@@ -31,6 +37,7 @@ for (const [name, change] of Object.entries({
   base: { segments: [{ ...FILE, base: 1 }] },
   times: { segments: [FILE, FILE] },
   "a gap": { segments: [FILE, { ...FILE, file: "b.pd4", time_range: [3, 4] }] },
+  "three at a time": { segments: [FILE, { ...FILE, time_range: [1, 3] }, { ...FILE, time_range: [1.5, 4] }] },
   "no time": { segments: [{ ...FILE, time_range: ["0", 2] }] },
 })) {
   test(`an index with a fault is refused: ${name}`, () => {
@@ -57,6 +64,8 @@ test("what is missing is told of, and the next segment is asked for", async () =
   assert.ok(told.every(({ problem }) => problem?.includes("the server answered 404")));
   await segments.load({ time: 3 });
   assert.deepEqual(asked.slice(3), ["b.pd4"]);
+  await segments.load({ time: 1.75 }); // of both
+  assert.deepEqual(asked.slice(4), ["b.pd4", "base.pd4"]);
 });
 
 test("the next segment waits for a budget that it fits in", async () => {

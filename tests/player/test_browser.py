@@ -541,6 +541,28 @@ def test_the_first_picture_comes_before_layer_0_is_whole(harness, folder):
     assert decibels(shot.player, shot.expected) > LEAST_DB
 
 
+def test_a_poster_stays_until_more_of_the_file_shows_more(harness, folder, lively):
+    ends = [row["end"] for row in info(lively)["layers"]]
+    first = "harness.events.find(([name]) => name === 'firstpicture')?.[1]"
+    with Server(folder, link=Link(8 * len(lively) / 3)) as slow, slow.running():
+        url = slow.url_of("scene.pd4")
+        harness.evaluate("([url, held]) => void harness.open(url, 96, 72, { held, autoplay: true })", [url, ends[0]])
+        harness.wait_for_function("harness.player._front")
+        assert harness.evaluate("[harness.player.status.level, harness.player.paused]") == [None, True]
+        harness.wait_for_function(first)
+        assert harness.evaluate(first)["consumed"] in ends[1:] and harness.evaluate("!harness.player.paused")
+
+        harness.evaluate("(url) => void harness.open(url, 96, 72, { held: 1e9 })", url)
+        harness.wait_for_function("harness.player._front")
+        harness.evaluate("harness.player.camera = harness.player.camera")  # as a viewer does
+        harness.wait_for_function(first)
+        assert harness.evaluate(first)["consumed"] < len(lively)
+
+        opened(harness, url, held=1e9, level=1)  # more does not come
+        harness.wait_for_function(first)
+        assert harness.evaluate(first)["consumed"] == ends[1]
+
+
 def test_budgets_are_kept_and_may_be_raised(harness, server, lively):
     ends = [row["end"] for row in info(lively)["layers"]]
     events = opened(harness, server.url_of("scene.pd4"), bytes=ends[1] + 10)
@@ -682,14 +704,14 @@ def test_an_evaluation_that_ends_after_its_scene_was_replaced_is_not_shown(harne
         """async (url, arrived) => {
           const { player } = harness;
           await player.settled();
-          const evaluated = player._gaussians;
+          const evaluated = player._main._gaussians;
           let release = () => {};
           const held = new Promise((resolve) => (release = resolve));
           const begun = new Promise((resolve) => {
-            player._gaussians = async (...args) => {
-              player._gaussians = evaluated;
+            player._main._gaussians = async (...args) => {
+              player._main._gaussians = evaluated;
               resolve();
-              const result = await player._gaussians(...args);
+              const result = await player._main._gaussians(...args);
               await held;
               return result;
             };
@@ -813,10 +835,10 @@ def test_a_slow_machine_shows_smaller_pictures_never_a_lower_level(page, server)
     page.evaluate(
         f"""() => {{
           const {{ player }} = {ELEMENT};
-          const evaluated = player._gaussians;
-          player._gaussians = async (...args) => {{
+          const evaluated = player._main._gaussians;
+          player._main._gaussians = async (...args) => {{
             await new Promise((resolve) => setTimeout(resolve, 450)); // more than a level may take, in older players
-            return evaluated.apply(player, args);
+            return evaluated.apply(player._main, args);
           }};
           player._pace._step = 3;
           player.play();

@@ -6,6 +6,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,9 +29,13 @@ from test_browser import (  # noqa: F401 - fixtures
 )
 
 from pd4dgs_codec import decode, encode
+from pd4dgs_codec.draw.player import drawer
 from pd4dgs_codec.quality.timeline import Timeline
-from pd4dgs_codec.segments import INDEX, read_index
+from pd4dgs_codec.scene import Camera
+from pd4dgs_codec.segments import INDEX, Segment, file_of, read_index
 from pd4dgs_codec.web.server import Server
+
+LAP = 0.5  #: seconds that segments overlap
 
 
 @pytest.fixture(scope="module")
@@ -44,8 +49,37 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
     base, path = root / "odd" / "base-0000.pd4", root / "odd" / "00002.pd4"
     still, scene = decode(base), decode(path, base=base)
     path.write_bytes(encode(scene, base=encode(replace(still, info=replace(still.info, near=still.info.near / 2)))))
+    overlapping(root / "whole", root / "overlapping")
     with Server(root) as served, served.running():
         yield served
+
+
+def overlapping(source: Path, folder: Path) -> None:
+    """Copies segments to ranges that are longer at both ends, and so overlap."""
+    shutil.copytree(source, folder)
+    _, index = read_index(folder)
+    base, parts = folder / index.bases[0].file, []
+    for segment in index.segments:
+        scene, (start, end) = decode(folder / segment.file, base=base), segment.time_range
+        times = (max(start - LAP / 2, 0.0), min(end + LAP / 2, 4.0))
+        data = encode(replace(scene, info=replace(scene.info, time_range=times)), base=base)
+        (folder / segment.file).write_bytes(data)
+        parts.append(Segment(**vars(file_of(segment.file, data)), time_range=times, base=0))
+    (folder / INDEX).write_bytes(replace(index, segments=tuple(parts)).packed())
+
+
+def blended(folder: Path, camera: Camera, seconds: float) -> np.ndarray:
+    """The rasteriser's picture of a time, by the rule of overlaps."""
+    _, index = read_index(folder)
+    pictures, weights = [], []
+    for k, segment in enumerate(index.segments):
+        start, end = segment.time_range
+        if not start <= seconds < end:
+            continue
+        part = drawer(decode(folder / segment.file, base=folder / index.bases[0].file))
+        pictures.append(np.clip(part.picture(camera, (seconds - start) / (end - start)), 0, 1))
+        weights.append(min((seconds - start) / LAP, 1.0) if k else 1.0)
+    return pictures[0] if len(pictures) == 1 else (1 - weights[1]) * pictures[0] + weights[1] * pictures[1]
 
 
 def kept(page: Any, player: str) -> list[int]:
@@ -66,6 +100,33 @@ def test_pictures_of_all_times_are_those_of_the_rasteriser(harness: Any, server:
         k = min(int(seconds), 3)
         assert set(kept(harness, "harness.player")) <= {-1, k, k + 1}
     assert harness.evaluate("harness.player.timeRange") == [0, 4]
+
+
+def test_pictures_are_blended_where_segments_overlap(harness: Any, server: Server) -> None:
+    folder = server.root / "overlapping"
+    events = opened(harness, server.url_of(f"overlapping/{INDEX}"))
+    assert [name for name, _ in events].count("error") == 0
+    info = decode(folder / "00000.pd4", base=folder / "base-0000.pd4").info
+    assert info.camera is not None
+    camera = resized(info.camera, WIDTH, HEIGHT)
+    for seconds in (0.7, 0.8, 0.95, 1.2, 2.0, 3.1, 1.1, 0.5):  # forwards and backwards, from one overlap to others
+        got = shoot(harness, camera, 2, seconds)
+        assert decibels(got, blended(folder, camera, seconds)) > LEAST_DB, seconds
+        assert len(kept(harness, "harness.player")) <= 4
+        assert (harness.evaluate("harness.player.fading?.share ?? 0") > 0) == (abs(seconds - round(seconds)) < LAP / 2)
+
+
+@pytest.mark.parametrize("missing", [1, 2])
+def test_a_segment_that_is_missing_leaves_the_other_one_of_an_overlap(page: Any, server: Server, missing: int) -> None:
+    page.route(f"**/{missing:05d}.pd4", lambda route: route.fulfill(status=404))
+    player = element(page, server, f'src="overlapping/{INDEX}" controls')
+    until(page, f"{ELEMENT}?.player?.scene?.layers.length === 2")
+    page.evaluate(f"{ELEMENT}.seek(2)")
+    until(page, f"{ELEMENT}.player.problem.includes('404') && {ELEMENT}.player.awaited === null")
+    assert not player.get_by_role("alert").is_hidden()
+    there = 3 - missing
+    assert page.evaluate(f"{ELEMENT}.player.scene === {ELEMENT}.player._parts.get({there})")
+    assert page.evaluate(f"{ELEMENT}.player.fading") is None
 
 
 def test_playing_fetches_each_file_once_and_holds_two_segments(page: Any, server: Server) -> None:

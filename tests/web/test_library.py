@@ -20,7 +20,7 @@ VIDEO = replace(fake_video(), poster=b"\xff\xd8 a picture")
 @pytest.fixture(scope="module")
 def packages(scene_bytes):
     """Two, one with names that never change."""
-    return {"a b": package(scene_bytes, lambda scene: VIDEO, immutable=True), "c": package(scene_bytes)}
+    return {"a b": package(scene_bytes, lambda scene, share: VIDEO, immutable=True), "c": package(scene_bytes)}
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def shelf(tmp_path, packages):
 
 def test_what_others_name_carries_its_digest(scene_bytes, packages):
     files = packages["a b"]
-    plain = package(scene_bytes, lambda scene: VIDEO)
+    plain = package(scene_bytes, lambda scene, share: VIDEO)
     named = {name: found for name in files if (found := re.search("-([0-9a-f]{16})[.]", name))}
     assert len(named) == 4 and len(files) == len(plain) and all(files.values())
     for name, found in named.items():
@@ -45,7 +45,7 @@ def test_what_others_name_carries_its_digest(scene_bytes, packages):
         assert re.sub(b"-[0-9a-f]{16}(?=[.])", b"", files[name]).count(b"scene.") >= plain[name].count(b"scene.")
     text = b"".join(files[name] for name in files if name not in named)
     assert all(name.encode() in text for name in named)
-    assert package(scene_bytes, lambda scene: VIDEO, immutable=True) == files
+    assert package(scene_bytes, lambda scene, share: VIDEO, immutable=True) == files
 
 
 def test_the_index_says_what_caches_may_keep_and_when_a_picture_is_there(scene_bytes, packages):

@@ -12,9 +12,11 @@ from common import ROOT, SHARED
 from strategies import LAYER_SETS, make_scene
 
 from pd4dgs_codec import decode, encode
+from pd4dgs_codec.cli.package import _still
 from pd4dgs_codec.errors import DeliveryError, Malformed, Truncated
 from pd4dgs_codec.format import reader
 from pd4dgs_codec.format.container import read_preamble, write_chunk, write_preamble
+from pd4dgs_codec.format.decoder import every_prefix
 from pd4dgs_codec.format.header import pack_header, unpack_header
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.web import manifests
@@ -39,7 +41,7 @@ def fake_video(fps: float = 20.0, samples: tuple[int, ...] = (40, 40, 7)) -> Vid
 
 @pytest.fixture(scope="module", params=[False, True], ids=["layers only", "with video"])
 def packaged(request, scene_bytes) -> dict[str, bytes]:
-    return package(scene_bytes, lambda scene: fake_video() if request.param else None)
+    return package(scene_bytes, lambda scene, share: fake_video() if request.param else None)
 
 
 def _sets(files: dict[str, bytes]) -> list[ElementTree.Element]:
@@ -106,7 +108,7 @@ def test_the_manifest_is_valid(layers, video):
     etree = pytest.importorskip("lxml.etree")
     schema = etree.XMLSchema(etree.parse(str(SCHEMA)))
     data = encode(make_scene(3, layers=layers, anchors=3), layers=2, effort=1)
-    document = etree.fromstring(package(data, lambda scene: video)[MPD])
+    document = etree.fromstring(package(data, lambda scene, share: video)[MPD])
     schema.assertValid(document)
     document[0][-1][-1].set("codecs", "application/x-pd4")  # the check can fail
     assert not schema.validate(document)
@@ -122,7 +124,7 @@ def test_a_manifest_grows_with_the_slices_and_no_faster():
 
 def test_the_video_is_listed_fragment_by_fragment(scene_bytes):
     video = fake_video()
-    files = package(scene_bytes, lambda scene: video)
+    files = package(scene_bytes, lambda scene, share: video)
     init, pieces = manifests.fragments(video.data)
     assert [piece.samples for piece in pieces] == [40, 40, 7]
     playlist = files["fallback.m3u8"].decode().splitlines()
@@ -237,6 +239,15 @@ def test_scenes_that_make_no_video(cli, tmp_path, time_range, camera, says):
     assert not (tmp_path / "out" / "fallback.mp4").exists()
 
 
+def test_a_picture_is_worth_the_bytes_that_show_less():
+    """It is compared with what each prefix shows, and leaves before the first of those that all show more."""
+    pytest.importorskip("numba")
+    data = (ROOT / "pd4dgs_codec" / "samples" / "dancer.pd4").read_bytes()
+    first, *_, whole = every_prefix(data)
+    prefixes = [(10, whole), (20, first), (30, whole)]
+    assert [_still(whole, iter(prefixes[:n])).worth for n in (1, 3)] == [0, 20]
+
+
 def test_a_rendered_video_is_packaged(cli, folder, tmp_path, monkeypatch):
     pytest.importorskip("torch")
     pytest.importorskip("imageio_ffmpeg")
@@ -251,7 +262,7 @@ def test_a_rendered_video_is_packaged(cli, folder, tmp_path, monkeypatch):
     monkeypatch.setattr(reader, "read_slice", lambda *args: read.append(args[1]) or read_slice(*args))
     done = cli("package", folder / "small.pd4", "-o", tmp_path / "out", "--fps", 10, "--json")
     assert done.code == 0 and done.json["video"] is True, done.err
-    assert read == [0, 1, 2]  # each layer is decoded once, for the check and for the video
+    assert read == 2 * [0, 1, 2]  # for check and video, and for what prefixes show beside the page's picture
     init, pieces = manifests.fragments((tmp_path / "out" / "fallback.mp4").read_bytes())
     low, high = scene.info.time_range
     assert sum(piece.samples for piece in pieces) == round((high - low) * 10) and len(pieces) == 2

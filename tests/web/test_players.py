@@ -45,7 +45,7 @@ def packaged(scene_bytes, missing, tmp_path_factory) -> Server:
     pictures = (np.full((SIZE, SIZE, 3), 50 + 5 * i, np.uint8) for i in range(30))
     write_mp4(pictures, folder / "video.mp4", FPS, fragment=10)
     video = Video((folder / "video.mp4").read_bytes(), SIZE, SIZE, FPS)
-    for name, content in package(scene_bytes, lambda scene: video).items():
+    for name, content in package(scene_bytes, lambda scene, share: video).items():
         (folder / name).write_bytes(content)
     with Server(folder) as server, server.running():
         yield server

@@ -28,7 +28,7 @@ def served(scene_bytes, tmp_path_factory) -> Iterator[Server]:
     root = tmp_path_factory.mktemp("pages")
     still = Still(PICTURE, 1.5, 4 / 3, "rgb(1,2,3)")
     (root / "library" / "one").mkdir(parents=True)
-    for name, content in package(scene_bytes, draw=lambda scene: still).items():
+    for name, content in package(scene_bytes, draw=lambda scene, prefixes: still).items():
         (root / "library" / "one" / name).write_bytes(content)
     for name, content in library(root / "library").items():
         (root / "library" / name).write_bytes(content)

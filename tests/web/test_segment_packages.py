@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import xml.etree.ElementTree as ElementTree
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ SCHEMA = SHARED / "dash-schema" / "DASH-MPD.xsd"
 
 @pytest.fixture(scope="module", params=[False, True], ids=["layers only", "with video"])
 def packaged(request):
-    return dict(package_segments(segmented.folder(), lambda scene: fake_video() if request.param else None))
+    return dict(package_segments(segmented.folder(), lambda scene, share: fake_video() if request.param else None))
 
 
 def test_the_index_gives_every_slice_by_its_bytes(packaged):
@@ -65,6 +66,19 @@ def test_periods_share_the_sets_of_their_base(packaged):
         ]
         assert ids == ["B0", "L0", "L1"][: len(ids)] and after == ids[:-1]
     assert len(set(firsts)) == 1
+
+
+def test_periods_and_videos_end_where_the_next_segment_begins(tmp_path):
+    shutil.copytree(segmented.folder(), tmp_path / "in")
+    _, index = read_index(tmp_path / "in")
+    longer = [replace(s, time_range=(s.time_range[0], s.time_range[1] + 0.25)) for s in index.segments]
+    (tmp_path / "in" / INDEX).write_bytes(replace(index, segments=tuple(longer)).packed())
+    shares = []
+    files = dict(package_segments(tmp_path / "in", lambda scene, share: shares.append(share)))
+    root = ElementTree.fromstring(files["scene.mpd"])
+    assert [p.get("start") for p in root.findall("d:Period", NAMESPACE)] == ["PT0S", "PT1S", "PT2S", "PT3S"]
+    assert root.get("mediaPresentationDuration") == "PT4.25S" and shares == [0.8, 0.8, 0.8, 1.0]
+    assert parse(files[INDEX], "it").segments[1].time_range == (1.0, 2.25)
 
 
 @pytest.mark.skipif(not SCHEMA.exists(), reason=f"no {SCHEMA}")
