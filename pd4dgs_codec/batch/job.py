@@ -62,7 +62,7 @@ KEYS = ("source", "output", "options", "needs")
 @dataclass(frozen=True)
 class Line:
     """A valid line. number: from 1 on. output: a path below the root of the batch. needs: options that name the output
-    of another line, which is made first."""
+    of another line, which needs nothing and is made first."""
 
     number: int
     source: str
@@ -95,7 +95,12 @@ def read_manifest(place: str, op: Op, check: Check) -> tuple[list[Line], list[tu
                 faults.append((number, one_line(f"{type(error).__name__}: {error}")))
     if not (lines or faults):
         raise DataError(f"{place}: is empty, expected one JSON object per scene")
-    return lines, faults
+    made = {line.output for line in lines if not line.needs}
+    for line in lines:
+        if lost := [output for output in line.needs.values() if output not in made]:
+            fault = f"found needs of {lost[0]!r}, expected the output of a valid line that needs nothing"
+            faults.append((line.number, fault))
+    return [line for line in lines if made.issuperset(line.needs.values())], sorted(faults)
 
 
 def _line(number: int, raw: bytes, op: Op, check: Check) -> Line:

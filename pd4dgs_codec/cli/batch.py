@@ -12,7 +12,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from pd4dgs_codec.batch.job import OPS, Job, Outcome, arguments, read_manifest, scan
+from pd4dgs_codec.batch.job import OPS, Job, Line, Outcome, arguments, read_manifest, scan
 from pd4dgs_codec.cli import common, options
 from pd4dgs_codec.cli.common import FAILED, OK, STDIO, Console, UsageError, progress_bar, say
 from pd4dgs_codec.errors import DataError, printable
@@ -149,7 +149,13 @@ def _batch(args: argparse.Namespace, console: Console) -> int:
 
         summary = dict[str, Any]()
         for needy in (False, True):
-            stage = [line.at(output) for line in lines if bool(line.needs) == needy]
+            stage, failed = list[Line](), {row["output"] for row in failures}
+            for line in (line for line in lines if bool(line.needs) == needy):
+                if lost := failed.intersection(line.needs.values()):  # an earlier batch may have left such an output
+                    failures.append(_failed(args.input, line.number, line.output, f"needs {min(lost)}, which failed"))
+                    step()
+                else:
+                    stage.append(line.at(output))
             jobs = (Job(line, args.op, output, threads, args.overwrite) for line in stage)
             if stage or not needy:
                 for name, n in run(jobs, command, args.on, settings, args.retries, told).items():

@@ -19,12 +19,21 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any, TextIO
 
-from pd4dgs_codec.errors import DamageWarning, DecodeError, DeliveryError, EncodeError, Pd4Error, one_line, printable
+from pd4dgs_codec.errors import (
+    DamageWarning,
+    DataError,
+    DecodeError,
+    DeliveryError,
+    EncodeError,
+    Pd4Error,
+    one_line,
+    printable,
+)
 from pd4dgs_codec.signals import ignore_more, interruptible
 from pd4dgs_codec.threads import configure
 
 if TYPE_CHECKING:
-    from pd4dgs_codec.data.view import Dataset
+    from pd4dgs_codec.data.view import Dataset, View
     from pd4dgs_codec.scene import LayeredScene, Scene, SceneInfo, Viewpoint
     from pd4dgs_codec.train.loop import Trainer
 
@@ -34,6 +43,8 @@ atexit.register(gc.freeze)
 OK, FAILED, USAGE, PARTIAL = 0, 1, 2, 3
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  #: errors of a full disk
 STDIO = "-"
+#: Times of a scene and a dataset that differ by less than this share of the duration are the same.
+SAME_TIME = 1e-3
 #: Least time between two lines if stderr is not a terminal.
 LINE_SECONDS = 10.0
 EXTRAS = {"ray": "cluster", "submitit": "cluster"}  #: extra of each module that the extra `train` does not install
@@ -271,14 +282,39 @@ def write_checkpoint(path: str, scene: LayeredScene, overwrite: bool) -> None:
 
 
 def read_dataset(source: str, args: argparse.Namespace, info: SceneInfo) -> Dataset:
-    """Reads the dataset `source` with the options of `add_reading`, over the background of the scene to compare; says
-    what was assumed or left out."""
-    from pd4dgs_codec.interchange.teacher import load_source
+    """Reads the dataset `source` with the options of `add_reading`, over the background of the scene to compare, and of
+    segments its part of their time; says what was assumed or left out. Raises DataError."""
+    from dataclasses import replace
+    from pathlib import Path
 
-    dataset = load_source(source, downscale=args.downscale, holdout=args.holdout, background=info.background)
+    from pd4dgs_codec.interchange.teacher import load_source
+    from pd4dgs_codec.segments import is_folder, read_index
+
+    place = next((p for p in (Path(args.input), Path(args.input).parent) if is_folder(p)), None)
+    reading = place and read_index(place)[1].made.get("reading")  # of its training
+    fps = reading.get("fps") if isinstance(reading, dict) else None
+    fps = fps if type(fps) in (int, float) and fps > 0 else None
+    dataset = load_source(source, downscale=args.downscale, holdout=args.holdout, background=info.background, fps=fps)
     for remark in dataset.origin.notes:
         say(f"note: {remark}")
-    return dataset
+    (low, high), (start, stop) = dataset.time_range, info.time_range
+    whole, part = high - low, stop - start
+    if not place or start < low - SAME_TIME * whole or stop > high + SAME_TIME * whole:
+        if abs(whole - part) > SAME_TIME * whole:
+            say(f"note: {source} lasts {whole:.4g} s, {args.input} {part:.4g} s: compared at the same shares of both")
+        return dataset
+    if part > (1 - SAME_TIME) * whole:
+        return dataset
+
+    def within(views: Iterable[View]) -> tuple[View, ...]:
+        times = ((view, (low + view.time * whole - start) / part) for view in views)
+        return tuple(replace(v, time=min(max(t, 0.0), 1.0)) for v, t in times if -SAME_TIME <= t <= 1 + SAME_TIME)
+
+    train, test = within(dataset.train), within(dataset.test)
+    if not train:
+        raise DataError(f"{source}: has no views from {start:.4g} to {stop:.4g} s, the time of {args.input}")
+    say(f"note: {args.input} shows {start:.4g} to {stop:.4g} of {low:.4g} to {high:.4g} s: compared with these views")
+    return replace(dataset, train=train, test=test, time_range=info.time_range)
 
 
 def check_output(path: str, overwrite: bool) -> None:

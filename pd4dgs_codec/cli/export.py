@@ -210,10 +210,13 @@ def _write_sequence(args: argparse.Namespace, player: Drawer, eyes: Eyes | None)
     starts = frame_times(player.info, args.fps)
 
     def frames(step: Callable[[], None]) -> Iterator[tuple[float, Splats, np.ndarray]]:
+        part, number = None, -1
         for seconds in starts:
             t = min(seconds / (stop - start), 1.0) if stop > start else 0.0
+            before, part = part, player.at(t)[0]
+            number += part is not before  # segments have slots of their own
             splats, slots = exported(player, t, eyes, args.sh)
-            yield seconds, splats.scaled(args.scale), slots
+            yield seconds, splats.scaled(args.scale), slots + (number << 40)
             step()
 
     with progress_bar(len(starts), "frames", "exporting") as step:

@@ -55,7 +55,7 @@ def _info(args: argparse.Namespace, console: Console) -> int:
     result = {"input": args.input, **info(data), "available": total}
     end = result["layers"][0]["slices"][0]["end"]
     result["first_frame_seconds"] = {name: 8 * end / rate for name, rate in args.at.items()}
-    result["left_out"] = _left_out(result["layers"])
+    result["left_out"] = [] if "degree" in result else _left_out(result["layers"])  # splats have the layers they need
     if args.bytes or args.check:
         base = base_beside(args.input)
         _, layers = read_layers(data, base=base)

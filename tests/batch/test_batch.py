@@ -118,6 +118,29 @@ def test_a_broken_line_is_named_and_the_others_go_on(library, line, what):
     assert library.run()["done"] == 1
 
 
+@pytest.mark.parametrize(
+    "needs",
+    [
+        {"a.pd4": "none.pd4"},
+        {"a.pd4": "a.pd4"},
+        {"a.pd4": "c.pd4", "c.pd4": "a.pd4"},
+        {"a.pd4": "c.pd4", "c.pd4": "b.pd4"},
+    ],
+)
+def test_only_outputs_of_lines_that_need_nothing_can_be_needed(library, needs):
+    """Not one that is missing, the line's own, or of a cycle or a chain: the lines run at one time."""
+    for name in ("a", "b", "c"):
+        need = needs.get(f"{name}.pd4")
+        library.add(f"{name}.pt", "fine", **({"needs": {"data": need}} if need else {}))
+    lines, faults = library.manifest()
+    chained = {"b.pd4"} & set(needs.values())
+    assert {line.output for line in lines} == {"a.pd4", "b.pd4", "c.pd4"} - set(needs) | (
+        {"c.pd4"} if chained else set()
+    )
+    number, message = faults[0]
+    assert number == 1 and f"found needs of {needs['a.pd4']!r}" in message
+
+
 STORES = ("dir:///", "reference://", "zip://none.zip", "sftp://127.0.0.1:9/x", "simplecache::none", "\0", "a\ud800b")
 
 

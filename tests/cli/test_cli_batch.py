@@ -57,6 +57,18 @@ def test_lines_that_fail_are_named_with_their_logs_and_the_others_go_on(cli, tmp
     assert not (tmp_path / "out" / "b.pd4").exists()
 
 
+def test_what_an_earlier_batch_left_does_not_stand_for_a_need_that_failed(cli, tmp_path, manifest):
+    lines = manifest(
+        {"source": "models/a.pt", "options": {"slices": "50k"}, "needs": {"data": "base.pd4"}},
+        {"source": "missing.pt", "output": "base.pd4"},
+    )
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "base.pd4").write_text("of an earlier batch")
+    done = cli("batch", lines, "--op", "encode", "-o", "out", "--workers", "0", "--json")
+    assert [row["line"] for row in done.json["failures"]] == [2, 1] and done.json["failed"] == 2
+    assert done.json["failures"][1]["message"] == "needs base.pd4, which failed"
+
+
 @pytest.mark.parametrize(
     "op,options,message",
     [

@@ -1,5 +1,6 @@
 """A folder of segments as one scene with one time axis."""
 
+import json
 import shutil
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 import segmented
 from PIL import Image
 
+from pd4dgs_codec.interchange import splats
 from pd4dgs_codec.interchange.splats import picture, read_splats
 from pd4dgs_codec.quality.image import mpsnr, to_uint8
 from pd4dgs_codec.quality.levels import load_levels
@@ -57,6 +59,28 @@ def test_commands_take_a_folder_or_its_index(cli, tmp_path, place):
     source = f"teacher:{segmented.folder().parent / 'frames'}?views=4&size=48x48&fps=4"
     levels = cli("eval", scene, source, "--holdout", 2, "--json").json["levels"]
     assert len(levels) == 2 and levels[1]["mpsnr"] > 34
+
+
+def test_a_part_is_compared_with_the_views_of_its_time(cli, own):
+    """A file of a folder, and a folder that is not finished, show less time than the data."""
+    source = f"teacher:{segmented.folder().parent / 'frames'}?views=12&size=48x48&fps=4"
+    index = json.loads((own / INDEX).read_text())
+    index["segments"] = index["segments"][:2]
+    (own / INDEX).write_text(json.dumps(index))
+    for part, times in (("00001.pd4", "1 to 2"), ("", "0 to 2")):
+        found = cli("eval", own / part, source, "--holdout", 2, "--json")
+        assert found.json["levels"][1]["mpsnr"] > 34, found.err
+        assert f"shows {times} of 0 to 4 s: compared with these views" in found.err
+    other = cli("eval", own, f"{source}0", "--holdout", 2)  # 40 frames a second
+    assert "lasts 0.4 s" in other.err and "2 s: compared at the same shares of both" in other.err
+
+
+def test_no_gaussian_of_a_4dgs_file_moves_to_one_of_another_segment(cli, tmp_path, monkeypatch):
+    kept = []
+    monkeypatch.setattr(splats, "fourdgs_bytes", lambda frames, seconds: kept.extend(frames) or b"4")
+    assert cli("export", segmented.folder(), "-o", tmp_path / "a.4dgs", "--fps", 4).code == 0
+    same = [len(np.intersect1d(a[2], b[2])) for a, b in zip(kept[:-1], kept[1:], strict=True)]
+    assert [i for i, count in enumerate(same) if not count] == [3, 7, 11] and max(same) > 200
 
 
 def test_one_segment_finds_its_base_in_its_folder(cli, own, tmp_path):
