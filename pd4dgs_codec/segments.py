@@ -45,8 +45,8 @@ class Segment(File):
 
 @dataclass(frozen=True)
 class Index:
-    """The files of a scene. segments: in the order of time; each begins where the one before ends, or within it. made:
-    what their maker needs to go on after an interruption."""
+    """The files of a scene. segments: in the order of time; each begins where the one before ends, or within it, and
+    not before the one before that has ended. made: what their maker needs to go on after an interruption."""
 
     bases: tuple[File, ...]
     segments: tuple[Segment, ...]
@@ -63,8 +63,19 @@ class Index:
         return (*self.bases, *self.segments)
 
     def at(self, seconds: float) -> int:
-        """Returns the number of the segment that shows this time: the last one that begins by then."""
-        return max(bisect_right(self.segments, seconds, key=lambda s: s.time_range[0]) - 1, 0)
+        """Returns the number of the segment that shows this time, of two that do the one of larger weight."""
+        return max(self.shown(seconds), key=lambda found: found[1])[0]
+
+    def shown(self, seconds: float) -> list[tuple[int, float]]:
+        """Returns the numbers of the segments that show this time, at most two, and their weights, which sum to 1: the
+        last one that begins by then, and the one before, unless it has ended. While both last, pictures are blended
+        linearly in time."""
+        later = max(bisect_right(self.segments, seconds, key=lambda s: s.time_range[0]) - 1, 0)
+        start, end = self.segments[later].time_range[0], self.segments[max(later - 1, 0)].time_range[1]
+        if not (later and seconds < end):
+            return [(later, 1.0)]
+        weight = (seconds - start) / (end - start)
+        return [(later - 1, 1 - weight), (later, weight)]
 
     def json(self) -> dict[str, Any]:
         """The content of the index file."""
@@ -115,6 +126,9 @@ def parse(data: bytes, where: str) -> Index:
         if before and not (before[0] < start <= before[1] < end):
             raise DataError(f"{what}: time range {start:g} to {end:g} s after {before[0]:g} to {before[1]:g} s, "
                             "expected one that begins by its end and ends later")  # fmt: skip
+        if len(segments) > 2 and start < (ended := segments[-3].time_range[1]):
+            raise DataError(f"{what}: begins at {start:g} s, expected {ended:g} s or later, where the second before it "
+                            "ends")  # fmt: skip
     names = [file.file for file in (*bases, *segments)]
     if len(set(names)) < len(names):
         raise DataError(f"{where}: names a file twice, expected different ones")

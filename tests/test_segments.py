@@ -34,9 +34,15 @@ def test_what_is_written_is_read_back():
     assert INDEX_OF_THREE.time_range == (0, 6) and len(INDEX_OF_THREE.files) == 4
 
 
-def test_a_time_belongs_to_the_last_segment_that_has_begun():
-    times = {-1: 0, 0: 0, 1.9: 0, 2: 1, 3.4: 1, 3.5: 2, 6: 2, 99: 2}
+def test_a_time_belongs_to_the_last_segment_that_has_begun_and_while_two_last_to_the_nearer_one():
+    times = {-1: 0, 0: 0, 1.9: 0, 2: 1, 3.4: 1, 3.5: 1, 3.7: 1, 3.8: 2, 4: 2, 6: 2, 99: 2}
     assert {t: INDEX_OF_THREE.at(t) for t in times} == times
+
+
+def test_weights_of_two_segments_are_linear_in_time():
+    assert INDEX_OF_THREE.shown(2) == [(1, 1.0)]
+    assert [INDEX_OF_THREE.shown(t) for t in (3.5, 3.625, 3.75)] == [[(1, 1 - w), (2, w)] for w in (0, 0.25, 0.5)]
+    assert INDEX_OF_THREE.shown(4) == INDEX_OF_THREE.shown(99) == [(2, 1.0)]
 
 
 def test_members_that_are_not_known_are_skipped():
@@ -67,6 +73,7 @@ FAULTS = {
     "NaN": (changed("segments", 0, "time_range", to=[0, float("nan")]), "segments 0: time_range"),
     "backwards": (changed("segments", 0, "time_range", to=[2, 0]), "segments 0: time_range"),
     "gap": (changed("segments", 1, "time_range", to=[2.5, 4]), "expected one that begins by its end"),
+    "three at a time": (changed("segments", 0, "time_range", to=[0, 3.6]), "begins at 3.5 s, expected 3.6 s or later"),
     "within": (changed("segments", 2, "time_range", to=[2.5, 4]), "expected one that begins by its end"),
 }
 

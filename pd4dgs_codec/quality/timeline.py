@@ -1,4 +1,4 @@
-"""Draws a folder of segments as one scene over all of its time."""
+"""Draws a folder of segments as one scene over all of its time, blended where two segments overlap."""
 
 from __future__ import annotations
 
@@ -36,23 +36,39 @@ class Timeline(Drawer):
         self._own = self.background
 
     def at(self, t: float) -> tuple[Drawer, float]:
-        """Returns (what draws the segment that shows time t, the time there), both normalised."""
-        low, high = self.index.time_range
-        seconds = low + t * (high - low)
-        k = self.index.at(seconds)
-        start, end = self.index.segments[k].time_range
-        part = self._part(k)
-        if self.background != self._own:  # another one was asked for
-            part.background = self.background
-        return part, min(max((seconds - start) / (end - start), 0.0), 1.0)
+        """Returns (what draws the segment that shows time t, the time there), both normalised; of two segments that
+        show it, the one of larger weight."""
+        seconds = self._seconds(t)
+        return self._segment(self.index.at(seconds), seconds)
 
     def gaussians(self, camera: Camera, t: float) -> Gaussians:
         part, own = self.at(t)
         return part.gaussians(camera, own)
 
     def drawn(self, camera: Camera, t: float) -> tuple[np.ndarray, np.ndarray]:
-        part, own = self.at(t)
-        return part.drawn(camera, own)
+        seconds = self._seconds(t)
+        if len(shown := self.index.shown(seconds)) == 1:
+            part, own = self.at(t)
+            return part.drawn(camera, own)
+        pictures = []
+        for number, weight in shown:  # of clipped pictures, as displays show them
+            part, own = self._segment(number, seconds)
+            image, alpha = part.drawn(camera, own)
+            pictures.append((np.float32(weight) * np.clip(image, 0, 1), np.float32(weight) * alpha))
+        image, alpha = (sum(parts) for parts in zip(*pictures, strict=True))
+        return image, alpha
+
+    def _seconds(self, t: float) -> float:
+        low, high = self.index.time_range
+        return low + t * (high - low)
+
+    def _segment(self, number: int, seconds: float) -> tuple[Drawer, float]:
+        """Returns (what draws a segment, its normalised time at these seconds)."""
+        start, end = self.index.segments[number].time_range
+        part = self._part(number)
+        if self.background != self._own:  # another one was asked for
+            part.background = self.background
+        return part, min(max((seconds - start) / (end - start), 0.0), 1.0)
 
     @property
     def bytes(self) -> int:

@@ -54,9 +54,19 @@ class SegmentsClient:
         return self._index
 
     def at(self, seconds: float) -> Part:
-        """Fetches what shows a time, seconds; times outside the scene are moved into it. A segment that is missing,
-        damaged or of another scene leaves its base. Raises as `index` does."""
-        number = self.index.at(seconds)
+        """Fetches what shows a time, seconds; times outside the scene are moved into it. Of two segments that show it,
+        the one of larger weight. A segment that is missing, damaged or of another scene leaves its base. Raises as
+        `index` does."""
+        return self._part(self.index.at(seconds))
+
+    def shown(self, seconds: float) -> list[tuple[Part, float]]:
+        """Fetches all that `Index.shown` says, with weights. A part with a problem has weight 0 beside one without; of
+        two with problems, the earlier one has. Raises as `index` does."""
+        parts = [(self._part(number), weight) for number, weight in self.index.shown(seconds)]
+        alone = next((part for part, _ in parts if not part.problem), parts[-1][0])
+        return [(p, float(p is alone)) for p, _ in parts] if any(p.problem for p, _ in parts) else parts
+
+    def _part(self, number: int) -> Part:
         segment, base, scene = self.index.segments[number], None, None
         try:
             if segment.base is not None:

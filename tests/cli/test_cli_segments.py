@@ -2,16 +2,20 @@
 
 import json
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import segmented
 from PIL import Image
 
+from pd4dgs_codec import decode
+from pd4dgs_codec.draw.player import drawer
 from pd4dgs_codec.interchange import splats
 from pd4dgs_codec.interchange.splats import picture, read_splats
 from pd4dgs_codec.quality.image import mpsnr, to_uint8
 from pd4dgs_codec.quality.levels import load_levels
+from pd4dgs_codec.quality.timeline import Timeline
 from pd4dgs_codec.segments import INDEX, read_index
 
 
@@ -38,6 +42,21 @@ def test_a_folder_is_drawn_over_all_of_its_time(cli, tmp_path):
         assert mpsnr(before, after) > 37
     red = load_levels(segmented.folder(), background=(1.0, 0.0, 0.0))[-1]
     assert red.picture(drawer.info.camera, 0.6)[0, 0].tolist() == [1, 0, 0]
+
+
+def test_pictures_of_segments_that_overlap_are_blended_linearly_in_time(own):
+    _, index = read_index(own)
+    later = replace(index.segments[1], time_range=(0.5, 2.0))
+    (own / INDEX).write_bytes(replace(index, segments=(index.segments[0], later, *index.segments[2:])).packed())
+    timeline, camera = Timeline(own), Timeline(own).info.camera
+    first, second = (drawer(decode(own / f"0000{k}.pd4", base=own / "base-0000.pd4")) for k in (0, 1))
+    for seconds, weight in ((0.5, 0), (0.625, 0.25), (0.875, 0.75), (1, 1)):
+        pictures = first.picture(camera, seconds), second.picture(camera, (seconds - 0.5) / 1.5)
+        assert mpsnr(*pictures) < 60, "else nothing is tested"
+        expected = (1 - weight) * pictures[0] + weight * pictures[1]
+        assert np.allclose(timeline.picture(camera, seconds / 4), expected, atol=1e-6)
+        nearer, _ = timeline.at(seconds / 4)  # of which exports of Gaussians are
+        assert nearer.scene.info.time_range == ((0, 1) if weight < 0.5 else (1, 2))
 
 
 @pytest.mark.parametrize("place", ["", INDEX])

@@ -177,6 +177,25 @@ def test_what_does_not_come_leaves_the_base_and_the_next_one_comes(served, tmp_p
     assert part.scene is None and "404" in part.problem
 
 
+def test_of_two_segments_that_overlap_both_come_or_the_one_that_does(served):
+    root, index = read_index(served.root)
+    rows = [
+        replace(index.segments[k], time_range=times) for k, times in enumerate(((0, 1.5), (1, 2.5), (2, 3.5), (3, 4)))
+    ]
+    (root / INDEX).write_bytes(replace(index, segments=tuple(rows)).packed())
+    (root / "00002.pd4").unlink()
+    client = SegmentsClient(served.url_of(INDEX))
+
+    def shown(seconds):
+        return [(part.number, weight, bool(part.problem)) for part, weight in client.shown(seconds)]
+
+    assert shown(0.9) == [(0, 1, False)] and shown(1.125) == [(0, 0.75, False), (1, 0.25, False)]
+    assert client.at(1.125).number == 0 and client.at(1.4).number == 1
+    assert shown(2.375) == [(1, 1, False), (2, 0, True)] and shown(3.25) == [(2, 0, True), (3, 1, False)]
+    (root / "00003.pd4").unlink()
+    assert shown(3.25) == [(2, 0, True), (3, 1, True)]
+
+
 def test_an_index_that_is_missing_or_invalid_is_an_error(served):
     with pytest.raises(DeliveryError, match="404"):
         SegmentsClient(served.url_of("none.json")).at(0)
