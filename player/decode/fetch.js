@@ -149,7 +149,7 @@ export class SceneSource {
           continue;
         }
         if (this.received > before) failures = 0;
-        if (this._ended) this.decoder.finish(); // the file ends within this layer: Truncated
+        if (this._ended) return this.decoder.finish(); // the file ends within this layer: Truncated
         if (seconds < Infinity && until === Infinity && begun()) {
           until = now() + seconds;
           this._stopTimer(); // the next wait may lapse earlier than the one it was set for
