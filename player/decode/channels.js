@@ -3,24 +3,23 @@
 import { AnsDecoder } from "./ans.js";
 import { ByteReader, MAX_VARINT } from "./bytes.js";
 import { limitExceeded, malformed, unsupported } from "./errors.js";
-import { MAX_CODED, MAX_COUNT, MAX_WINDOW } from "./limits.js";
+import { MAX_CODED } from "./limits.js";
 import { Prior, normTable } from "./tables.js";
 
 const CONST = 0;
 const GAUSS = 1;
 const MIXTURE = 2;
 const FIRST_REUSE = 8;
+/** Symbols of a window. */
+const MAX_WINDOW = 2 ** 14;
 
-/**
- * The places in the order in which a split channel holds them: class by class, in each as they come.
- *
- * @typedef {{order: Int32Array, sizes: Int32Array}} Groups sizes: places per class
- */
+/** The places in the order in which a split channel holds them, class by class, and how many each class has.
+ * @typedef {{order: Int32Array, sizes: Int32Array}} Groups */
 
 /** The channels of a slice, one after the other. */
 export class ChannelReader {
-  /** @param {Uint8Array} codes @param {Uint8Array} stream @param {Prior[]} priors of the layer so far, in order; new ones
-   * are added @param {number} entries that their windows may have at most */
+  /** @param {Uint8Array} codes @param {Uint8Array} stream @param {Prior[]} priors of the layer so far, in order; new
+   * ones are added @param {number} entries that their windows may have at most */
   constructor(codes, stream, priors, entries) {
     /** What is read besides channels stands in the codes between theirs. */
     this.codes = new ByteReader(codes);
@@ -40,12 +39,9 @@ export class ChannelReader {
   }
 
   /** Reads the next channel into `out`, split if there are groups. @param {Int32Array} out
-   * @param {Groups | null} [groups] */
+   * @param {Groups | null} groups */
   fill(out, groups) {
-    if (!groups) {
-      this._take(out, 0, out.length);
-      return;
-    }
+    if (!groups) return this._take(out, 0, out.length);
     const { order, sizes } = groups;
     const sorted = new Int32Array(out.length);
     let at = 0;
@@ -64,7 +60,7 @@ export class ChannelReader {
   _take(out, at, end) {
     if (at === end) return;
     const { codes } = this;
-    const token = codes.varint(2 * (MAX_COUNT + FIRST_REUSE), "a channel's prior");
+    const token = codes.varint(2 * (2 ** 26 + FIRST_REUSE), "a channel's prior");
     const prior = this._prior(token >> 1);
     const exceptions = token & 1 ? 1 + codes.varint(MAX_VARINT, "the number of exceptions") : 0;
     if (exceptions > end - at) throw malformed(`${exceptions} exceptions, expected at most ${end - at}`);
@@ -87,17 +83,15 @@ export class ChannelReader {
   /** 8.1. @param {number} family */
   _prior(family) {
     const priors = this._priors;
-    if (family >= FIRST_REUSE) {
-      const prior = priors[priors.length - 1 - (family - FIRST_REUSE)];
-      if (!prior) throw malformed("a channel reuses a prior before the first");
-      return prior;
-    }
-    const prior = readPrior(this.codes, family);
-    priors.push(prior);
-    this._entries += prior.n;
-    if (this._entries > this._most) {
+    if (family < FIRST_REUSE) {
+      const prior = readPrior(this.codes, family);
+      priors.push(prior);
+      this._entries += prior.n;
+      if (this._entries <= this._most) return prior;
       throw limitExceeded(`tables of ${this._entries} entries in one layer, limit ${this._most}`);
     }
+    const prior = priors[priors.length - 1 - (family - FIRST_REUSE)];
+    if (!prior) throw malformed("a channel reuses a prior before the first");
     return prior;
   }
 }
@@ -134,10 +128,10 @@ export function groupByClass(classes, count) {
 }
 
 /** Views of the channels, one behind the other. @param {Int32Array} values @param {number} count of channels */
-export function channelsOf(values, count) {
+export const channelsOf = (values, count) => {
   const places = values.length / count;
   return Array.from({ length: count }, (_, c) => values.subarray(c * places, (c + 1) * places));
-}
+};
 
 /** Raises if a symbol is out of its range. @param {Int32Array} symbols @param {number} least @param {number} most
  * @param {string} what */

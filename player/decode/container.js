@@ -3,11 +3,12 @@
 import { crc32, hex } from "./digests.js";
 import { DecodeError, limitExceeded, malformed, unsupported } from "./errors.js";
 import { LAYER_TYPES, SCENE_ID_SIZE } from "./header.js";
-import { MAX_HEADER, MAX_PAYLOAD } from "./limits.js";
+import { MAX_PAYLOAD } from "./limits.js";
 /** @import { ListedChunk } from "./header.js" */
 
 const SIGNATURE = /* @__PURE__ */ Uint8Array.of(0x89, 0x50, 0x44, 0x34, 0x0d, 0x0a, 0x1a, 0x0a);
 const MAJOR = 5;
+const MAX_HEADER = 2 ** 14;
 export const PREAMBLE_SIZE = 20;
 const CHUNK_HEAD = 16;
 /** Bytes of a chunk around its payload. */

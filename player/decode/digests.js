@@ -6,36 +6,23 @@ const CRC_TABLE = /* @__PURE__ */ Uint32Array.from({ length: 256 }, (_, c) => {
   return c;
 });
 
-/**
- * CRC-32 of `bytes`, which follow bytes whose CRC-32 is `before`.
- *
- * @param {Uint8Array} bytes @param {number} [before]
- * @returns {number} 0..2^32 - 1
- */
+/** CRC-32 of `bytes`, which follow bytes whose CRC-32 is `before`. @param {Uint8Array} bytes @param {number} [before] */
 export function crc32(bytes, before = 0) {
   let c = ~before;
   for (let i = 0; i < bytes.length; i++) c = (c >>> 8) ^ CRC_TABLE[(c ^ bytes[i]) & 255];
   return ~c >>> 0;
 }
 
-/** The first 32 bits of the fractional part of the root of order `power` of each of the first `count` primes. */
-function primeRoots(/** @type {number} */ count, /** @type {number} */ power) {
-  const roots = new Int32Array(count);
-  for (let n = 2, i = 0; i < count; n++) {
-    let prime = true;
-    for (let d = 2; d * d <= n; d++) if (n % d === 0) prime = false;
-    if (!prime) continue;
-    // floor(2^32 root): the largest integer whose power is at most n 2^(32 power); found exactly, bit by bit.
-    const bound = BigInt(n) << BigInt(32 * power);
-    let root = 0n;
-    for (let bit = 1n << 40n; bit; bit >>= 1n) if ((root + bit) ** BigInt(power) <= bound) root += bit;
-    roots[i++] = Number(BigInt.asIntN(32, root));
-  }
-  return roots;
+/** The first 32 bits of the fractional parts of a root of the first primes: SHA-256's constants, as binary64 has 52 bits
+ * of each and none is near a whole number. @param {number} count @param {(n: number) => number} root */
+function fractions(count, root) {
+  const primes = [2];
+  for (let n = 3; primes.length < count; n += 2) if (primes.every((prime) => n % prime)) primes.push(n);
+  return Int32Array.from(primes, (prime) => (root(prime) % 1) * 2 ** 32);
 }
 
-const ROUND_CONSTANTS = /* @__PURE__ */ primeRoots(64, 3);
-const START = /* @__PURE__ */ primeRoots(8, 2);
+const ROUND_CONSTANTS = /* @__PURE__ */ fractions(64, Math.cbrt);
+const START = /* @__PURE__ */ fractions(8, Math.sqrt);
 
 /** SHA-256. @param {Uint8Array} bytes @returns {Uint8Array} [32] */
 export function sha256(bytes) {
@@ -49,10 +36,9 @@ export function sha256(bytes) {
   const state = START.slice();
   compress(state, bytes.subarray(0, whole));
   compress(state, end);
-  const out = new Uint8Array(32);
-  const words = new DataView(out.buffer);
-  state.forEach((word, i) => words.setInt32(4 * i, word));
-  return out;
+  const out = new DataView(new ArrayBuffer(32));
+  state.forEach((word, i) => out.setInt32(4 * i, word));
+  return new Uint8Array(out.buffer);
 }
 
 /** @param {Int32Array} state [8], changed in place @param {Uint8Array} bytes whole blocks */
@@ -86,18 +72,9 @@ function compress(state, bytes) {
       b = a;
       a = (t1 + t2) | 0;
     }
-    state[0] += a;
-    state[1] += b;
-    state[2] += c;
-    state[3] += d;
-    state[4] += e;
-    state[5] += f;
-    state[6] += g;
-    state[7] += h;
+    [a, b, c, d, e, f, g, h].forEach((word, i) => (state[i] += word));
   }
 }
 
 /** @param {Uint8Array} bytes @returns {string} lower-case hexadecimal */
-export function hex(bytes) {
-  return Array.from(bytes, (b) => b.toString(16).padStart(2, "0")).join("");
-}
+export const hex = (bytes) => Array.from(bytes, (b) => b.toString(16).padStart(2, "0")).join("");

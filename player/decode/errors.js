@@ -1,11 +1,7 @@
 // Clause 15: the one kind of error that a decoder of `.pd4` files raises.
 
-/**
- * The names of clause 15.
- *
- * @typedef {"BadSignature" | "UnsupportedVersion" | "Truncated" | "ChecksumMismatch" | "LimitExceeded"
- *   | "UnsupportedFeature" | "BaseMissing" | "BaseMismatch" | "Malformed"} ErrorKind
- */
+/** The names of clause 15. @typedef {"BadSignature" | "UnsupportedVersion" | "Truncated" | "ChecksumMismatch" | "LimitExceeded"
+ *   | "UnsupportedFeature" | "BaseMissing" | "BaseMismatch" | "Malformed"} ErrorKind */
 
 /**
  * Bytes that are not a valid `.pd4` file, or one that this decoder does not support.
@@ -30,10 +26,8 @@ export class DecodeError extends Error {
   }
 }
 
-/** A fault of a kind, at an offset if it is known. @param {ErrorKind} kind */
-const fault = (kind) => (/** @type {string} */ reason, /** @type {number | null} */ offset = null) => {
-  return new DecodeError(kind, reason, { offset });
-};
+/** @param {ErrorKind} kind @returns {(reason: string, offset?: number) => DecodeError} */
+const fault = (kind) => (reason, offset) => new DecodeError(kind, reason, { offset });
 
 export const malformed = fault("Malformed");
 export const limitExceeded = fault("LimitExceeded");

@@ -34,8 +34,6 @@ export class FetchError extends Error {
 
 /** Limit of layer 0 without a budget of bytes: bytes are held until their slice is complete. */
 const MOST_BYTES = 2 ** 28;
-/** Small pieces are gathered to so many bytes: one costs more to hand on than to read. */
-const GATHERED = 1024;
 /** HTTP status codes of temporary errors. */
 const TEMPORARY = [408, 425, 429, 500, 502, 503, 504];
 /** After so many changes the file counts as never stable. */
@@ -45,13 +43,12 @@ const MOST_CHANGES = 4;
 class Cut extends Error {}
 
 /**
- * The scenes of one URL. `scenes()` yields them as slices arrive; called again, with another budget, it continues after the
- * last one. A damaged slice is fetched once more and never yielded.
+ * The scenes of one URL. `scenes()` yields them as slices arrive; called again, with another budget, it continues after
+ * the last one. A damaged slice is fetched once more and never yielded.
  */
 export class SceneSource {
   /** @param {string | URL} url @param {SourceOptions} [options] */
-  constructor(url, options = {}) {
-    const { signal, stall = 10, attempts = 5, pause = 0.2, progress } = options;
+  constructor(url, { signal, stall = 10, attempts = 5, pause = 0.2, progress, fetch, stream } = {}) {
     this.url = String(url);
     /** Connections that ended early, and changes of the file, so far. */
     this.cuts = 0;
@@ -64,24 +61,22 @@ export class SceneSource {
     /** Whether the server has no byte behind those received. */
     this._ended = false;
     this._signal = signal;
-    this._stream = options.stream ?? (() => new Stream());
+    this._limits = { stall, attempts, pause };
+    this._progress = progress;
+    this._fetch = fetch ?? globalThis.fetch.bind(globalThis);
+    this._stream = stream ?? (() => new Stream());
     /** What decodes the bytes; another one if the file changes. */
     this.decoder = this._stream();
-    this._stall = stall;
-    this._attempts = attempts;
-    this._pause = pause;
-    this._progress = progress;
-    this._fetch = options.fetch ?? globalThis.fetch.bind(globalThis);
     /** The file's ETag, or its date; null where the server does not show them. @type {string | null} */
     this._tag = null;
     /** The open connection. @type {AbortController | null} */
     this._controller = null;
     /** Its response. skip: bytes that are here already.
-     * @type {{reader: Reader, skip: number, rest: Uint8Array} | null} */
+     * @type {{reader: ReadableStreamDefaultReader<Uint8Array>, skip: number, rest: Uint8Array} | null} */
     this._body = null;
-    /** Ends the read that waits for it: not every body notices that its connection was aborted. */
+    /** Ends the wait for the connection: not every body notices that it was aborted. */
     this._giveUp = (/** @type {unknown} */ _reason) => {};
-    /** When a wait of the connection lapses, and the timer that looks. */
+    /** When a wait lapses, and the timer that looks. */
     this._lapse = Infinity;
     /** @type {ReturnType<typeof setTimeout> | undefined} */
     this._timer = undefined;
@@ -89,7 +84,6 @@ export class SceneSource {
     this._requested = { at: 0, received: 0 };
     /** Where the file was fetched anew after damage. */
     this._repairedAt = -1;
-    this._gathered = new Uint8Array(GATHERED);
     signal?.addEventListener("abort", () => this._abort(signal.reason), { once: true });
   }
 
@@ -100,8 +94,8 @@ export class SceneSource {
 
   /** @param {unknown} [reason] */
   _abort(reason) {
-    this._controller?.abort(reason);
     this._giveUp(reason);
+    this._controller?.abort(reason);
   }
 
   /** Ends the connection. `scenes` may be called again. */
@@ -127,6 +121,7 @@ export class SceneSource {
    * @returns {AsyncGenerator<Scene, void, void>}
    */
   async *scenes({ maxLayer = Infinity, bytes, seconds = Infinity } = {}) {
+    const { attempts, pause } = this._limits;
     const begun = () => this.decoder.consumed >= (this.decoder.layerEnds[0]?.end ?? Infinity);
     let until = now() + seconds;
     let failures = 0;
@@ -136,39 +131,30 @@ export class SceneSource {
         if (!begun()) until = Infinity; // also of a file that has changed
         const end = this._end(maxLayer, bytes, until);
         if (end === null || now() >= until) return;
-        let block;
+        const before = this.received;
+        let scenes;
         try {
-          block = await this._read(end, until);
-        } catch (thrown) {
-          const reason = this._controller?.signal.reason;
-          const error = reason instanceof Cut ? reason : thrown; // not all engines throw the reason
-          // without an answer, browsers do not tell the two apart
-          const lost = this._body ? "the connection broke" : "no connection, or no CORS permission of the server";
+          scenes = await this._load(end, until);
+        } catch (error) {
           this.close();
           this._signal?.throwIfAborted();
+          if (!(error instanceof Cut)) throw error;
           if (now() >= until) return;
-          // fetch raises TypeError where there is no connection, or it ends
-          if (!(error instanceof Cut || error instanceof TypeError || error instanceof DOMException)) throw error;
           this.cuts++;
-          if (++failures >= this._attempts) {
-            const why = error instanceof Cut ? error.message : lost;
-            throw new FetchError(`${this.url}: ${why} (${this.received} bytes received)`);
+          failures = this.received > before ? 1 : failures + 1;
+          if (failures >= attempts) {
+            throw new FetchError(`${this.url}: ${error.message} (${this.received} bytes received)`);
           }
-          if (failures > 1) await sleep(1000 * Math.min(this._pause * 2 ** (failures - 2), until - now()));
+          if (failures > 1) await sleep(1000 * Math.min(pause * 2 ** (failures - 2), until - now()));
           continue;
         }
-        if (block === null) {
-          this.decoder.finish(); // the file ends within this layer: Truncated
-          return;
-        }
-        if (!block.length) continue;
-        failures = 0;
-        const scenes = this._feed(block);
+        if (this.received > before) failures = 0;
+        if (this._ended) return this.decoder.finish(); // the file ends within this layer: Truncated
         if (seconds < Infinity && until === Infinity && begun()) {
           until = now() + seconds;
           this._stopTimer(); // the next wait may lapse earlier than the one it was set for
         }
-        for (const scene of scenes) yield scene; // yield* takes longer than a small piece
+        yield* scenes;
       }
     } finally {
       this.close();
@@ -192,11 +178,48 @@ export class SceneSource {
     return late ? null : next.end;
   }
 
-  /** The scenes that a block completes. After damage the download goes back to the last valid chunk, once.
-   * @param {Uint8Array} block @returns {Scene[]} */
-  _feed(block) {
+  /**
+   * Feeds the decoder up to byte `end`, before which it completes nothing: the scenes that it makes. Ends earlier,
+   * without any, where the response is of no use, or the server has no more. Raises Cut or FetchError.
+   *
+   * @param {number} end @param {number} until seconds
+   * @returns {Promise<Scene[]>}
+   */
+  async _load(end, until) {
+    if (!this._body && !this._ended) await this._request(until);
+    while (this._body && this.received < end) {
+      const body = this._body;
+      if (!body.rest.length) {
+        const { done, value } = await this._wait(() => body.reader.read(), until, "the connection broke");
+        if (done) {
+          this.close();
+          // the header says that more follows, so that it is asked for; a response without a new byte is the answer
+          if (this.received > this._requested.received) throw new Cut(`ended at byte ${this.received} of ${this.total}`);
+          this._ended = true;
+          return [];
+        }
+        const skipped = Math.min(body.skip, value.length);
+        body.skip -= skipped;
+        body.rest = skipped ? value.subarray(skipped) : value;
+        if (!body.rest.length) continue;
+      }
+      const { rest } = body;
+      const all = rest.length <= end - this.received; // views take longer than a small piece
+      const piece = all ? rest : rest.subarray(0, end - this.received);
+      body.rest = all ? NOTHING : rest.subarray(piece.length);
+      this.received += piece.length;
+      this._progress?.(this.received, this.total);
+      const scenes = this._feed(piece);
+      if (scenes.length) return scenes;
+    }
+    return [];
+  }
+
+  /** The scenes that a piece completes. After damage the download goes back to the last valid chunk, once.
+   * @param {Uint8Array} piece @returns {Scene[]} */
+  _feed(piece) {
     try {
-      return this.decoder.feed(block);
+      return this.decoder.feed(piece);
     } catch (error) {
       const damaged = error instanceof DecodeError && !["BadSignature", "UnsupportedVersion"].includes(error.kind);
       const good = this.decoder.consumed;
@@ -213,73 +236,23 @@ export class SceneSource {
   }
 
   /**
-   * The next bytes to arrive, none beyond `end`, which nothing is decoded before; perhaps none at all; null if the
-   * server has no more. The array is used again. Raises Cut, FetchError or an error of fetch.
+   * Waits for the connection. One timer serves all of it, since one for each wait would take longer than a small piece
+   * does; waits that follow lapse no earlier.
    *
-   * @param {number} end @param {number} until seconds
-   * @returns {Promise<Uint8Array | null>}
+   * @template T @param {() => Promise<T>} start @param {number} until @param {string} lost says that it is gone
+   * @returns {Promise<T>}
    */
-  async _read(end, until) {
-    if (this._ended) return null;
-    if (!this._body) {
-      await this._request(until);
-      return NOTHING; // if the file has changed, it begins anew
-    }
-    const body = this._body;
-    const wanted = Math.min(end - this.received, GATHERED);
-    let filled = 0;
-    while (filled < wanted) {
-      if (!body.rest.length) {
-        this._await(until);
-        let came;
-        try {
-          came = await this._next(body.reader);
-        } catch (error) {
-          if (filled) break; // the next call meets it again, as the end below
-          throw error;
-        }
-        this._lapse = Infinity;
-        if (came.done) {
-          if (filled) break;
-          this.close();
-          // the header says that more follows, so that it is asked for; a response without a new byte is the answer
-          if (this.received > this._requested.received) throw new Cut(`ended at byte ${this.received} of ${this.total}`);
-          this._ended = true;
-          return null;
-        }
-        const skipped = Math.min(body.skip, came.value.length);
-        body.skip -= skipped;
-        body.rest = skipped ? came.value.subarray(skipped) : came.value;
-      }
-      const { rest } = body;
-      const room = filled ? wanted - filled : end - this.received;
-      const all = rest.length <= room; // views take longer than a small piece
-      const piece = all ? rest : rest.subarray(0, room);
-      body.rest = all ? NOTHING : rest.subarray(room);
-      if (!piece.length) continue;
-      this.received += piece.length;
-      this._progress?.(this.received, this.total);
-      if (piece.length >= wanted) return piece;
-      this._gathered.set(piece, filled);
-      filled += piece.length;
-    }
-    return this._gathered.subarray(0, filled);
-  }
-
-  /** @param {Reader} reader @returns {Promise<ReadableStreamReadResult<Uint8Array>>} */
-  _next(reader) {
+  _wait(start, until, lost) {
     return new Promise((resolve, reject) => {
       this._controller?.signal.throwIfAborted();
       this._giveUp = reject;
-      reader.read().then(resolve, reject);
+      this._lapse = Math.min(performance.now() + 1000 * this._limits.stall, 1000 * until);
+      if (this._timer === undefined) this._look();
+      start().then((value) => {
+        this._lapse = Infinity;
+        resolve(value);
+      }, (error) => reject(error instanceof TypeError || error instanceof DOMException ? new Cut(lost) : error));
     });
-  }
-
-  /** Begins a wait. One timer serves all of a connection, since one for each would take longer than a small piece does;
-   * those that follow lapse no earlier. @param {number} until */
-  _await(until) {
-    this._lapse = Math.min(performance.now() + 1000 * this._stall, 1000 * until);
-    if (this._timer === undefined) this._look();
   }
 
   /** Ends the connection if the wait has lapsed, else looks again when it will have. */
@@ -303,9 +276,9 @@ export class SceneSource {
     const { signal } = (this._controller = new AbortController());
     this._requested = { at: now(), received: start };
     // a request after a cut or damage bypasses caches
-    const cache = start ? "no-store" : "default";
-    this._await(until);
-    const response = await this._fetch(this.url, { headers, signal, cache });
+    const request = () => this._fetch(this.url, { headers, signal, cache: start ? "no-store" : "default" });
+    // browsers do not tell the two apart
+    const response = await this._wait(request, until, "no connection, or no CORS permission of the server");
     const skip = this._accept(response, "Range" in headers);
     if (skip === null) this.close();
     else this._body = { reader: (response.body ?? new Blob().stream()).getReader(), skip, rest: NOTHING };
@@ -358,8 +331,6 @@ export class SceneSource {
     return null;
   }
 }
-
-/** @typedef {ReadableStreamDefaultReader<Uint8Array>} Reader */
 
 /** @param {string | null | undefined} text */
 const lengthOf = (text) => (/^\d{1,15}$/.test(text ?? "") ? Number(text) : null);

@@ -4,7 +4,7 @@ import { channelsOf, groupByClass } from "./channels.js";
 import { malformed } from "./errors.js";
 import { MAX_SYMBOL } from "./limits.js";
 /** @import { ChannelReader } from "./channels.js" */
-/** @import { PlaneShape } from "./parameters.js" */
+/** @import { Plane } from "./tensors.js" */
 
 /** Classes of a plane channel that is split. */
 const CLASSES = 8;
@@ -14,7 +14,7 @@ const LOOKED_UP = 256;
 /**
  * The samples of each plane of all grids.
  *
- * @param {ChannelReader} reader @param {PlaneShape[]} shapes
+ * @param {ChannelReader} reader @param {Plane[]} shapes
  * @returns {Int32Array[]} [channels, height, width] each
  */
 export function decodePlanes(reader, shapes) {
@@ -94,7 +94,7 @@ function sumOfNine(values, height, width) {
 }
 
 /** 11.3, in place: residuals of a channel become samples. Each is checked before others are predicted from it, so that a
- * sum stays small. @param {Int32Array} samples @param {PlaneShape} shape */
+ * sum stays small. @param {Int32Array} samples @param {Plane} shape */
 function restore(samples, { width, predictor }) {
   check(samples[0]);
   // both predictors give W in row 0 and N in column 0

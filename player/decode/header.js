@@ -3,7 +3,7 @@
 import { hex, sha256 } from "./digests.js";
 import { malformed, unsupported } from "./errors.js";
 import { bytes, integer, kind, list, map, optional, real, record, registered, rows, step, widthOf } from "./fields.js";
-import { MAX_CHUNKS, MAX_PAYLOAD, MAX_ROWS, MAX_SYMBOL } from "./limits.js";
+import { MAX_PAYLOAD, MAX_ROWS, MAX_SYMBOL } from "./limits.js";
 import { unpack } from "./msgpack.js";
 /** @import { Made } from "./fields.js" */
 /** @import { Info } from "./tensors.js" */
@@ -27,7 +27,7 @@ const CAMERA = map([1, 2, 3, 4], {
   height: integer(1, 65535),
 });
 const HEADER = map([1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15], {
-  chunks: list(record(CHUNK), 1, MAX_CHUNKS),
+  chunks: list(record(CHUNK), 1, 1024),
   mode: registered(2),
   kind,
   rows,

@@ -7,8 +7,9 @@
  */
 
 import { RULES, sceneOf } from "../kinds/index.js";
-import { Base, readAll } from "./reader.js";
+import { readAll } from "./reader.js";
 import { Stream } from "./stream.js";
+/** @import { GivenBase } from "./reader.js" */
 
 export { DecodeError } from "./errors.js";
 export { hashes } from "./hashes.js";
@@ -25,51 +26,21 @@ export { Stream } from "./stream.js";
 /** @typedef {import("./errors.js").ErrorKind} ErrorKind */
 
 /** maxLayer: bytes behind the layers up to it are not looked at. allowPartial: a cut file, which raises Truncated, yields
- * its longest prefix of complete slices, at least one, or its base alone. base: of a file that names one (clause 5.6), the
- * bytes, or what `readBase` made of them.
- * @typedef {{maxLayer?: number | null, allowPartial?: boolean, base?: import("./reader.js").GivenBase}} Options */
+ * its longest prefix of complete slices, at least one, or its base alone. base: of a file that names one (clause 5.6),
+ * the bytes, or a Base of them, which decodes it once for many files.
+ * @typedef {{maxLayer?: number | null, allowPartial?: boolean, base?: GivenBase}} Options */
 
 /** @param {Uint8Array | ArrayBuffer} bytes */
 const viewOf = (bytes) => (bytes instanceof Uint8Array ? bytes : new Uint8Array(bytes));
 
-/**
- * The scene of a file, or of a prefix. Raises DecodeError, also where a kind is unknown or its tensors break its rules
- * (clause 13.1).
- *
- * @param {Uint8Array | ArrayBuffer} bytes @param {Options} [options]
- * @returns {Scene}
- */
-export function decode(bytes, options = {}) {
-  return sceneOf(readAll(viewOf(bytes), options, RULES));
-}
+/** The scene of a file, or of a prefix. Raises DecodeError, also where a kind is unknown or its tensors break its rules
+ * (clause 13.1). @param {Uint8Array | ArrayBuffer} bytes @param {Options} [options] @returns {Scene} */
+export const decode = (bytes, options = {}) => sceneOf(readAll(viewOf(bytes), options, RULES));
 
-/**
- * The tensors of a file, or of a prefix, whatever their kinds are. Raises DecodeError.
- *
- * @param {Uint8Array | ArrayBuffer} bytes @param {Options} [options]
- * @returns {Tensors}
- */
-export function decodeTensors(bytes, options = {}) {
-  return readAll(viewOf(bytes), options, null);
-}
+/** The tensors of a file, or of a prefix, whatever their kinds are. Raises DecodeError.
+ * @param {Uint8Array | ArrayBuffer} bytes @param {Options} [options] @returns {Tensors} */
+export const decodeTensors = (bytes, options = {}) => readAll(viewOf(bytes), options, null);
 
-/**
- * Decodes the layer 0 of a file once for all files whose base it is. Raises DecodeError.
- *
- * @param {Uint8Array | ArrayBuffer} bytes of the file, at least up to the end of its layer 0
- * @returns {Base}
- */
-export function readBase(bytes) {
-  return new Base(viewOf(bytes));
-}
-
-/**
- * A decoder that takes a file in pieces: `feed(bytes)` gives the newest scene of each layer that they
- * complete a slice of.
- *
- * @param {Omit<Options, "allowPartial">} [options]
- * @returns {Stream}
- */
-export function openStream(options) {
-  return new Stream(options);
-}
+/** A decoder that takes a file in pieces: `feed(bytes)` gives the newest scene of each layer that they complete a slice
+ * of. @param {Omit<Options, "allowPartial">} [options] */
+export const openStream = (options) => new Stream(options);

@@ -1,7 +1,6 @@
 // Clause 4: canonical msgpack, in which each value has one valid form.
 
 import { malformed } from "./errors.js";
-import { MAX_NESTING } from "./limits.js";
 
 /** A float 32, which differs in type from an integer of the same value. */
 export class Real {
@@ -109,7 +108,7 @@ class Reader {
 
   /** A list, or a map. @param {string} kind @param {number} size @param {number} depth */
   items(kind, size, depth) {
-    if (depth >= MAX_NESTING) throw this.fault(`lists and maps nested more than ${MAX_NESTING} deep`);
+    if (depth >= 4) throw this.fault(`lists and maps nested more than 4 deep`);
     /** @type {Value[]} */
     const list = [];
     /** @type {Map<number, Value>} */

@@ -2,10 +2,10 @@
 
 import { groupByClass } from "./channels.js";
 import { limitExceeded, malformed } from "./errors.js";
-import { MAX_VOXEL } from "./limits.js";
 /** @import { ChannelReader } from "./channels.js" */
 
 const MAX_DEPTH = 21;
+const MAX_VOXEL = 2 ** 20;
 /** Children of a full node. */
 const ALL = 8;
 
@@ -17,17 +17,32 @@ for (let byte = 1; byte < 256; byte++) {
   PATTERNS[further].push(byte);
 }
 
-/**
- * @param {ChannelReader} reader @param {number} rows at least 1
- * @returns {Int32Array} [rows, 3] voxel indices, in Morton order of their offsets from the minimum
- */
+/** The voxel indices, [rows, 3], in Morton order of their offsets from the minimum. @param {ChannelReader} reader
+ * @param {number} rows at least 1 */
 export function decodePositions(reader, rows) {
   const { codes } = reader;
   const minimum = [0, 1, 2].map(() => codes.zigzag(MAX_VOXEL, "the minimum of the voxel indices"));
   const depth = codes.byte("the depth of the octree");
   if (depth > MAX_DEPTH) throw limitExceeded(`a depth of ${depth}, limit ${MAX_DEPTH}`);
-  const levels = readLevels(reader, depth, rows);
-  return placed(grow(reader, levels, rows), minimum, depth);
+  const offsets = grow(reader, readLevels(reader, depth, rows), rows);
+  const voxels = new Int32Array(3 * rows);
+  let largestOfAll = 0;
+  offsets.forEach((along, axis) => {
+    let least = Infinity;
+    let largest = 0;
+    for (let i = 0; i < rows; i++) {
+      least = Math.min(least, along[i]);
+      largest = Math.max(largest, along[i]);
+      voxels[3 * i + axis] = minimum[axis] + along[i];
+    }
+    if (least !== 0) throw malformed(`voxel offsets begin at ${least} on an axis, expected 0`);
+    const last = minimum[axis] + largest;
+    if (last > MAX_VOXEL) throw malformed(`a voxel index of ${last}, limit ${MAX_VOXEL}`);
+    largestOfAll = Math.max(largestOfAll, largest);
+  });
+  const bits = 32 - Math.clz32(largestOfAll);
+  if (bits !== depth) throw malformed(`voxel offsets of ${bits} bits, expected the octree's depth ${depth}`);
+  return voxels;
 }
 
 /** How many children each node has less one, level by level from the root on. @param {ChannelReader} reader
@@ -36,7 +51,8 @@ function readLevels(reader, depth, rows) {
   const levels = [];
   let nodes = 1;
   for (let level = depth; level > 0; level--) {
-    const further = nodes < rows ? reader.read(nodes, 0, ALL - 1, "a number of children less one") : new Int32Array(rows);
+    const coded = nodes < rows; // else each node has one child
+    const further = coded ? reader.read(nodes, 0, ALL - 1, "a number of children less one") : new Int32Array(rows);
     levels.push(further);
     nodes = further.reduce((sum, more) => sum + more, nodes);
     if (nodes > rows) throw malformed(`${nodes} nodes below level ${level} of the octree, of ${rows} anchors`);
@@ -48,8 +64,7 @@ function readLevels(reader, depth, rows) {
 /** The offsets of all anchors along x, y, z. @param {ChannelReader} reader @param {Int32Array[]} levels
  * @param {number} rows */
 function grow(reader, levels, rows) {
-  let parents = [0, 1, 2].map(() => new Int32Array(rows));
-  let nodes = [0, 1, 2].map(() => new Int32Array(rows));
+  let [parents, nodes] = [0, 1].map(() => [0, 1, 2].map(() => new Int32Array(rows)));
   for (const further of levels) {
     const indices = new Int32Array(further.length);
     reader.fill(indices, groupByClass(further, ALL));
@@ -66,29 +81,4 @@ function grow(reader, levels, rows) {
     [parents, nodes] = [nodes, parents];
   }
   return parents;
-}
-
-/** 10.1: the voxels at these offsets. @param {Int32Array[]} offsets @param {number[]} minimum @param {number} depth */
-function placed(offsets, minimum, depth) {
-  const rows = offsets[0].length;
-  const voxels = new Int32Array(3 * rows);
-  let largestOfAll = 0;
-  for (let axis = 0; axis < 3; axis++) {
-    const along = offsets[axis];
-    let least = Infinity;
-    let largest = 0;
-    for (let i = 0; i < rows; i++) {
-      least = Math.min(least, along[i]);
-      largest = Math.max(largest, along[i]);
-      voxels[3 * i + axis] = minimum[axis] + along[i];
-    }
-    if (least !== 0) throw malformed(`voxel offsets begin at ${least} on an axis, expected 0`);
-    if (minimum[axis] + largest > MAX_VOXEL) {
-      throw malformed(`a voxel index of ${minimum[axis] + largest}, limit ${MAX_VOXEL}`);
-    }
-    largestOfAll = Math.max(largestOfAll, largest);
-  }
-  const bits = 32 - Math.clz32(largestOfAll);
-  if (bits !== depth) throw malformed(`voxel offsets of ${bits} bits, expected the octree's depth ${depth}`);
-  return voxels;
 }

@@ -6,7 +6,7 @@ import { hex, sha256 } from "./digests.js";
 import { DecodeError, limitExceeded, malformed } from "./errors.js";
 import { LAYER_TYPES, readHeader } from "./header.js";
 import { dequantise, rowsOf } from "./rows.js";
-import { LEAST_OWN_CODE, MOST_CODE, chainsOf, decodeSlice, gridsOf } from "./slice.js";
+import { LEAST_OWN_CODE, MOST_CODE, decodeSlice } from "./slice.js";
 import { VoxelTable, mortonOrder } from "./voxels.js";
 /** @import { Values } from "./columns.js" */
 /** @import { Header } from "./header.js" */
@@ -210,8 +210,7 @@ export class TensorReader {
     }
     const classes = header.centres && this._columns[this._columns.length - 1].values;
     const slice = decodeSlice(payload, number, header, { declared: this._declared, classes, layer: had });
-    const { parameters, voxels, rises, stepClasses } = slice;
-    const { layerRows, fill, declared } = parameters;
+    const { voxels, rises, stepClasses, rowTensors } = slice;
     const own = slice.codes.length;
     const codes = new Uint8Array(rises.length + own);
     const before = latest?.codes.values; // of a whole layer, in order, or with no rises
@@ -231,7 +230,7 @@ export class TensorReader {
     /** @type {Values[]} */
     const values = [voxels, positions, ...rowsOf(header.rows, slice.rows, own)];
     if (stepClasses) values.push(Uint8Array.from(stepClasses));
-    values.push(codes, ...rowsOf(layerRows, slice.layerRows, rises.length + own));
+    values.push(codes, ...rowsOf(rowTensors, slice.layerRows, rises.length + own));
     const layer = had ?? this._begun(slice);
     if (!had) this._rules?.checkLayer(header, [...this.layers, layer]);
     const growth = next ? Math.max(1.5, (1.25 * (last - start)) / (end - start)) : 1;
@@ -242,21 +241,21 @@ export class TensorReader {
     if (!had) this.layers = [...this.layers.filter((other) => other.layer !== number), layer];
     layer.slices++;
     layer.sorted = !had || (layer.sorted && !voxels.length);
-    layer.fill = fill?.map((c) => c / 255) ?? header.info.background;
+    layer.fill = slice.fill?.map((c) => c / 255) ?? header.info.background;
     layer.priors = slice.priors;
     this._taken.add(voxels);
-    this._declared = declared;
+    this._declared = slice.declared;
     if (next?.layer !== number) this.sort(growth);
     return slice;
   }
 
   /** A layer without rows. @param {Slice} slice its first @returns {Layer} */
   _begun(slice) {
-    const { layer, parameters: { kind, layerRows: rowTensors }, priors } = slice;
+    const { layer, kind, rowTensors, priors } = slice;
+    const { grids, chains } = (!layer && this.layers[0]) || slice; // layer 0 over a base has the base's
     const rows = widths(rowTensors).map((channels) => new Column(Float32Array, channels));
-    const { grids, chains } = (!layer && this.layers[0]) || { grids: gridsOf(slice), chains: chainsOf(slice) };
-    const made = { grids, chains, codes: new Column(Uint8Array, 1), rowTensors, rows };
-    return { layer, kind, ...made, fill: [], slices: 0, first: this._declared.rows, sorted: true, priors };
+    const empty = { codes: new Column(Uint8Array, 1), rows, fill: [], slices: 0, sorted: true };
+    return { layer, kind, grids, chains, rowTensors, priors, first: this._declared.rows, ...empty };
   }
 
   /** Puts the rows of the latest layer in the order of 12.2. @param {number} [growth] as in Column */

@@ -7,7 +7,7 @@ import { MAX_SYMBOL } from "./limits.js";
 /** @import { ChannelReader } from "./channels.js" */
 /** @import { RowTensor } from "./tensors.js" */
 
-/** The one that step classes do not concern. */
+/** The predictor that step classes do not concern. */
 const WHOLE = 2;
 export const STEP_CLASSES = 7;
 
@@ -21,7 +21,7 @@ export const STEP_CLASSES = 7;
  */
 export function decodeRows(reader, tensors, count, classes, centres, base = 0) {
   const values = new Int32Array(widthOf(tensors) * count);
-  const parts = base ? Uint8Array.from(values.subarray(0, count), (_, i) => (i < base ? 0 : STEP_CLASSES)) : classes;
+  const parts = base ? new Uint8Array(count).fill(STEP_CLASSES, base) : classes;
   if (base) classes?.forEach((c, i) => (/** @type {Uint8Array} */ (parts)[i] += c));
   const groups = parts && groupByClass(parts, 2 * STEP_CLASSES);
   const predictors = tensors.flatMap(({ channels, predictor }) => new Array(channels).fill(predictor));
@@ -59,20 +59,17 @@ function checked(v) {
 export function rowsOf(tensors, values, count) {
   let at = 0;
   return tensors.map(({ channels, step }) => {
-    return transposed(values.subarray(at, (at += channels * count)), count, channels, step);
+    return dequantise(values.subarray(at, (at += channels * count)), step, count, channels);
   });
 }
-
-/** 11.5: symbols times their step, rounded to binary32. Malformed if a result is not finite. @param {Int32Array} symbols
- * @param {number} step */
-export const dequantise = (symbols, step) => transposed(symbols, symbols.length, 1, step);
 
 /** Rows that are transposed at a time, so few that they stay in the cache. */
 const BLOCK = 128;
 
-/** As dequantise, of [columns, rows] symbols to [rows, columns] values. @param {Int32Array} symbols @param {number} rows
- * @param {number} columns @param {number} step */
-function transposed(symbols, rows, columns, step) {
+/** 11.5: symbols times their step, rounded to binary32, of [columns, rows] symbols to [rows, columns] values. Malformed
+ * if a result is not finite. @param {Int32Array} symbols @param {number} step @param {number} [rows]
+ * @param {number} [columns] */
+export function dequantise(symbols, step, rows = symbols.length, columns = 1) {
   const values = new Float32Array(symbols.length);
   for (let first = 0; first < rows; first += BLOCK) {
     const end = Math.min(first + BLOCK, rows);
@@ -82,8 +79,7 @@ function transposed(symbols, rows, columns, step) {
     }
   }
   // Rounding is monotone, so that where the largest symbol stays finite all do.
-  if (!Number.isFinite(Math.fround(MAX_SYMBOL * step))) {
-    for (const value of values) if (!Number.isFinite(value)) throw malformed("a reconstructed value is not finite");
-  }
+  const finite = Number.isFinite(Math.fround(MAX_SYMBOL * step)) || values.every(Number.isFinite);
+  if (!finite) throw malformed("a reconstructed value is not finite");
   return values;
 }

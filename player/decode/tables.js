@@ -41,12 +41,8 @@ function distribution(n, { mu8, si }) {
   return out;
 }
 
-/**
- * NormTable, 7.3, or the table of a mixture of two Gaussians, 7.4.
- *
- * @param {number} n symbols @param {Normal} first @param {Normal} [second] @param {number} [weight] of the second in 256
- * @returns {Int32Array} cum [n + 1]
- */
+/** NormTable, 7.3, or the table of a mixture of two Gaussians, 7.4: cum [n + 1]. @param {number} n symbols
+ * @param {Normal} first @param {Normal} [second] @param {number} [weight] of the second in 256 */
 export function normTable(n, first, second, weight = 0) {
   const c = distribution(n, first);
   const other = second ? distribution(n, second) : c;

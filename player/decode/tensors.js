@@ -1,5 +1,5 @@
-// What the decoder yields: tensors in three forms (clause 6.3), by id. Arrays are in C order. A kind (13.1) says what they
-// mean.
+// What the decoder yields: tensors in three forms (clause 6.3), by id. Arrays are in C order. A kind (13.1) says what
+// they mean.
 
 /**
  * The properties of the whole scene (clause 5.1).
@@ -16,27 +16,20 @@
  * @property {Camera | null} camera
  */
 
-/**
- * A pinhole camera with the axes x right, y down, z forward. viewmat: world to camera, row-major [4][4]. K: row-major
- * [3][3], pixels.
- *
- * @typedef {{viewmat: Float32Array, K: Float32Array, width: number, height: number}} Camera
- */
+/** A pinhole camera with the axes x right, y down, z forward. viewmat: world to camera, row-major [4][4]. K: row-major
+ * [3][3], pixels. @typedef {{viewmat: Float32Array, K: Float32Array, width: number, height: number}} Camera */
 
 /** A tensor of rows: so many numbers of each anchor, multiples of the step.
  * @typedef {{id: number, channels: number, step: number, predictor: number}} RowTensor */
 
 /** A plane of a grid, [channels, height, width].
- * @typedef {{data: Float32Array, channels: number, height: number, width: number}} Plane */
+ * @typedef {{data: Float32Array, channels: number, height: number, width: number, predictor: number}} Plane */
 
 /** A grid with one plane for each pair of its sides in order: 01, 02, .. 12, 13, ..
  * @typedef {{id: number, channels: number, sides: number[], planes: Plane[]}} Grid */
 
-/**
- * Linear layers from the input side. weight: row-major [outputs][inputs].
- *
- * @typedef {{weight: Float32Array, bias: Float32Array, inputs: number, outputs: number}[]} Network
- */
+/** Linear layers from the input side. weight: row-major [outputs][inputs].
+ * @typedef {{weight: Float32Array, bias: Float32Array, inputs: number, outputs: number}[]} Network */
 
 /** @typedef {{id: number, network: Network}} Chain */
 
