@@ -16,7 +16,7 @@ def splats_pd4(tmp_path_factory):
     return path
 
 
-def test_info_names_what_the_file_holds(cli, splats_pd4):
+def test_info_names_what_the_file_holds(cli, splats_pd4, tmp_path):
     result = cli("info", splats_pd4, "--json", "--check", "--bytes").json
     assert result["kind"] == [1] and (result["degree"], result["windows"]) == (1, False)
     assert [row["heads"] for row in result["layers"]] == [
@@ -27,6 +27,9 @@ def test_info_names_what_the_file_holds(cli, splats_pd4):
     assert result["layers"][1]["instants"] == 5 and result["left_out"] == []
     text = cli("info", splats_pd4, "-v")
     assert b"splats with harmonics of degree 1" in text.out and "instants 5" in text.err
+    still = tmp_path / "still.pd4"
+    still.write_bytes(encode(visible_splats(moving=False), effort=1))
+    assert cli("info", still, "--json").json["left_out"] == [] and b"left out" not in cli("info", still).out
 
 
 def test_decode_writes_arrays_and_no_checkpoint(cli, splats_pd4, tmp_path):
