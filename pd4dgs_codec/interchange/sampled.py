@@ -175,10 +175,9 @@ def _by_error(read: Callable[[float], Splats], where: str, step: Step) -> tuple[
             step()
         return found[t]
 
-    shifts = (
-        np.arange(1, FIRST - 1) * GOLDEN % 1 - 0.5
-    ) / 2  # else a motion that repeats with the samples stands still
-    grid = [0.0, *(np.arange(1, FIRST - 1) + shifts) / (FIRST - 1), 1.0]
+    inner = np.arange(1, FIRST - 1)
+    inner = inner + (inner * GOLDEN % 1 - 0.5) / 2  # a motion that repeats with even samples would stand still
+    grid = [0.0, *(inner / (FIRST - 1)).tolist(), 1.0]
     open_ = [(a, b) for a, b in zip(grid[:-1], grid[1:], strict=True)]
     for t in grid:
         at(t)
