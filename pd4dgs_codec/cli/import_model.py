@@ -172,7 +172,7 @@ def _asked(args: argparse.Namespace) -> dict[str, Any]:
 
     return {
         "psnr": args.psnr or LOWEST_DB + POINT_DB * (QUALITY if args.quality is None else args.quality),
-        "fps": args.fps or 30.0,
+        "fps": args.fps,
         "seconds": args.seconds,
         "background": args.background,
         "up": args.up,

@@ -97,7 +97,12 @@ def _segments(args: argparse.Namespace, console: Console) -> int:
     head = f"{args.input}: {len(index.segments):,} segments, {low:g} to {high:g} s, {sum(sizes):,} bytes: "
     lines = [head + f"{sizes[0]:,} of what segments share, {sizes[1] / (high - low):,.0f} a second"]
     rows = [
-        (s.file, *s.time_range, "-" if s.base is None else index.bases[s.base].file, number(s.bytes, 0))
+        (
+            s.file,
+            *(f"{t:.6g}" for t in s.time_range),
+            "-" if s.base is None else index.bases[s.base].file,
+            number(s.bytes, 0),
+        )
         for s in index.segments
     ]
     lines.append(table(("segment", "from s", "to s", "base", "bytes"), rows if console.verbose else rows[:SHOWN]))
@@ -180,7 +185,7 @@ def _text(result: dict[str, Any]) -> str:
     cut = f", truncated to {result['available']:,}" if rest < 0 else f", {rest:,} more behind its end" if rest else ""
     low, high = result["time_range"]
     what = f"splats with harmonics of degree {result['degree']}" if "degree" in result else "anchors"
-    left_out = result["left_out"]
+    left_out, base = result["left_out"], result["base"]
     lines = [
         f"{shown_name(result['input'])}: .pd4 format {result['format_version']}, {result['bytes']:,} bytes{cut}",
         f"mode {result['mode']}, header {result['header_bytes']} bytes, "
@@ -193,6 +198,7 @@ def _text(result: dict[str, Any]) -> str:
                 for row in result["layers"]
             ],
         ),
+        *([f"adds to the {base['rows']:,} rows of layer 0 of scene {base['scene']}, its base"] if base else []),
         *_slice_lines(result),
         *_about_lines(result["metadata"]),
         *([f"left out: {', '.join(row['what'] for row in left_out)} ({left_out[0]['why']})"] if left_out else []),

@@ -197,7 +197,10 @@ def stored_frames(path: Path, how: str, treat: Callable[[np.ndarray], np.ndarray
     how: identifies `treat` in the cache. Raises DataError for a video that cannot be decoded or holds no frame, and if
     the cache has no room.
     """
-    folder = Path(os.environ.get(FOLDER) or Path.home() / ".cache" / "pd4dgs-frames").absolute()
+    place = os.environ.get(FOLDER) or os.path.expanduser("~/.cache/pd4dgs-frames")
+    if place.startswith("~/"):
+        raise DataError(f"{path}: found no home folder to keep its frames in, expected one in {FOLDER}")
+    folder = Path(place).absolute()
     try:
         check_regular(path)
         stat = path.stat()

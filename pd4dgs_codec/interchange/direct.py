@@ -17,6 +17,7 @@ import numpy as np
 
 from pd4dgs_codec.data.view import held_out
 from pd4dgs_codec.draw.player import SplatPlayer
+from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.pack import (
     Grid,
     Ordered,
@@ -51,16 +52,16 @@ PRECISE, SHORT = 0.1, 0.01
 
 
 class Views(Sequence[Any]):
-    """Cameras with the Gaussians at times, or instants, that are made when they are asked for."""
+    """Cameras, again and again, with the Gaussians at times, or instants, that are made when they are asked for."""
 
     def __init__(self, at: Callable[[Any], Splats], cameras: Sequence[Camera], times: Sequence[Any]):
         self.at, self.cameras, self.times = at, cameras, times
 
     def __len__(self) -> int:
-        return len(self.cameras)
+        return len(self.times)
 
     def __getitem__(self, i: Any) -> Any:
-        return self.cameras[i], self.at(self.times[i])
+        return self.cameras[i % len(self.cameras)], self.at(self.times[i])
 
 
 class Packer:
@@ -72,16 +73,17 @@ class Packer:
         self.info, self.key = info, len(source.times) // 2
         self.source = source = canonical(source, self.key)
         deciding, others = held_out(cameras, HOLDOUT if len(cameras) >= FEW else 0)
-        last = len(source.times) - 1
-        instants = [round(t * last) for t in spread(len(deciding))]
-        views = Views(lambda i: source.frame(i, bare=False), deciding, instants)
+        times, self._often = source.looks(len(deciding))
+        views = Views(source.near, deciding, times[: len(deciding)])
         self.deciding = Pictures(views, info.background, info.near)
-        weights = sensitivity(self.deciding)
+        weights = sensitivity(replace(self.deciding, views=Views(source.near, deciding, times)))
         step()
         self.few, self.cameras = not others, others or evenly(deciding, CHECKED)
         self.times = [model.nearest(t) for t in spread(len(self.cameras))]  # also between samples
         checked = Views(model.splats, self.cameras, self.times)
         self.images = Pictures(checked, info.background, info.near).images
+        if not any(own.any() for own in weights.values()):
+            raise DataError(f"found none of {len(source.means[0]):,} Gaussians in any picture, expected one")
         self.ordered = Ordered.of(source.frame(self.key), weights)
         self.grouping: Grouping | None = None
         self.changes: dict[str, Change] = {}
@@ -118,7 +120,7 @@ class Packer:
             if self._added is None:
                 self._added, _ = absence(self.deciding, kept)
             worth = BIT * next_ * SCALAR_BITS * sum(self.ordered.channels.values())
-            leaving = kept & (self._added < worth)
+            leaving = kept & self._often & (self._added < worth)
             self._added, joint = absence(self.deciding, kept & ~leaving)
             if joint > JOINT * theta / SURE * self.scalars:
                 self._added = None

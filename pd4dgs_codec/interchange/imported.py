@@ -13,14 +13,14 @@ import numpy as np
 
 from pd4dgs_codec.data.view import depth_range, held_out, points_box, seconds_range
 from pd4dgs_codec.draw.player import SplatPlayer
-from pd4dgs_codec.errors import EncodeError
+from pd4dgs_codec.errors import DataError, EncodeError
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import Report, encode_with_report, with_metadata
 from pd4dgs_codec.format.metadata import Metadata
 from pd4dgs_codec.interchange.direct import Packer
 from pd4dgs_codec.interchange.sampled import Sampled, sampled
 from pd4dgs_codec.interchange.splats import evenly, picture
-from pd4dgs_codec.interchange.teacher import GOLDEN, SOLID, Options, Teacher, cameras_of, read_model
+from pd4dgs_codec.interchange.teacher import GOLDEN, SOLID, Options, Teacher, cameras_beside, cameras_of, read_model
 from pd4dgs_codec.kinds.splats import Splats, SplatScene
 from pd4dgs_codec.quality.image import mpsnr
 from pd4dgs_codec.scene import Camera, SceneInfo
@@ -28,12 +28,14 @@ from pd4dgs_codec.threads import one_blas_thread
 
 #: Cameras; of so many of them one measures the result and decides nothing. Width and height of a dome's pictures.
 CAMERAS, HOLDOUT, SIZE = 72, 6, 400
+FPS = 30.0  #: frames per second of a folder that does not say it
 BOX_INSTANTS = 5  #: number of instants whose Gaussians the box encloses
 #: A target size is met if the file has at least this share of it; most tries; dB of the first guess and the bounds.
 FULL, TRIES, LOWEST, HIGHEST = 0.95, 8, 15.0, 70.0
 METADATA_ROOM = 150  #: bytes of metadata without texts, at most
 GROWTH = 0.05  #: first guess of the change of the logarithm of bytes by dB
 BEST = 100.0  #: dB that stand for equal pictures
+FAR = 2.0  #: dB by which a result may be below what was asked for without a note
 
 Progress = Callable[[str, "int | None"], AbstractContextManager[Callable[[], None]]]
 
@@ -68,7 +70,7 @@ def import_model(
     psnr: float,
     most_bytes: int | None = None,
     slices: int | None = None,
-    fps: float = 30.0,
+    fps: float | None = None,
     seconds: float | None = None,
     background: tuple[float, float, float] | None = None,
     up: tuple[float, float, float] | None = None,
@@ -78,16 +80,19 @@ def import_model(
 ) -> Imported:
     """Packs the model at `place`, see `teacher.read_model`, for `psnr` dB, or with most_bytes for so many bytes.
 
-    fps: frames per second of a folder. seconds: the duration instead. tell: gets lines about what was read. progress:
-    (task, number of steps or None) -> a context whose value is called after each step. Raises DataError, EncodeError.
+    fps: frames per second of a folder, FPS by default. seconds: the duration instead. tell: gets lines about what was
+    read. progress: (task, number of steps or None) -> a context whose value is called after each step. Raises
+    DataError, EncodeError.
     """
-    model = read_model(place, fps, seconds)
+    model = read_model(place, fps or FPS, seconds)
+    if fps and not model.varies and len(model.times or ()) < 2:
+        raise DataError(f"{place}: found --fps for a source without frames; --seconds sets the duration of what moves")
     with progress("reading", None if model.times is None else len(model.times)) as step:
-        source = sampled(model, place, fps, step)
+        source = sampled(model, place, fps or FPS, step)
     instants, count = source.means.shape[:2]
     about, seconds = metadata or Metadata(), seconds or model.seconds
     static = float(source.static.mean())
-    tell(f"{place}: {_about(source, seconds, static)}")
+    tell(f"{place}: {_about(source, seconds, static)}; seen by {seen_by(place)}")
     some = [source.frame(i, bare=False) for i in evenly(range(instants), BOX_INSTANTS)]
     info, cameras, judges = scene_info(place, model, some, seconds, background, up)
     with progress("packing", None) as step:
@@ -99,6 +104,8 @@ def import_model(
     assert isinstance(scene, SplatScene)
     with progress("measuring", len(judges)) as step:
         quality = _quality(model, scene, judges, step)
+    if room is None and (found := quality[scene.level]) < psnr - FAR:
+        tell(f"note: has {found:.1f} dB, not {psnr:g}: these cameras and instants show more than those that decided")
     data, size = with_metadata(data, replace(about, quality=quality))
     report = replace(report, bytes=len(data), metadata_bytes=size)
     return Imported(
@@ -114,6 +121,12 @@ def _about(source: Sampled, seconds: float, static: float) -> str:
         return f"{count:,} Gaussians, harmonics of degree {degree}, static"
     times = f"{instants} instants in {seconds:.3g} s"
     return f"{count:,} Gaussians, harmonics of degree {degree}, {times}, {source.order}, {static:.0%} static"
+
+
+def seen_by(place: str) -> str:
+    """Names the cameras that decide and measure."""
+    beside = cameras_beside(Path(place))
+    return f"{CAMERAS} cameras around it" if beside is None else f"the cameras of {beside}"
 
 
 def scene_info(

@@ -8,16 +8,17 @@ space and colour. A row is then a chain of matches, and is shown only in its own
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pd4dgs_codec.draw.simd import kernel
-from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.errors import DamageWarning, DataError
 from pd4dgs_codec.format.registry import MAX_SIDE
 from pd4dgs_codec.interchange.splats import evenly
-from pd4dgs_codec.interchange.teacher import Teacher
+from pd4dgs_codec.interchange.teacher import GOLDEN, Teacher, spread
 from pd4dgs_codec.kinds.splats import Splats, unit, visible
 
 MOST_NUMBERS = 1 << 29  #: numbers of all samples, which take 2 GiB
@@ -34,6 +35,9 @@ ROWS, TRIPLES, RANK = 200, 6, 2
 REACH, HUE, GROWTH = 3.0, 0.2, 1.0
 SHARP = 1e-3  #: the share of a frame in which a window of matched Gaussians ends
 MOVES = 0.02  #: Gaussians are static if they move by less than this share of their size, and change by less than it
+
+#: Pictures that show a Gaussian before it counts as one that no view needs, and how many are added for that, at most.
+LOOKS, MOST_LOOKS = 4, 1024
 
 Step = Callable[[], None]
 
@@ -61,9 +65,38 @@ class Sampled:
 
     def frame(self, i: int, *, bare: bool = True) -> Splats:
         """Returns the Gaussians at instant i; bare: without their windows."""
-        shown = np.float32(1) if bare or self.windows is None else visible(self.windows, self.times[i])
+        return self.near(self.times[i], bare=bare)
+
+    def near(self, t: float, *, bare: bool = False) -> Splats:
+        """Returns the Gaussians at the instant nearest to time t, through their windows at t."""
+        i = int(np.abs(self.times - t).argmin())
+        shown = np.float32(1) if bare or self.windows is None else visible(self.windows, t)
         sh = np.concatenate([self.colors[i][:, None], self.rest], axis=1)
         return Splats(self.means[i], self.quats[i], self.scales[i], self.opacities[i] * shown, sh)
+
+    def looks(self, count: int) -> tuple[list[float], np.ndarray]:
+        """Returns (times of pictures that see each Gaussian while it is shown: of `count`, spread over the instants,
+        and then further ones; the Gaussians, bool [n], that LOOKS of the `count` show, if there are so many)."""
+        last, windows = len(self.times) - 1, self.windows
+        found = [float(self.times[round(t * last)]) for t in spread(count)]
+        peak = self.opacities.max(axis=0)
+        bright = self.opacities >= np.maximum(peak / 2, SEEN)
+        end, other = self.times[last - bright[::-1].argmax(axis=0)], peak < SEEN
+        if windows is not None:  # half of a bell and more
+            start, end = (windows[:, 0] + sign * (windows[:, 1] + windows[:, 2]) for sign in (-1, 1))
+            end, other = np.clip(end, 0, 1), other | (start > 1) | (end < 0)
+
+        def shows(t: float) -> np.ndarray:
+            i = np.abs(self.times - t).argmin()
+            return bright[i] if windows is None else visible(windows, t) > 0.5
+
+        most = min(LOOKS, count)
+        seen = np.where(other, most, np.sum([shows(t) for t in found], axis=0))
+        often = seen >= most
+        while len(found) < count + MOST_LOOKS and (lacking := seen < most).any():
+            found.append(float(end[lacking].min()))
+            seen += shows(found[-1]) | (end == found[-1])
+        return found, often
 
     @property
     def static(self) -> np.ndarray:
@@ -96,7 +129,10 @@ def sampled(model: Teacher, where: str, fps: float = 30.0, step: Step = lambda: 
             frames.append(frame)
             step()
         same = len({len(frame.means) for frame in frames}) == 1 and in_order(frames)
-    degree = min(frame.degree for frame in frames)
+    degree, most = (choose(frame.degree for frame in frames) for choose in (min, max))
+    if most > degree:
+        left = f"harmonics above degree {degree} are left out, expected degree {most} at all instants"
+        warnings.warn(DamageWarning(f"{where}: {left}"), stacklevel=2)
     frames = [replace(frame, sh=frame.sh[:, : (degree + 1) ** 2]) for frame in frames]
     if same:
         order = "one instant" if len(frames) == 1 else "rows in a stable order"
@@ -139,7 +175,9 @@ def _by_error(read: Callable[[float], Splats], where: str, step: Step) -> tuple[
             step()
         return found[t]
 
-    grid = np.linspace(0, 1, FIRST).tolist()
+    inner = np.arange(1, FIRST - 1)
+    inner = inner + (inner * GOLDEN % 1 - 0.5) / 2  # a motion that repeats with even samples would stand still
+    grid = [0.0, *(inner / (FIRST - 1)).tolist(), 1.0]
     open_ = [(a, b) for a, b in zip(grid[:-1], grid[1:], strict=True)]
     for t in grid:
         at(t)

@@ -8,6 +8,7 @@ same frame at their seam. A new group begins where a base of all segments would 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import math
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
@@ -28,7 +29,7 @@ from pd4dgs_codec.format.metadata import Metadata
 from pd4dgs_codec.format.reader import Base, read_base
 from pd4dgs_codec.format.registry import MAX_SIDE
 from pd4dgs_codec.interchange.direct import CHECKED, Packer, Views, canonical
-from pd4dgs_codec.interchange.imported import BEST, BOX_INSTANTS, Progress, scene_info
+from pd4dgs_codec.interchange.imported import BEST, BOX_INSTANTS, FPS, Progress, scene_info, seen_by
 from pd4dgs_codec.interchange.pack import Grid, Ordered, Packed, Pictures, Tensors, cells_of, matched, sensitivity
 from pd4dgs_codec.interchange.sampled import (
     MOVES,
@@ -65,15 +66,15 @@ class Unordered(Exception):
 
 
 class Frames(Sequence[Any]):
-    """The frames of a model, read when they are asked for, with harmonics of one degree. rows: the number of Gaussians
-    in each, else Unordered is raised; None: any."""
+    """The frames of a model, read when they are asked for, all with as many harmonics. rows: the number of Gaussians
+    in each, else Unordered is raised; None: any. digests: SHA-256 of those that were read, by number."""
 
     def __init__(self, model: Teacher, times: Sequence[float]):
         self.model, self.times = model, times
-        self.rows: int | None = None
-        self.harmonics: int | None = None
-        self.harmonics = min(self[i].sh.shape[1] for i in {0, len(times) - 1})
-        self.rows = len(self[0].means)
+        self.digests = dict[int, bytes]()
+        first = model.splats(float(times[0]))
+        self.harmonics = first.sh.shape[1]
+        self.rows: int | None = len(first.means)
 
     def __len__(self) -> int:
         return len(self.times)
@@ -82,10 +83,16 @@ class Frames(Sequence[Any]):
         frame = self.model.splats(float(self.times[i]))
         if self.rows not in (None, len(frame.means)):
             raise Unordered
-        most = self.harmonics or frame.sh.shape[1]
-        if frame.sh.shape[1] < most:
-            raise DataError(f"frame {i}: has {frame.sh.shape[1]} harmonics, expected {most} as the first and last have")
-        return replace(frame, sh=frame.sh[:, :most])
+        if frame.sh.shape[1] != self.harmonics:
+            raise DataError(f"frame {i}: has {frame.sh.shape[1]} harmonics, expected {self.harmonics} as the first has")
+        if i not in self.digests:
+            self.digests[i] = hashlib.sha256(b"".join(values.tobytes() for values in vars(frame).values())).digest()
+        return frame
+
+    @property
+    def content(self) -> str:
+        """SHA-256 of all frames, which have been read, hexadecimal."""
+        return hashlib.sha256(b"".join(self.digests[i] for i in range(len(self)))).hexdigest()
 
 
 # -- what stands still -------------------------------------------------------------------------------------------------
@@ -226,15 +233,15 @@ class BasePacker(Packer):
 
 
 class Backed(Views):
-    """Views of a segment's samples, and of the Gaussians of its base, if it has one."""
+    """Views of a segment's samples, and of the Gaussians of its base, if it has one. more: as many as `looks` wants."""
 
-    def __init__(self, source: Sampled, cameras: Sequence[Camera], behind: Splats | None):
-        def at(i: int) -> Splats:
-            own = source.frame(i, bare=False)
+    def __init__(self, source: Sampled, cameras: Sequence[Camera], behind: Splats | None, *, more: bool = False):
+        def at(t: float) -> Splats:
+            own = source.near(t)
             return together(behind, own) if behind else own
 
-        last = len(source.times) - 1
-        super().__init__(at, cameras, [round(t * last) for t in spread(len(cameras))])
+        times, _ = source.looks(len(cameras))
+        super().__init__(at, cameras, times if more else times[: len(cameras)])
 
 
 def _known(source: Sampled) -> Teacher:
@@ -278,9 +285,9 @@ class SegmentPacker(Packer):
     ):
         self.info, self.key, self.base = info, len(source.times) // 2, base
         self.source = source = canonical(source, self.key)
-        weights = sensitivity(Pictures(Backed(source, cameras, behind), info.background, info.near))
+        weights = sensitivity(Pictures(Backed(source, cameras, behind, more=True), info.background, info.near))
         some = Backed(source, evenly(cameras, CHECKED), behind)
-        self.cameras, self.times = list(some.cameras), [float(source.times[i]) for i in some.times]
+        self.cameras, self.times = list(some.cameras), list(some.times)
         self.images = Pictures(some, info.background, info.near).images
         size, own = base.info.voxel_size, {name: h[len(behind.means) :] for name, h in weights.items()}
         found = Ordered.of(source.frame(self.key), own, lambda at: (size, cells_of(at, size, base.anchor_q)))
@@ -358,7 +365,7 @@ def import_segments(
     *,
     length: float,
     psnr: float,
-    fps: float = 30.0,
+    fps: float | None = None,
     seconds: float | None = None,
     background: tuple[float, float, float] | None = None,
     up: tuple[float, float, float] | None = None,
@@ -373,7 +380,7 @@ def import_segments(
     Others as in `imported.import_model`. Raises DataError, also for a folder of another import without `overwrite`.
     """
     check_path(folder)
-    model = read_model(place, fps, seconds)
+    model = read_model(place, fps := fps or FPS, seconds)
     total = float(np.float32(seconds or model.seconds))
     times = model.times or tuple(np.linspace(0, 1, max(round(total * fps), 1) + 1))
     if len(times) < 2:
@@ -384,10 +391,13 @@ def import_segments(
     if count > last:
         raise DataError(f"{place}: has {last + 1:,} frames in {total:g} s, expected two at least in each segment")
     target, index = Path(folder), Index((), ())
-    made = {"source": place, "frames": len(times), "seconds": total, "cuts": count, "psnr": psnr, "theta": []}
+    made: dict[str, Any] = {"source": place, "frames": len(times), "seconds": total, "cuts": count, "psnr": psnr}
+    text = metadata or Metadata()
+    made |= {"background": background and list(background), "up": up and list(up)}
+    made |= {"texts": [text.title, text.source, text.licence], "content": None, "theta": []}
     if (target / INDEX).exists() and not overwrite:
         index = parse((target / INDEX).read_bytes(), str(target / INDEX))
-        made["theta"] = theta = index.made.get("theta")
+        made |= {"theta": (theta := index.made.get("theta")), "content": index.made.get("content")}
         if index.made != made or not isinstance(theta, list) or len(theta) != len(index.bases):
             raise DataError(f"{target}: holds another import; --overwrite replaces it")
     target.mkdir(parents=True, exist_ok=True)
@@ -399,15 +409,16 @@ def import_segments(
         except Unordered:
             frames.rows, reach = None, reach_of(first)
             found = groups(frames, cuts, reach, step)
+    if made["content"] not in (None, frames.content):
+        raise DataError(f"{target}: was made of other Gaussians than {place} holds now; --overwrite replaces it")
+    made["content"] = frames.content
     some = [frames[i] for i in evenly(range(len(times)), BOX_INSTANTS)]
     info, cameras, judges = scene_info(place, model, some, total, background, up)
     still = [len(own.rows) for _, own in found]
     rests = ", ".join(f"{n:,} stand still from segment {k} on" for n, (k, _) in zip(still, found, strict=True))
     what = f"{len(first.means):,} Gaussians, {len(times):,} frames in {total:.3g} s, {count} segments"
-    tell(f"{place}: {what}; {rests}")
-    writer = _Writer(
-        target, index, made, frames, cuts, info, cameras, [c for c, _ in judges], psnr, metadata or Metadata(), reach
-    )
+    tell(f"{place}: {what}; {rests}; seen by {seen_by(place)}")
+    writer = _Writer(target, index, made, frames, cuts, info, cameras, [c for c, _ in judges], psnr, text, reach)
     measured = list[float]()
     with progress("packing", count) as step:
         for (start, own), stop in zip(found, [k for k, _ in found[1:]] + [count], strict=True):
@@ -539,8 +550,8 @@ class _Writer:
     def _quality(self, scene: SplatScene, source: Sampled, behind: Splats | None) -> float:
         """Returns the mean PSNR in dB from cameras that decided nothing."""
         views, player, found = Backed(source, evenly(self.judges, JUDGED), behind), SplatPlayer(scene), []
-        for (camera, shown), i in zip(views, views.times, strict=True):
+        for (camera, shown), t in zip(views, views.times, strict=True):
             truth = picture(shown, camera, self.info.background, self.info.near)
-            image = picture(player.splats(float(source.times[i]))[0], camera, player.background, self.info.near)
+            image = picture(player.splats(t)[0], camera, player.background, self.info.near)
             found.append(min(mpsnr(image, truth), BEST))
         return float(np.mean(found))

@@ -20,6 +20,7 @@ import os
 import re
 import struct
 import sys
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -31,7 +32,7 @@ import numpy as np
 from pd4dgs_codec.data.dataset import color, load
 from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, files_of, last_numbers, read_file, split_options
 from pd4dgs_codec.data.view import Dataset, View, depth_range, held_out, normalised_times, points_box, seconds_range
-from pd4dgs_codec.errors import DataError, one_line, required
+from pd4dgs_codec.errors import DamageWarning, DataError, one_line, required
 from pd4dgs_codec.interchange import polynomials
 from pd4dgs_codec.interchange.runs import (
     PLY,
@@ -181,10 +182,14 @@ def _value(key: str, text: str) -> Any:
     raise ValueError(text)
 
 
+def cameras_beside(place: Path) -> Path | None:
+    """The cameras.json of a model: in its folder, or one or two folders above."""
+    return next((p / "cameras.json" for p in (place, *place.parents[:2]) if (p / "cameras.json").is_file()), None)
+
+
 def cameras_of(place: Path, points: np.ndarray, options: Options, downscale: int = 1) -> tuple[list[Camera], Triple]:
     """Returns (cameras of a cameras.json beside the Gaussians, else cameras around `points` [n, 3]; up direction)."""
-    beside = next((p / "cameras.json" for p in (place, *place.parents[:2]) if (p / "cameras.json").is_file()), None)
-    if beside is not None:
+    if (beside := cameras_beside(place)) is not None:
         cameras, up = read_cameras(beside)
         some = evenly(cameras, options.views)
         return [shrunk(c, downscale * math.ceil(max(c.width, c.height) / max(options.size))) for c in some], up
@@ -276,10 +281,17 @@ def _moving(paths: polynomials.Paths, seconds: float) -> Teacher:
 
 def _folder(folder: Path, fps: float) -> Teacher:
     """Reads a folder of one file per frame, in the order of the last number in the names."""
+    every = files_of(folder, FRAME_SUFFIXES)
     paths = max((files_of(folder, [suffix]) for suffix in FRAME_SUFFIXES), key=len)
     if not paths:
         raise DataError(f"{folder}: holds no file that ends in {', '.join(FRAME_SUFFIXES)}, expected one per frame")
+    if len(every) > len(paths):
+        left = f"{len(every) - len(paths)} of {len(every)} files are left out"
+        warnings.warn(DamageWarning(f"{folder}: {left}, expected all to end in {paths[0].suffix}"), stacklevel=2)
     numbers = last_numbers(paths) or list(range(len(paths)))
+    plain = [path for path in paths if last_numbers([path]) is None]
+    if 0 < len(plain) < len(paths):
+        raise DataError(f"{plain[0]}: has no number, expected one in the name of each frame, or in none")
     paths, numbers = [path for _, path in sorted(zip(numbers, paths, strict=True))], sorted(numbers)
     gaps = np.diff(numbers)
     if len(gaps) and (odd := np.flatnonzero(gaps != max(gaps.min(), 1))).size:

@@ -104,7 +104,8 @@ def test_no_gaussian_of_a_4dgs_file_moves_to_one_of_another_segment(cli, tmp_pat
 
 def test_one_segment_finds_its_base_in_its_folder(cli, own, tmp_path):
     assert cli("render", own / "00002.pd4", "-o", tmp_path / "a.png", "--time", 0.4, "--json").code == 0
-    assert cli("info", own / "00002.pd4", "--check").code == 0
+    told = cli("info", own / "00002.pd4", "--check")
+    assert told.code == 0 and b"rows of layer 0 of scene" in told.out
     assert cli("decode", own / "00002.pd4").code == 0
     assert cli("export", own / "00002.pd4", "-o", tmp_path / "a.ply").code == 0
     (own / INDEX).unlink()

@@ -69,6 +69,14 @@ def test_a_relative_cache_is_found_from_another_folder(stored, monkeypatch, tmp_
     assert frames.read(0).shape == frames.shape
 
 
+def test_an_account_without_a_home_is_told_to_name_a_cache(stored, monkeypatch):
+    for name in ("PD4DGS_CACHE", "HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr("pwd.getpwuid", Mock(side_effect=KeyError))
+    with pytest.raises(DataError, match="found no home folder to keep its frames in, expected one in PD4DGS_CACHE"):
+        stored()
+
+
 def test_videos_of_other_lengths_are_refused(scene, folder, refused):
     write_video(folder / "videos" / "cam1.mp4", [view.image for view in rig_views(scene, 1)[:3]], FPS)
     refused(folder, "cam1.mp4: has 3 frames at 10 per second and cam0.mp4 4")

@@ -16,7 +16,7 @@ from pd4dgs_codec.interchange import imported
 from pd4dgs_codec.interchange.sampled import sampled
 from pd4dgs_codec.interchange.splats import ply_bytes
 from pd4dgs_codec.interchange.teacher import Teacher, read_model
-from pd4dgs_codec.kinds.splats import Splats
+from pd4dgs_codec.kinds.splats import Splats, visible
 
 pytestmark = pytest.mark.usefixtures("small_views")
 
@@ -127,6 +127,63 @@ def test_a_function_is_sampled_where_it_bends(tmp_path, monkeypatch, cli):
     assert 0.85 * 4000 < Path("late.pd4").stat().st_size <= 4000 and max(result.json["psnr"].values()) > 30
 
 
+def test_a_motion_that_repeats_with_the_samples_is_not_still():
+    """It is at the same place at all of the first samples, and half way between them."""
+    still = body()
+
+    def at(t: float) -> Splats:
+        return replace(still, means=still.means + np.float32([np.sin(2 * np.pi * 16 * t), 0, 0]))
+
+    found = sampled(Teacher(at, None, 1.0), "waves")
+    assert not found.static.any() and np.ptp(found.means, axis=0)[:, 0].min() > 1.9
+
+
+def brief(folder: Path, way: str) -> Path:
+    """25 frames of a body, and 60 Gaussians above it in frame 17 only: as further rows, or as rows that fade in."""
+    folder.mkdir()
+    splats, more = body(), body(60)
+    more = replace(more, means=more.means / 4 + np.float32([0, 0, 2]))
+    both = Splats(**{name: np.concatenate([part, getattr(more, name)]) for name, part in vars(splats).items()})
+    for i in range(25):
+        faded = replace(both, opacities=both.opacities * (np.arange(360) < 300))
+        frame = both if i == 17 else splats if way == "rows" else faded
+        (folder / f"{i:02d}.ply").write_bytes(ply_bytes(frame))
+    return folder
+
+
+@pytest.mark.parametrize("way", ["rows", "fade"])
+def test_gaussians_that_no_usual_picture_shows_are_kept(tmp_path, cli, way):
+    out = tmp_path / "a.pd4"
+    result = cli("import_model", brief(tmp_path / "set", way), "-o", out, "--psnr", 36, "--json")
+    assert result.code == 0 and result.json["gaussians_left_out"] < 20, result.err
+    scene = decode(out.read_bytes())
+    shown = {i: np.count_nonzero(scene.splats(i / 24)[0].opacities > 0.4) for i in (15, 17)}
+    assert shown[17] - shown[15] > 50 or way == "fade"  # whose motion may cost more bits than it is worth
+
+
+def test_every_window_is_looked_at():
+    """At a time between the samples if it is so short; those that are never open need no picture."""
+    still = body()
+    centers = np.linspace(-0.4, 1.4, 300)
+    windows = np.stack([centers, np.zeros(300), np.full(300, 0.003)], axis=1).astype(np.float32)
+    moving = Teacher(lambda t: still, None, 1.0, windows=windows, bare=lambda t: still)
+    found = sampled(moving, "windows")
+    times, often = found.looks(20)
+    seen = np.sum([visible(windows, t) > 0.5 for t in times], axis=0)
+    assert len(times) < 800 and seen[(centers > 0) & (centers < 1)].min() >= 4 and not often.all()
+
+
+def test_files_and_harmonics_that_are_left_out_are_named(tmp_path, cli):
+    source = sequence(tmp_path / "set")
+    (source / "0009.splat").write_bytes(bytes(32))
+    (source / "0003.ply").write_bytes(ply_bytes(body(degree=1)))
+    result = cli("import_model", source, "-o", tmp_path / "a.pd4", "--psnr", 30)
+    assert "1 of 10 files are left out, expected all to end in .ply" in result.err
+    assert "harmonics above degree 0 are left out, expected degree 1 at all instants" in result.err
+    (source / "mean.ply").write_bytes(ply_bytes(body()))
+    _refused(cli, source, "mean.ply: has no number")
+
+
 SPINS = """
 import numpy as np
 from test_import import body
@@ -224,7 +281,10 @@ def test_bad_input_is_refused_in_one_line(tmp_path, monkeypatch, cli):
     _refused(cli, folder, "0004.ply")
     Path("nan.ply").write_bytes(ply_bytes(replace(body(), means=np.full((300, 3), np.nan, np.float32))))
     _refused(cli, "nan.ply", "none of 300 Gaussians is finite")
+    Path("unseen.ply").write_bytes(ply_bytes(replace(body(), opacities=np.zeros(300, np.float32))))
+    _refused(cli, "unseen.ply", "found none of 300 Gaussians in any picture")
     Path("one.ply").write_bytes(ply_bytes(body()))
+    _refused(cli, "one.ply", "found --fps for a source without frames", "--fps", "25")
     _refused(cli, "one.ply", "target size: the smallest file tried takes", "--target-size", "500")
     _refused(cli, "none.ply", "found nothing")
 

@@ -92,8 +92,12 @@ def test_segments_that_are_there_are_kept_and_the_others_are_made_again(tmp_path
     (out / "base-0000.pd4").write_bytes(b"")  # segments of another base would not fit
     assert imported(cli, source, out).json["kept"] == 3
     assert {path.name: path.read_bytes() for path in out.iterdir()} == before
-    other = imported(cli, source, out, "--psnr", 30)
-    assert other.code == 1 and "holds another import" in other.err
+    for more in (("--psnr", 30), ("--background", "white"), ("--up", "0,0,1"), ("--title", "another")):
+        other = imported(cli, source, out, *more)
+        assert other.code == 1 and "holds another import" in other.err
+    (source / "0001.ply").write_bytes(ply_bytes(body()))
+    other = imported(cli, source, out)
+    assert other.code == 1 and "was made of other Gaussians" in other.err
     assert imported(cli, source, out, "--psnr", 30, "--overwrite").json["kept"] == 0
 
 
