@@ -3,7 +3,8 @@
 The Gaussians at the key instant become splats, see `pack`. What changes over time is subtracted from them, head by
 head, and its principal components, weighted by what pictures depend on, become bases over time, with one coefficient
 per Gaussian and basis. A component stays while it lowers the error by more than its bits are worth. Instants at which
-all bases are nearly straight are left out. Layer 2 takes the components that may be missing at twice the error.
+all bases are nearly straight are left out. What moves comes in layer 1, and with it the Gaussians that a file of far
+lower quality would leave out: layer 0 is a good picture of the key instant in a third of the bytes.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ from pd4dgs_codec.interchange.pack import (
 from pd4dgs_codec.interchange.sampled import Sampled
 from pd4dgs_codec.interchange.splats import evenly, picture
 from pd4dgs_codec.interchange.teacher import Teacher, spread
-from pd4dgs_codec.interchange.tracks import BIT, STRAIGHT, Change, Grouping, Motion, layer
+from pd4dgs_codec.interchange.tracks import BIT, STRAIGHT, Change, Grouping, tracks_of
 from pd4dgs_codec.kinds import splats
 from pd4dgs_codec.kinds.splats import YCOCG, Splats, product
 from pd4dgs_codec.kinds.tracks import Tracks, place
@@ -43,10 +44,12 @@ from pd4dgs_codec.scene import Camera, SceneInfo
 #: One of so many cameras measures the error and does not decide about steps: those that do look better than others. Of
 #: fewer than FEW all decide, and CHECKED of them measure.
 HOLDOUT, FEW, CHECKED = 5, 30, 12
-#: Bits of a scalar, about; the share of the first guess of theta by which Gaussians are left out; and the rounds in
-#: which they are, at twice the theta of the one before: several that hide each other's absence cannot all leave.
-SCALAR_BITS, SURE, ROUNDS = 2.8, 0.25, 7
-JOINT = 0.3  #: the most that those who left may add together, as a share of the error that is aimed at
+#: Bits of a scalar, about. Gaussians leave in rounds, each at twice the theta of the one before, the first at the share
+#: FIRST of the first guess of theta: several that hide each other's absence cannot all leave. Of EACH views one decides
+#: about it.
+SCALAR_BITS, FIRST, EACH = 2.8, 1 / 256, 2
+EARLY = 14.0  #: in layer 0 are the Gaussians that stay at so many times theta
+NEAR = 8.0  #: principal components and groups serve for thetas that differ by this factor
 #: Windows are precise to PRECISE of the width that all but the share SHORT of them have.
 PRECISE, SHORT = 0.1, 0.01
 
@@ -66,6 +69,8 @@ class Views(Sequence[Any]):
 
 class Packer:
     """Packs samples for any quality; what does not depend on it is computed once."""
+
+    early: np.ndarray | None = None  #: bool [n]: the ordered Gaussians that come in layer 0, None for all
 
     def __init__(
         self, model: Teacher, source: Sampled, cameras: Sequence[Camera], info: SceneInfo, step: Callable[[], None]
@@ -89,8 +94,7 @@ class Packer:
         self.changes: dict[str, Change] = {}
         seen = np.bincount(self.ordered.rows, minlength=len(source.means[0])) > 0
         self._leave, self._reached = np.where(seen, np.inf, 0.0), 0.0  # theta at which each Gaussian leaves
-        self._added: np.ndarray | None = None  # to the error by the absence of each that has not left
-        self._thinned: tuple[float, Packer] | None = None
+        self._moving: tuple[float, Packer] | None = None  # a theta, and with what moves of those that have not left
         step()
 
     @property
@@ -101,39 +105,44 @@ class Packer:
     def scene(self, psnr: float) -> splats.SplatScene:
         """Returns the scene whose pictures have `psnr` dB against those of the source."""
         error = 10 ** (-psnr / 10)
-        own = self._thin(2.0 ** np.floor(np.log2(SURE * error / self.scalars)))
 
         def build(theta: float) -> tuple[splats.SplatScene, float]:
-            scene = own._scene(theta, error)
-            return scene, own._error(scene)
+            scene = self._thinned(theta)._scene(theta)
+            return scene, self._error(scene)
 
-        return matched(build, psnr, error / own.scalars)
+        return matched(build, psnr, error / self.scalars)
 
-    def _thin(self, theta: float) -> Packer:
+    def _thinned(self, theta: float) -> Packer:
         """Returns the packer of the Gaussians whose absence would add more to the error than their bits are worth: of
         all that a view sees if there are few, which would not tell what other views miss."""
-        if self._thinned and self._thinned[0] == theta:  # for several qualities: motion takes longer than all else
-            return self._thinned[1]
-        self._reached = self._reached or theta / 2**ROUNDS
-        while not self.few and self._reached < theta:
-            kept, next_ = self._leave > self._reached, 2 * self._reached
-            if self._added is None:
-                self._added, _ = absence(self.deciding, kept)
-            worth = BIT * next_ * SCALAR_BITS * sum(self.ordered.channels.values())
-            leaving = kept & self._often & (self._added < worth)
-            self._added, joint = absence(self.deciding, kept & ~leaving)
-            if joint > JOINT * theta / SURE * self.scalars:
-                self._added = None
-                break
-            self._leave[leaving] = self._reached = next_
-        own, kept = copy(self), self._leave[self.ordered.rows] > theta
-        own.ordered = self.ordered.taken(kept if kept.any() else ~kept)
-        if len(self.source.times) > 1:
-            own.changes = own._changes()
-        if own.changes:
-            places = place(own.ordered.values["position"], self.info.box)
-            own.grouping = Grouping.of(own.changes, places, theta / SURE)
-        self._thinned = theta, own
+        worth = BIT * SCALAR_BITS * sum(self.ordered.channels.values())
+        views = self.deciding.views
+        some = replace(self.deciding, views=Views(views.at, views.cameras[::EACH], views.times[::EACH]))
+        moving = len(self.source.times) > 1
+        while not self.few and self._reached < theta * (EARLY if moving else 1):
+            at, kept = absence(some, self._leave > self._reached) / worth, self._leave > self._reached
+            next_ = 2 * self._reached or FIRST * theta
+            leaving = kept & self._often & (at < next_)
+            self._leave[leaving] = np.maximum(at[leaving], self._reached)
+            self._reached = next_
+        if self._moving is None or not 1 / NEAR <= theta / self._moving[0] <= NEAR:
+            own = self._taken(self._leave[self.ordered.rows] > theta / NEAR)
+            own.changes = own._changes() if moving else {}
+            if own.changes:
+                own.grouping = Grouping.of(own.changes, place(own.ordered.values["position"], self.info.box), theta)
+            self._moving = theta, own
+        own = self._moving[1]
+        own = own._taken(self._leave[own.ordered.rows] > theta)
+        early = self._leave[own.ordered.rows] > EARLY * theta
+        own.early = early if moving and early.any() else None
+        return own
+
+    def _taken(self, kept: np.ndarray) -> Packer:
+        """Returns the packer of those of the ordered Gaussians that are kept, bool [n]: of all if none is."""
+        own, kept = copy(self), kept if kept.any() else ~kept
+        own.ordered = self.ordered.taken(kept)
+        own.changes = {name: change.taken(kept) for name, change in self.changes.items()}
+        own.grouping = self.grouping and self.grouping.taken(kept)
         return own
 
     def _error(self, scene: splats.SplatScene) -> float:
@@ -144,14 +153,14 @@ class Packer:
             errors.append(np.square(image - truth, dtype=np.float64).mean())
         return float(np.exp(np.mean(np.log(np.maximum(errors, 1e-12)))))
 
-    def _scene(self, theta: float, error: float) -> splats.SplatScene:
+    def _scene(self, theta: float) -> splats.SplatScene:
         grid = self.ordered.grid(theta)
         packed = self.ordered.packed(grid)
         tensors, steps, centres = self._tensors(packed)
         found = splats.scene(
             replace(self.info, voxel_size=packed.voxel_size), packed.cells, tensors, steps,
-            classes=packed.classes, centres=centres,
-            tracks=self._tracks(grid, error, packed),
+            classes=packed.classes, centres=centres, tracks=self._tracks(grid, packed),
+            layer=None if self.early is None else ~self.early,
         )  # fmt: skip
         return found
 
@@ -200,29 +209,16 @@ class Packer:
                 found[name] = change
         return found
 
-    def _tracks(self, grid: Grid, error: float, packed: Packed) -> dict[int, Tracks]:
-        """Returns the tracks of layers 1 and 2. error: the mean squared error of pictures that is aimed at."""
-        kept = [
-            (change.energies[k], name, int(k))
-            for name, change in self.changes.items()
-            for k in np.flatnonzero(change.gains(grid.theta) > 0)
-        ]
-        kept.sort(reverse=True)
-        rest = np.cumsum([energy for energy, *_ in kept][::-1])[::-1]
-        first = [row for row, behind in zip(kept, rest, strict=True) if behind > error]
-        allowed = STRAIGHT * grid.theta * self.scalars
+    def _tracks(self, grid: Grid, packed: Packed) -> dict[int, Tracks]:
+        """Returns the tracks, of layer 1, none if nothing moves."""
+        chosen = {name: np.flatnonzero(change.gains(grid.theta) > 0) for name, change in self.changes.items()}
+        chosen = {name: own for name, own in chosen.items() if len(own)}
+        if not chosen:
+            return {}
         at = (packed.cells + packed.tensors["offset"].astype(np.float64)) * packed.voxel_size
         grouping = self.grouping and replace(self.grouping, places=place(at, self.info.box))
-        layers = {1: first or kept, 2: kept[len(first) :] if first else []}
-        found, done = dict[int, Tracks](), dict[str, Motion]()
-        for number, own in layers.items():
-            if not own:
-                continue
-            chosen = {name: np.array([k for _, other, k in own if other == name]) for name in self.changes}
-            chosen = {name: ks for name, ks in chosen.items() if len(ks)}
-            groups = grouping if number == 1 else None
-            found[number], done = layer(self.changes, chosen, grid, self.source.times, self.key, allowed, groups, done)
-        return found
+        allowed = STRAIGHT * grid.theta * self.scalars
+        return {1: tracks_of(self.changes, chosen, grid, self.source.times, self.key, allowed, grouping)}
 
 
 def _logs(scales: np.ndarray) -> np.ndarray:

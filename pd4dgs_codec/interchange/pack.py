@@ -129,25 +129,30 @@ def sensitivity(pictures: Pictures) -> Tensors:
     return total
 
 
-def absence(pictures: Pictures, kept: np.ndarray) -> tuple[np.ndarray, float]:
-    """Returns (by how much the mean squared error of pictures that show only the Gaussians `kept`, bool [n], grows if
-    one more leaves them: float64 [n], 0 for the others; this error). Exact up to the random signs of `sensitivity`,
-    since a picture is linear in the opacity of one Gaussian."""
-    rng, total, rows, error = np.random.default_rng(0), np.zeros(len(kept)), np.flatnonzero(kept), 0.0
+def absence(pictures: Pictures, kept: np.ndarray) -> np.ndarray:
+    """Returns by how much the mean squared error of pictures that show only the Gaussians `kept`, bool [n], grows if
+    one more leaves them: float64 [n], 0 for the others.
+
+    Exact up to the random signs of `sensitivity`, since a picture is linear in the opacity of one Gaussian: |c|² -
+    2 c r, c what it adds to the pictures, r what those of `kept` have too much. Where its absence would mend an error,
+    c r > 0, this part counts as 0: thousands would leave to mend the same error, and make it far larger.
+    """
+    rng, rows = np.random.default_rng(0), np.flatnonzero(kept)
+    alone, crossed = np.zeros((2, len(kept)))
     for (camera, splats), truth in zip(pictures.views, pictures.images, strict=True):
         own = splats.taken(rows)
         geometry = Geometry(own.means, own.quats, own.scales, own.opacities)
         projected, colors = project(geometry, camera, pictures.near), np.ascontiguousarray(own.colors(camera.eye))
         image, transmittance = composite(projected, colors, np.array(pictures.background, np.float32))
         signs = (2 * rng.integers(0, 2, image.shape) - 1).astype(np.float32)
-        alone, crossed = (
+        own_signs, own_error = (
             backward(projected, geometry, colors, image, transmittance, g, np.zeros_like(transmittance))
             .geometry.opacities.astype(np.float64) * own.opacities
             for g in (signs, image - truth)
         )  # fmt: skip
-        error += float(np.square(image - truth, dtype=np.float64).mean()) / len(pictures.views)
-        total[rows] += (np.square(alone) - 2 * crossed) / (image.size * len(pictures.views))
-    return total, error
+        alone[rows] += np.square(own_signs) / (image.size * len(pictures.views))
+        crossed[rows] += own_error / (image.size * len(pictures.views))
+    return np.asarray(alone + 2 * np.maximum(-crossed, 0))
 
 
 @dataclass(frozen=True, eq=False)

@@ -302,13 +302,13 @@ class SegmentPacker(Packer):
         found.base, found.ordered = base, replace(self.ordered, base=base)
         return found
 
-    def _scene(self, theta: float, error: float) -> SplatScene:
+    def _scene(self, theta: float) -> SplatScene:
         base = replace(self.base, info=replace(self.info, voxel_size=self.base.info.voxel_size))
-        return joined(base, super()._scene(theta, error)) if len(self.ordered.rows) else base
+        return joined(base, super()._scene(theta)) if len(self.ordered.rows) else base
 
-    def _tracks(self, grid: Grid, error: float, packed: Packed) -> dict[int, Tracks]:
+    def _tracks(self, grid: Grid, packed: Packed) -> dict[int, Tracks]:
         finer = replace(grid, steps={name: SEAM * step for name, step in grid.steps.items()})
-        return super()._tracks(finer, error, packed)
+        return super()._tracks(finer, packed)
 
     def _window_step(self, windows: np.ndarray, coarsest: float) -> float:
         return self.base.steps["window"]
@@ -509,12 +509,12 @@ class _Writer:
         error = 10 ** (-self.psnr / 10)
         guess, source = error / packer.scalars, self.samples(own[0], still)
         info = self._info(a, self.cuts[own[0] + 1])
-        first = SegmentPacker(source, still.mean, packer._scene(guess, error), self.cameras, info, guess)
+        first = SegmentPacker(source, still.mean, packer._scene(guess), self.cameras, info, guess)
 
         def build(theta: float) -> tuple[tuple[float, SplatScene], float]:
-            scene = packer._scene(theta, error)
+            scene = packer._scene(theta)
             here = first.on(scene)
-            return (theta, scene), here._error(here._scene(theta, error))
+            return (theta, scene), here._error(here._scene(theta))
 
         theta, scene = matched(build, self.psnr, guess)
         data, _ = encode_with_report(scene)
@@ -533,7 +533,7 @@ class _Writer:
             source = self.samples(k, still)
             if group and still:
                 packer: Packer = SegmentPacker(source, still.mean, group.scene, self.cameras, info, group.theta)
-                scene = packer._scene(group.theta, 10 ** (-self.psnr / 10))
+                scene = packer._scene(group.theta)
             else:
                 packer = Packer(_known(source), source, self.cameras, info, lambda: None)
                 scene = packer.scene(self.psnr)

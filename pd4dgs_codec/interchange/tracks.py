@@ -35,10 +35,6 @@ SWITCH, MAP_BITS, PREDICTED = 7.0, 12.0, 0.75
 FINE = 20.0  #: a map is so many times as precise as coefficients of class 0, since all of its group depend on it
 
 
-#: Coefficients [n, K] of a head, and its trajectories float64 [K, c T] at all instants.
-Motion = tuple[np.ndarray, np.ndarray]
-
-
 @dataclass(frozen=True, eq=False)
 class Change:
     """How a head changes. values: float32 [n, c T], n Gaussians at T instants, c components. weights: float64 [n],
@@ -66,6 +62,12 @@ class Change:
             return None
         coefficients = values @ (found / instants).astype(np.float32)
         return Change(values, weights, components, found, coefficients, energies[order])
+
+    def taken(self, rows: np.ndarray) -> Change:
+        """Returns that of some of the Gaussians, bool [n], by the same components."""
+        weights, coefficients = self.weights[rows], self.coefficients[rows]
+        energies = weights @ np.square(coefficients, dtype=np.float64)
+        return replace(self, values=self.values[rows], weights=weights, coefficients=coefficients, energies=energies)
 
     def gains(self, theta: float) -> np.ndarray:
         """Returns by how much each component lowers the error, less what its bits are worth, float64 [K]."""
@@ -99,7 +101,7 @@ def between(known: np.ndarray, values: np.ndarray, times: np.ndarray) -> np.ndar
     return np.asarray(values[..., j] * (1 - f) + values[..., j + 1] * f)
 
 
-def layer(
+def tracks_of(
     changes: Mapping[str, Change],
     chosen: Mapping[str, np.ndarray],
     grid: Grid,
@@ -107,18 +109,17 @@ def layer(
     key: int,
     allowed: float,
     grouping: Grouping | None = None,
-    below: Mapping[str, Motion] | None = None,
-) -> tuple[Tracks, dict[str, Motion]]:
-    """Returns (the tracks of a layer, the motion that they are, by head).
+) -> Tracks:
+    """Returns the tracks of components.
 
     chosen: components by head. times: float64 [T], normalised; key: the key instant. allowed: the squared error that
-    leaving out instants may add. grouping: None for tracks without groups. below: the motion of a layer below.
+    leaving out instants may add. grouping: None for tracks without groups.
     """
     paths = [changes[name].vectors[:, own] * np.sqrt(changes[name].energies[own]) for name, own in chosen.items()]
     kept = knots(np.concatenate([path.T.reshape(-1, len(times)) for path in paths]), times, key, allowed)
     largest = {name: changes[name].energies[own].max() for name, own in chosen.items()}
     fine = {name: min(np.sqrt(12 * grid.theta * len(times) / x), COARSEST) for name, x in largest.items()}  # of bases
-    step, bases, wholes, values = BASIS_STEP, {}, {}, {}
+    step, bases, values = BASIS_STEP, {}, {}
     if grouping:  # centres and maps have no scale of their own
         main = max(largest, key=lambda name: largest[name])
         step = float(np.float32(np.sqrt(fine[main] * grid.steps[main] / FINE)))
@@ -128,20 +129,15 @@ def layer(
         change = changes[name]
         exact = change.vectors[:, own].T.reshape(len(own), change.components, -1)[:, :, kept]
         bases[name] = (np.rint(exact / fine[name]) * step).astype(np.float32)
-        wholes[name] = between(times[kept], bases[name].astype(np.float64), times).reshape(len(own), -1)
-        inverse = np.linalg.pinv(wholes[name])
-        values[name] = (change.values @ inverse.astype(np.float32)).astype(np.float64)
-        if below and name in below:
-            values[name] -= below[name][0] @ (below[name][1] @ inverse)
+        whole = between(times[kept], bases[name].astype(np.float64), times).reshape(len(own), -1)
+        values[name] = (change.values @ np.linalg.pinv(whole).astype(np.float32)).astype(np.float64)
     groups = grouping.fitted(values, weights, grid.theta, step) if grouping else None
-    heads, motion = {}, {}
+    heads = {}
     for name, x in values.items():
         shared = groups.added(name, grouping.places) if grouping and groups and name in groups.maps else np.zeros(1)
         own_step = float(np.float32(grid.steps[name] / scales[name]))
-        rest = grid.rounded(x - shared, own_step, weights[name])
-        heads[name] = Head(bases[name], rest, own_step)
-        motion[name] = rest + shared, wholes[name]
-    return Tracks.of(times[kept], step, heads, groups), motion
+        heads[name] = Head(bases[name], grid.rounded(x - shared, own_step, weights[name]), own_step)
+    return Tracks.of(times[kept], step, heads, groups)
 
 
 # -- groups ------------------------------------------------------------------------------------------------------------
@@ -165,6 +161,10 @@ class Grouping:
             if bits > most:
                 most, found = bits, _labels(coefficients, change.weights, places, theta)
         return Grouping(places, found)
+
+    def taken(self, rows: np.ndarray) -> Grouping:
+        """Returns that of some of the Gaussians, bool [n]."""
+        return Grouping(self.places[rows], np.unique(self.labels[rows], return_inverse=True)[1])
 
     def fitted(
         self, values: Mapping[str, np.ndarray], weights: Mapping[str, np.ndarray], theta: float, step: float

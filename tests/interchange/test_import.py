@@ -79,7 +79,7 @@ def test_gaussians_that_are_not_worth_their_bits_are_left_out(tmp_path, monkeypa
     both = {name: np.concatenate([getattr(splats, name), getattr(dust, name)]) for name in vars(splats)}
     (tmp_path / "a.ply").write_bytes(ply_bytes(replace(splats, **both)))
     found = cli("import_model", tmp_path / "a.ply", "-o", tmp_path / "a.pd4", "--psnr", 40, "--json").json
-    assert found["psnr"]["0"] > 39.5 and 200 < found["gaussians"] < 330
+    assert found["psnr"]["0"] > 38.5 and 200 < found["gaussians"] < 330
 
 
 def test_frames_in_order_become_tracks(tmp_path, cli):
