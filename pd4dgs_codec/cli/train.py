@@ -138,7 +138,8 @@ def _train(args: argparse.Namespace, console: Console) -> int:
     reading = {name: getattr(config, name) for name in ("downscale", "holdout", "background", "fps")}
     with compiling(config, device):
         dataset = load_source(args.source, **reading)
-    trainer = Trainer(config, dataset, device)
+        start = checkpoint.load(args.resume)[0] if args.resume else None  # spares the search for start points
+        trainer = Trainer(config, dataset, device, start=start)
     if args.resume:
         trainer.resume(Path(args.resume))
     progress, log = None, None
@@ -371,6 +372,7 @@ def _summary(args: argparse.Namespace, trainer: Trainer) -> dict[str, Any]:
         "resume": None if trainer.finished else _resuming(args, trainer),
         "interrupted": trainer.interrupted,
         "seconds": round(trainer.seconds, 3),
+        "spent": {name: round(seconds, 3) for name, seconds in learner.spent.most_common()},
         "phases_not_reached": learner.schedule.phases_not_reached(learner.position),
         "skipped": learner.skipped,
         "doubts": trainer.doubts(),
@@ -399,6 +401,9 @@ def _text(result: dict[str, Any]) -> str:
     end = "" if result["finished"] or not result["total"] else f" of {result['total']}"
     steps = f"{result['iterations']}{end} steps in {result['seconds']:.0f} s"
     lines = [f"{result['output']}: {steps}, {result['anchors']} anchors"]
+    if result["spent"]:
+        parts = ", ".join(f"{name} {seconds:.1f}" for name, seconds in result["spent"].items())
+        lines.append(f"seconds that were not steps: {sum(result['spent'].values()):.0f}, of {parts}")
     if result["phases_not_reached"]:
         lines.append(f"phases not reached: {', '.join(result['phases_not_reached'])}")
     if result["resume"]:

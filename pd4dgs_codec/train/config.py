@@ -97,11 +97,11 @@ class LearningRates:
     """Adam's learning rates by parameter group: (start, end) of a log-linear schedule over the run.
 
     Final rates stay high because `TrainConfig.cooldown` anneals them to 0. `planes` and `deformation` apply to runs of
-    up to SHORT_RUN steps; `of_run` scales them for longer runs.
+    up to SHORT_RUN steps; `of_run` scales them for longer runs. Log-scalings have those of features, exposures those of
+    the opacity network.
     """
 
     feature: tuple[float, float] = (7.5e-3, 1.2e-2)
-    scaling_log: tuple[float, float] = (7e-3, 1.2e-2)
     offset: tuple[float, float] = (1e-2, 1.6e-3)
     mask_logits: tuple[float, float] = (5e-2, 0.16)
     opacity: tuple[float, float] = (2e-3, 8e-4)
@@ -109,7 +109,14 @@ class LearningRates:
     color: tuple[float, float] = (8e-3, 1.6e-3)
     planes: tuple[float, float] = (3e-2, 8e-3)
     deformation: tuple[float, float] = (1.5e-3, 5.6e-4)
-    exposure: tuple[float, float] = (2e-3, 2e-3)
+
+    @property
+    def scaling_log(self) -> tuple[float, float]:
+        return self.feature
+
+    @property
+    def exposure(self) -> tuple[float, float]:
+        return self.opacity
 
     def of_run(self, iterations: int | None) -> LearningRates:
         """The rates of a run of `iterations` steps. Beyond SHORT_RUN, the end rates of planes and deformation fall as

@@ -48,22 +48,18 @@ def fresh_model(
     seed: int,
     max_layer: int = 2,
     key: float | None = None,
+    moving: Tensor | None = None,
 ) -> Model:
     """Returns an untrained model without the deformations of the layers above max_layer.
 
-    Anchors start at the dataset's points, with jittered copies if there are few. Without points they start in its box
-    where pictures differ from a plain background, or at points found by stereo if there is none. More start where
-    something moves at the key instant, see `movers`. A layer's start values do not depend on max_layer. key: the key
-    instant, normalised time; None: no key instant.
+    Anchors start at the dataset's points, with jittered copies if there are few; without points in its box where
+    pictures differ from a plain background. More start at points `moving` [m, 3], see `start_points`. A layer's start
+    values do not depend on max_layer. key: the key instant, normalised time; None: no key instant.
     """
-    if dataset.points is None and not on_plain_background(dataset):
-        dataset = with_points(dataset, key)
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)  # nn.Linear and HexPlane draw their start values from the global generator
     info = scene_info(dataset)
-    moving = torch.zeros(0, 3)
-    if key is not None and max_layer > 0:
-        moving = workers.alike(lambda: moving_starts(dataset, key))
+    if moving is not None:
         moving = moving[torch.randperm(len(moving), generator=generator)[: config.initial_anchors]]
     anchor_q = initial_cells(dataset, config.initial_anchors, info.voxel_size, generator, moving)
     n = len(anchor_q)
@@ -87,6 +83,16 @@ def fresh_model(
         fields[0] if max_layer > 0 else None,
         fields[1] if max_layer > 1 else None,
     )
+
+
+def start_points(dataset: Dataset, key: float | None, moves: bool) -> tuple[Dataset, Tensor]:
+    """The dataset, with points found by stereo if it has neither points nor a plain background; and float32 [n, 3]
+    points of what moves at the key instant, if there is one and motion is to be learnt."""
+    if dataset.points is None and not on_plain_background(dataset):
+        dataset = with_points(dataset, key)
+    if key is None or not moves:
+        return dataset, torch.zeros(0, 3)
+    return dataset, workers.alike(lambda: moving_starts(dataset, key))
 
 
 def fresh_mask_logits(n: int, level: int) -> Tensor:

@@ -23,25 +23,25 @@ from pd4dgs_codec.train.schedule import Schedule
 
 @contextmanager
 def compiling(config: TrainConfig, device: str) -> Iterator[None]:
-    """Compiles, or loads from numba's cache, the kernels of a run on the CPU beside the `with` block, which may not
-    draw from torch's global generator. Those of level 0 are ready after it; those of higher levels may follow beside
-    the first steps."""
+    """Compiles, or loads from numba's cache, the kernels of a run on the CPU beside the `with` block. Those of the
+    first steps are ready after it; those of higher levels and later phases may follow beside the first steps."""
     ready = Event()
     if device == "cpu":
-        Thread(target=_compile, args=(config, ready), name="compiling").start()
+        size = replace(PRESETS["tiny"], initial_anchors=8)
+        # made here, since it draws from torch's global generator
+        learner = Learner(replace(config, iterations=100), _ball(), Schedule(100), torch.device("cpu"), size)
+        Thread(target=_compile, args=(learner, ready), name="compiling").start()
     else:
         ready.set()
     yield
     ready.wait()
 
 
-def _compile(config: TrainConfig, ready: Event) -> None:
-    """Finds the gradients of one picture at level 0, then at the highest level, as at the end of a run."""
+def _compile(learner: Learner, ready: Event) -> None:
+    """Finds the gradients of one picture as in the first step, then as in the last, at the highest level."""
     with suppress(Exception):  # the run compiles for itself, or has ended: it failed to read its data
-        size = replace(PRESETS["tiny"], initial_anchors=8)
-        learner = Learner(replace(config, iterations=1), _ball(), Schedule(1), torch.device("cpu"), size)
-        learner.iteration = 1
-        for level in sorted({0, learner.model.level}):
+        for step, level in ((0, 0), (99, learner.model.level)):
+            learner.iteration = step
             finish = learner.model_loss.begin(learner.model, level, learner.schedule, learner.position)
             _, _, loss = learner.picture_loss(0, level)
             loss.backward()  # type: ignore[no-untyped-call]

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+import time
+from collections import Counter
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from typing import Any
 
 import torch
@@ -37,7 +40,8 @@ from pd4dgs_codec.train.state import TrainState
 class Learner(TrainState):
     """A model in training, with its steps.
 
-    before_step: the phases that act before a step, in order; `grow` acts after the update.
+    before_step: the phases that act before a step, in order; `grow` acts after the update. spent: seconds of each, with
+    its trials, by the name of its module, since this process began.
     before_practice: called before each trial step with the trial steps done and their total; an exception ends the
     trial.
     """
@@ -59,7 +63,7 @@ class Learner(TrainState):
         self.unit = float(deformation_unit(self.model.info.box))  #: of lengths in the loss, scene units
         self.model_loss = ModelLoss(config, self.generator)
         self.levels, self.prefixes, self.grow = SelectLevels(self.practise), Prefixes(), Grow()
-        self.match = Match()
+        self.match, self.spent = Match(), Counter[str]()
         self.before_practice: Callable[[int, int], None] = lambda done, steps: None
         pruning = (Prune(turn) for turn in range(PRUNING_ROUNDS))
         self.before_step: list[Phase] = [
@@ -102,10 +106,10 @@ class Learner(TrainState):
     def _apply(self, phases: Sequence[Phase], record: dict[str, Any]) -> None:
         for phase in phases:
             if phase.due(self):
-                try:
+                begun = time.monotonic()
+                with suppress(NotFinite):  # skipped like a step that diverged
                     phase.apply(self, record)
-                except NotFinite:  # skipped like a step that diverged
-                    pass
+                self.spent[type(phase).__module__.rpartition(".")[2]] += time.monotonic() - begun
 
     # -- loss and update -------------------------------------------------------------------------------------------
 

@@ -26,17 +26,15 @@ from pd4dgs_codec.train import workers
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.doubts import doubts
 from pd4dgs_codec.train.learner import Learner
-from pd4dgs_codec.train.schedule import COARSE_SHARE, Schedule
+from pd4dgs_codec.train.schedule import Schedule
 
-#: A timed run estimates the N of its schedule after TIMED_STEPS steps. A slow run does so once it has spent the coarse
-#: phase's share of the limit, but not before FEWEST_TIMED_STEPS of this process, whose first steps compile kernels.
-TIMED_STEPS = 50
-FEWEST_TIMED_STEPS = 5
+#: A timed run estimates the N of its schedule after so many steps of this process, of which the first compile kernels.
+TIMED_STEPS = 10
 #: Mean cost of a step over a run, relative to its first steps, which train level 0 only.
 LATER_COST = 1.5
 #: Held-out evaluations over a run, for the curve of quality against wall time, and views in each.
-CURVE_POINTS = 12
-CURVE_VIEWS = 6
+CURVE_POINTS = 6
+CURVE_VIEWS = 4
 #: Training cameras and times in a checkpoint, from which packing measures the model.
 VIEWPOINTS = 32
 
@@ -164,6 +162,7 @@ class Trainer:
                 now, begun = time.monotonic(), now
                 (self._evaluation,) = workers.largest(now - begun)
                 self.seconds += self._evaluation
+                self.learner.spent["curve"] += self._evaluation
             logged = records.write(record | {"seconds": round(self.seconds, 3)})
             if progress:
                 progress.update(self, record)
@@ -182,8 +181,7 @@ class Trainer:
             return limit is not None and self.seconds >= limit
         if self.total is None:
             self._costs.append(seconds)
-            slow = len(self._costs) >= FEWEST_TIMED_STEPS and self.seconds >= COARSE_SHARE * limit
-            if len(self._costs) >= TIMED_STEPS or slow:
+            if len(self._costs) >= TIMED_STEPS:
                 self.learner.schedule = Schedule(max(1, round(limit / (LATER_COST * median(self._costs)))))
             return self.seconds >= limit
         share, left = self.learner.share or 0.0, limit - self._evaluation - usual - begun

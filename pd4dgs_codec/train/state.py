@@ -19,7 +19,7 @@ from pd4dgs_codec.model.networks import EXACT, Noise, Rounding
 from pd4dgs_codec.quality.measure import level_psnr
 from pd4dgs_codec.scene import MASK_THRESHOLD, instant
 from pd4dgs_codec.train.config import MOST_STEPS, TrainConfig
-from pd4dgs_codec.train.initialise import check_visible, fresh_model
+from pd4dgs_codec.train.initialise import check_visible, fresh_model, start_points
 from pd4dgs_codec.train.optimiser import PER_ANCHOR, Optimiser
 from pd4dgs_codec.train.schedule import Schedule
 from pd4dgs_codec.train.ssim import Part, pixel_weights, within_reach
@@ -152,6 +152,7 @@ class TrainState:
     iteration: steps done, skipped ones included. skipped: steps whose loss or gradient was not finite.
     share: in a timed run the share of the schedule that is done, 0..1, set by Trainer; None otherwise.
     statistics: [N] or [N, slots] per anchor, on which growing depends, see `fresh_statistics`.
+    starts: [n, 3] points of what moves, world; None once `phases.follow` has used them, or if `start` was given.
     order: training views drawn and not yet used, the next one last.
     rho: moving average of how much the masks of levels 0 and 2 differ.
     practising: a trial is running; all views and pixels train level 0, see `phases.levels`.
@@ -173,14 +174,18 @@ class TrainState:
         self.size = size or PRESETS[config.preset]
         steps = config.model_steps(self.size.steps)
         key = config.key_instant if config.rollout == "key" else None
-        model = start or fresh_model(self.size, dataset, config.widths, steps, config.seed, config.max_layer, key)
-        check_visible(model, dataset)
-        self.model = model.to(device)
-        self.views = TrainingViews(dataset.train, model.info.background, device)
+        self.starts: Tensor | None = None
+        if start is None:
+            placed, self.starts = start_points(dataset, key, config.max_layer > 0)
+            shape = config.widths, steps, config.seed, config.max_layer
+            start = fresh_model(self.size, placed, *shape, key, self.starts)
+        check_visible(start, dataset)
+        self.model = start.to(device)
+        self.views = TrainingViews(dataset.train, start.info.background, device)
         self.optimiser = Optimiser(self.model, config.rates, config.cooldown, self.views.exposures.values())
         self.generator = torch.Generator().manual_seed(config.seed)
         self.noise = Noise(config.seed + 1, device)
-        self.statistics = fresh_statistics(len(model.anchor_q), config.slots)
+        self.statistics = fresh_statistics(len(start.anchor_q), config.slots)
         self.iteration = self.skipped = 0
         self.share: float | None = None
         self.rho, self.practising, self.opened, self.guided = 0.0, False, False, False
@@ -291,6 +296,7 @@ class TrainState:
             "share": self.share or 0.0,
             "passed": self._before,
             "rho": self.rho,
+            "starts": self.starts,
             "opened": self.opened,
             "guided": self.guided,
             "skipped": self.skipped,
@@ -337,7 +343,7 @@ class TrainState:
         if self.share is not None:
             self.share, self._before = float(state["share"]), int(state["passed"])
         self.rho, self.opened, self.guided = float(state["rho"]), bool(state["opened"]), bool(state["guided"])
-        self.order = [int(index) for index in state["order"]]
+        self.order, self.starts = [int(index) for index in state["order"]], state["starts"]
 
 
 def fresh_statistics(anchors: int, slots: int) -> dict[str, Tensor]:

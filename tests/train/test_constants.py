@@ -11,7 +11,7 @@ PACKAGE = ROOT / "pd4dgs_codec"
 SMALL = {-1, 0, 0.5, 1, 2, 3, 4}
 BOUNDS = ("least", "most", "above", "count")  #: of an option: what a user may ask for
 #: How many numbers may decide behaviour: lower it when one goes.
-MOST = 115
+MOST = 106
 KINDS = {"behaviour", "size", "safety", "cost", "unit"}
 REASONS = {"measured", "published", "unit", "not measured"}
 

@@ -15,6 +15,7 @@ from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.quality.image import moving_regions, mpsnr
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.loop import Trainer
+from pd4dgs_codec.train.movers import ALIKE
 from pd4dgs_codec.train.phases import matching, opening
 from pd4dgs_codec.train.phases.matching import Points, attraction, moving_points
 from pd4dgs_codec.train.schedule import OPENING_SHARE
@@ -29,7 +30,7 @@ def short_runs_match(monkeypatch, short_runs_have_phases):
     monkeypatch.setattr(matching, "AMBIGUOUS", 1.0)
     monkeypatch.setattr(matching, "LEAST_FOUND", 0.0)
     monkeypatch.setattr(matching, "ELSEWHERE", 0.0)
-    monkeypatch.setattr(matching, "CONSISTENT", 1.0)
+    monkeypatch.setattr(matching, "_contrast", lambda places, *_: torch.zeros(places.shape[:2]))
 
 
 def points(position: list[list[float]], colour: list[list[float]], time: float = 0.25) -> Points:
@@ -107,7 +108,7 @@ def test_points_of_other_colours_do_not_attract(dataset):
     learner = trainer_of(dataset).learner
     unit = learner.model.deformations[1].unit
     here, colour = points([[0.0, 0.0, 0.0]], [[0.5, 0.5, 0.5]]), [[0.5, 0.5, 0.5]]
-    other = points([[0.3 * unit, 0.0, 0.0]], [[0.5 + 3.1 * matching.SAME_COLOUR, 0.5, 0.5]])
+    other = points([[0.3 * unit, 0.0, 0.0]], [[0.5 + 3.1 * ALIKE, 0.5, 0.5]])
     assert float(attraction(learner, 1, here, other).detach()) == 0
     same = points([[3.0 * unit, 0.0, 0.0]], colour)
     assert float(attraction(learner, 1, here, same).detach()) == pytest.approx(3.0, abs=1e-5)

@@ -8,7 +8,6 @@ import torch
 
 from pd4dgs_codec.data import dataset
 from pd4dgs_codec.data.view import shrunk_view
-from pd4dgs_codec.scene import Steps, Widths
 from pd4dgs_codec.train import initialise
 from pd4dgs_codec.train.stereo import PIXELS, with_points
 
@@ -83,9 +82,7 @@ def test_views_without_texture_or_neighbours_keep_the_dataset(room):
 def test_only_captures_without_points_and_plain_background_are_searched(source, searched, monkeypatch):
     calls = []
     monkeypatch.setattr(initialise, "with_points", lambda data, key: calls.append(key) or data)
-    size = initialise.ModelConfig(None, None, initial_anchors=50)
     given = dataset.load(source)
     for points in (given.points, None):
-        data = dataclasses.replace(given, points=points)
-        initialise.fresh_model(size, data, Widths(4, 2), Steps(), seed=0, key=0.25)
+        initialise.start_points(dataclasses.replace(given, points=points), 0.25, moves=False)
     assert calls == [0.25] * searched

@@ -34,7 +34,11 @@ class Follow(phases.Phase):
         """Teaches the tracks; sets `TrainState.opened` if there are any."""
         info, key = state.model.info, state.key or 0.0
         dataset = replace(state.dataset, box=info.box, near=info.near)
-        tracks = workers.alike(lambda: followed(dataset, moving_starts(dataset, key), key))
+        starts = state.starts
+        tracks = workers.alike(
+            lambda: followed(dataset, moving_starts(dataset, key) if starts is None else starts, key)
+        )
+        state.starts = None
         record["bodies"] = len(tracks)
         if tracks:
             teach(state, tracks)

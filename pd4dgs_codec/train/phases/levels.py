@@ -73,18 +73,23 @@ class SelectLevels(phases.Phase):
     def _try(self, state: TrainState, below: int, views: Sequence[TrainingView]) -> None:
         """Trains the level `below` with all anchors. Makes it the highest level if the levels above do not lower the
         squared error by more than its noise and their bits, which training weighs against an absolute error. Otherwise
-        restores the state."""
+        restores the state, after half of the steps if as many with as much gain would not suffice: gains diminish."""
         top, before = state.model.level, state.snapshot()
         errors = workers.alike(lambda: [error(state, view, top) for view in views])
         rate = 2 * math.sqrt(fmean(errors)) * state.config.plane_rate * sum(state.plane_bits()[below:])
         with torch.no_grad():
             for above in range(below + 1, 3):  # the anchors of these levels, without their motion
                 state.model.mask_logits[:, below] += softplus(state.model.mask_logits[:, above])
-        suffices = False
+        suffices, lacks = False, list[float]()
         try:
-            self._practise(below, state.steps_in(COARSE_SHARE))
-            instead = workers.alike(lambda: [error(state, view, below) for view in views])
-            suffices = not larger(instead, errors, rate)
+            for half in range(3):
+                if half:
+                    self._practise(below, round(state.steps_in(COARSE_SHARE) / 2))
+                instead = workers.alike(lambda: [error(state, view, below) for view in views])
+                lacks.append(excess(instead, errors) - rate)
+                if half == 1 and lacks[1] > lacks[0] - lacks[1]:
+                    break
+            suffices = lacks[-1] <= 0
         finally:  # a picture that is not finite ends the phase, and the level stays
             if not suffices:
                 state.return_to(before)
@@ -131,11 +136,11 @@ def worst_block(view: TrainingView, own: Tensor, other: Tensor) -> Lack | None:
     return Lack((x, y), float(own[row, column]), float(other[row, column]))
 
 
-def larger(errors: Sequence[float], others: Sequence[float], by: float = 0.0) -> bool:
-    """Whether the errors of some views are larger than other errors of these views, by more than `by` and the noise."""
+def excess(errors: Sequence[float], others: Sequence[float]) -> float:
+    """By how much the mean error of some views exceeds that of others of these views and the noise; 0 without views."""
     worse = [own - other for own, other in zip(errors, others, strict=True)]
     noise = stdev(worse) / math.sqrt(len(worse)) if len(worse) > 1 else 0.0
-    return bool(worse) and fmean(worse) > NEEDED * noise + by
+    return fmean(worse) - NEEDED * noise if worse else 0.0
 
 
 def error(state: TrainState, view: TrainingView, level: int) -> float:

@@ -39,16 +39,12 @@ INSTANTS, SAMPLE = 4, 150
 MOST_VIEWS = 240
 #: Pixels of a view that are searched, at random.
 PIXELS = 400
-#: A pixel shows something that moves if its mean difference from level 0 is over ALIKE. Its point is at the depth at
-#: which the colours of three views differ least, if by at most CONSISTENT, and if a share of at most AMBIGUOUS of them
-#: does.
-CONSISTENT = 0.16
 #: Most of what the views show is elsewhere in level 0 if such pixels are at least this share of those that differ from
 #: the background: a body that has moved away changes the pixels that it had and those that it has.
 ELSEWHERE = 1.0
 #: A match has the least distance, to which a difference in colour adds COLOUR_WEIGHT times. It attracts if the colours
-#: differ by at most SAME_COLOUR. Distances are in units of the deformation, colour differences are means over RGB.
-COLOUR_WEIGHT, SAME_COLOUR = 4.0, 0.1
+#: are ALIKE. Distances are in units of the deformation, colour differences are means over RGB.
+COLOUR_WEIGHT = 4.0
 
 
 class Points(NamedTuple):
@@ -135,7 +131,7 @@ def attraction(state: TrainState, level: int, here: Points, there: Points) -> Te
     with torch.no_grad():
         contrast = torch.cdist(here.colour, there.colour, p=1) / 3
         match = (torch.cdist(moved, place) + COLOUR_WEIGHT * contrast).argmin(1)
-        alike = contrast.gather(1, match[:, None])[:, 0] <= SAME_COLOUR
+        alike = contrast.gather(1, match[:, None])[:, 0] <= ALIKE
     distance = (moved - place[match]).norm(dim=1)
     found: Tensor = (distance * alike).mean()
     return found
@@ -188,10 +184,11 @@ def _points(
     own: Evidence, pixels: Tensor, others: Sequence[Evidence], low: Tensor, high: Tensor, near: float
 ) -> Points:
     """The points of `pixels` (int64 [n, 2], row and column) of view `own`, in the box from `low` to `high` and beyond
-    `near`."""
+    `near`: at the depth at which the colours of three views differ least, if they are ALIKE there, and at a share of at
+    most AMBIGUOUS of all depths."""
     rays, colour = rays_of(own.view, pixels, low, high, near), own.colour[pixels[:, 0], pixels[:, 1]]
     contrast = torch.stack([_contrast(rays.places, colour, other) for other in others]).amax(0)
-    consistent = contrast <= CONSISTENT
+    consistent = contrast <= ALIKE
     best = contrast.argmin(1, keepdim=True)
     clear = rays.inside & consistent.gather(1, best)[:, 0] & (consistent.float().mean(1) <= AMBIGUOUS)
     beside = consistent & ((torch.arange(DEPTH_STEPS) - best).abs() <= 3)  # colours hardly tell neighbours apart

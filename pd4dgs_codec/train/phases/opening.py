@@ -16,14 +16,12 @@ import torch
 
 from pd4dgs_codec.data.view import thinned
 from pd4dgs_codec.train import phases, workers
-from pd4dgs_codec.train.phases.levels import error, larger
-from pd4dgs_codec.train.schedule import NEAR_SHARE
+from pd4dgs_codec.train.phases.levels import error, excess
+from pd4dgs_codec.train.schedule import COARSE_SHARE, NEAR_SHARE
 from pd4dgs_codec.train.state import TrainState
 
 #: The planes' instants double from 3 to 17 while the window grows, at each of so many parts of it.
 DOUBLINGS = 5
-#: Share of the run for which each branch trains.
-TRIAL_SHARE = 1 / 15
 #: Most views in which they are compared, once to twice as far from the key instant as the window.
 VIEWS = 24
 
@@ -44,7 +42,7 @@ class OpenTime(phases.Phase):
         before, ends, errors = state.snapshot(), [], []
         try:
             for state.opened in (False, True):
-                self._practise(state.model.level, state.steps_in(TRIAL_SHARE))
+                self._practise(state.model.level, state.steps_in(COARSE_SHARE / 2))
                 errors.append(workers.alike(lambda: _errors_beyond(state)))
                 ends.append(state.snapshot())
                 state.return_to(before)
@@ -53,7 +51,7 @@ class OpenTime(phases.Phase):
             state.return_to(before)
             raise
         record["opening_errors"] = [sum(own) / max(len(own), 1) for own in errors]
-        state.opened = not larger(errors[True], errors[False])
+        state.opened = excess(errors[True], errors[False]) <= 0
         state.return_to(ends[state.opened])
 
 

@@ -21,14 +21,15 @@ from pd4dgs_codec.model.sensitivity import utility, without
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train import workers
 from pd4dgs_codec.train.phases import Phase, long_enough
+from pd4dgs_codec.train.rollout import STILL_ODDS
 from pd4dgs_codec.train.state import TrainState
 
 #: Training views whose pictures order the anchors.
 VIEWS = 8
 #: The fewest anchors of a prefix, about those of a first slice of 50 kB.
 FEWEST = 1500
-#: Share of the steps of level 0 that render a prefix, and the share if level 0 is the only level.
-SHARE, STILL_SHARE = 0.5, 0.15
+#: Share of the steps of level 0 that render a prefix; if it is the only level, STILL_ODDS.
+SHARE = 0.5
 
 
 class Prefixes(Phase):
@@ -51,7 +52,7 @@ class Prefixes(Phase):
 
     def draw(self, state: TrainState, level: int) -> Tensor | None:
         """bool [N]: the anchors that the next step, of `level`, renders; None for all of them."""
-        share = SHARE if state.model.level else STILL_SHARE
+        share = SHARE if state.model.level else STILL_ODDS
         if self.rank is None or level or float(torch.rand((), generator=state.generator)) >= share:
             return None
         return draw_prefix(self.rank, state.generator).to(state.device)

@@ -8,7 +8,7 @@ anchors, scattered over the scene, and the rest is measured again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -25,16 +25,13 @@ from pd4dgs_codec.train.schedule import PRUNING_ROUNDS
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
 #: Training views in which an anchor is measured; each round uses others.
-VIEWS = 12
+VIEWS = 6
 #: Mask of an anchor at a level that it has left: below the threshold, so that it is neither drawn there nor coded.
 ABSENT = 1e-3
 
 #: The mean squared error (30 dB) up to which a view's error counts towards the budget: otherwise views that are not
 #: learnt yet would allow pruning the content that few views show.
 LEARNT = 1e-3
-
-#: `omission_error` or a similar function, which returns (errors, bool [N] whether an anchor may reach it, picture).
-ErrorOf = Callable[..., tuple[Tensor, Tensor, Tensor]]
 
 
 class Prune(Phase):
@@ -58,7 +55,7 @@ class Prune(Phase):
         model, levels = state.model, state.measured_levels()
         share, before, order = state.config.prune / PRUNING_ROUNDS, len(model.anchor_q), other_views(state)
         views = state.views.spread(VIEWS, order, self.turn)
-        errors = added_error(model, levels, views, state.rounding(noisy=False), omission_error).to(state.device)
+        errors = added_error(model, levels, views, state.rounding(noisy=False)).to(state.device)
         errors[:, round_of(model.anchor_q) != self.turn] = torch.inf
         errors[:, : model.frozen] = torch.inf
         redundant = least(errors.amax(0), share)
@@ -74,32 +71,22 @@ class Prune(Phase):
         record["left_level_0"] = record.get("left_level_0", 0) + int(later.sum())
 
 
-def added_error(
-    model: Model, levels: Sequence[int], views: Sequence[TrainingView], rounding: Rounding, error_of: ErrorOf
-) -> Tensor:
-    """float64 [levels, N], on the CPU and equal in all workers: the error of each anchor by `error_of` at these levels,
-    summed over the views and relative to their present squared error. Infinite where no view shows the anchor."""
+def added_error(model: Model, levels: Sequence[int], views: Sequence[TrainingView], rounding: Rounding) -> Tensor:
+    """float64 [levels, N], on the CPU and equal in all workers: the squared error of omitting each anchor at these
+    levels, summed over the views and relative to their present one, of which a view counts at most LEARNT. Infinite
+    where no view shows the anchor."""
 
-    def measure() -> Tensor:
-        found = [relative_error(model, level, views, rounding, error_of) for level in levels]
-        return torch.stack([torch.where(met, error, torch.inf).cpu() for error, met in found])
+    def at(level: int) -> Tensor:
+        generator = torch.Generator().manual_seed(0)
+        total, met, error = torch.zeros((), dtype=torch.float64), torch.zeros((), dtype=torch.bool), 0.0
+        for view in views:
+            viewpoint = (level, view.view.time, view.view.camera)
+            added, near, image = omission_error(model, *viewpoint, generator, weights=view.weights, rounding=rounding)
+            total, met = total + added, met | near
+            error += min(view.squared_error(image), LEARNT)
+        return torch.where(met, total / max(error, 1e-12), torch.inf).cpu()
 
-    return workers.alike(measure)
-
-
-def relative_error(
-    model: Model, level: int, views: Sequence[TrainingView], rounding: Rounding, error_of: ErrorOf
-) -> tuple[Tensor, Tensor]:
-    """(float64 errors by `error_of` at `level`, summed over `views` and relative to their present squared error, of
-    which a view counts at most LEARNT; bool [N]: whether a view shows the anchor)."""
-    generator = torch.Generator().manual_seed(0)
-    total, met, error = torch.zeros((), dtype=torch.float64), torch.zeros((), dtype=torch.bool), 0.0
-    for view in views:
-        viewpoint = (level, view.view.time, view.view.camera)
-        added, near, image = error_of(model, *viewpoint, generator, weights=view.weights, rounding=rounding)
-        total, met = total + added, met | near
-        error += min(view.squared_error(image), LEARNT)
-    return total / max(error, 1e-12), met
+    return workers.alike(lambda: torch.stack([at(level) for level in levels]))
 
 
 def round_of(anchor_q: Tensor) -> Tensor:

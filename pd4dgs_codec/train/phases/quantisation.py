@@ -6,24 +6,25 @@ Whitening transforms the features so that a quantisation step costs the same in 
 Step classes give coarser steps to anchors that pictures depend on little. The error of a step differs a thousandfold
 between anchors, and neither position nor size predicts it, so it is measured. Each next class doubles the steps, which
 quadruples an anchor's squared error and saves the same bits for all anchors, from which the best classes follow.
+
+Both need the derivatives of the same pictures, which are found once: whitening changes those by features linearly.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.networks import Rounding
-from pd4dgs_codec.model.sensitivity import attribute_slopes, rounding_error, whitening_transform
+from pd4dgs_codec.model.sensitivity import attribute_slopes, whitening_transform
 from pd4dgs_codec.scene import MASK_THRESHOLD, MAX_CLASS, SCAFFOLD_NETWORKS
 from pd4dgs_codec.train import phases, workers
 from pd4dgs_codec.train.optimiser import Optimiser
-from pd4dgs_codec.train.phases.prune import added_error, relative_error
+from pd4dgs_codec.train.phases.prune import LEARNT
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
 #: Training views in which the error of a step is measured.
@@ -40,39 +41,94 @@ class FitQuantisation(phases.Phase):
         return state.config.noise and phases.long_enough(state) and state.reached(state.schedule.rounding)
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
-        """Grades and whitens, and logs how many anchors each step class has."""
-        model, config, rounding = state.model, state.config, state.rounding(noisy=False)
-        levels, views = state.measured_levels(), state.views.spread(VIEWS)
-        found: list[int] = []
-        if model.frozen:  # the features are those of the base, and steps are graded if its are
-            config = replace(config, whitening=False, grading=config.grading * bool(model.step_class.any()))
-        if config.grading:
-            found = grade(model, levels, views, config.grading, rounding)
-        if config.whitening:
-            whiten(model, state.optimiser, levels, views, rounding)
-            if config.grading:  # the features' steps have changed
-                found = grade(model, levels, views, config.grading, rounding)
-        if found:
-            record["step_classes"] = found
+        """Whitens and grades, and logs how many anchors each step class has."""
+        model, config = state.model, state.config
+        # a base has whitened its features, and steps are graded if its are
+        whitens, grades = config.whitening and not model.frozen, not model.frozen or bool(model.step_class.any())
+        share = config.grading if grades else 0.0
+        if not (share or whitens):
+            return
+
+        def fit() -> tuple[Tensor | None, Tensor | None]:
+            views, rounding = state.views.spread(VIEWS), state.rounding(noisy=False)
+            found = [measured(model, level, views, rounding) for level in state.measured_levels()]
+            return fitted(model, found, share, whitens)
+
+        classes, transform = workers.alike(fit)
+        if transform is not None:
+            whiten(model, state.optimiser, transform.to(model.feature.device))
+        if classes is not None:
+            record["step_classes"] = grade(model, classes)
+
+
+class Measured(NamedTuple):
+    """How the pictures of a level depend on the anchors. feature: float32 [views, N, D], derivatives by features.
+    others: float64 [N], the squared error of rounding the other attributes to steps of class 0. met: bool [N], whether
+    a view shows the anchor. error: the views' present squared error, of which a view counts at most LEARNT."""
+
+    feature: Tensor
+    others: Tensor
+    met: Tensor
+    error: float
+
+
+def measured(model: Model, level: int, views: Sequence[TrainingView], rounding: Rounding) -> Measured:
+    """Finds the derivatives of a level in some views. The squared error of a step Q is Q^2 / 12 on average."""
+    generator, feature, total = torch.Generator().manual_seed(0), [], 0.0
+    met, others = torch.zeros_like(model.step_class, dtype=torch.bool), torch.zeros_like(model.step_class).double()
+    for view in views:
+        viewpoint = (level, view.view.time, view.view.camera)
+        slopes, near, image = attribute_slopes(model, *viewpoint, generator, weights=view.weights, rounding=rounding)
+        feature.append(slopes.pop("feature"))
+        for name, slope in slopes.items():
+            others += slope.double().square().flatten(1).sum(1) * (getattr(model.steps, name) ** 2 / 12)
+        met |= near
+        total += min(view.squared_error(image), LEARNT)
+    return Measured(torch.stack(feature), others, met, max(total, 1e-12))
+
+
+def fitted(model: Model, found: Sequence[Measured], share: float, whitens: bool) -> tuple[Tensor | None, Tensor | None]:
+    """(uint8 [N], step classes whose quantisation adds at most `share` to the squared error of the views at any of the
+    levels in `found`, beyond that of class 0, if `share` is not 0; float64 [D, D], the features' transform, if it
+    `whitens`). Both on the CPU."""
+    classes, transform, spacing = None, None, model.spacing
+    if share:
+        classes = _classes(model, found, share, None)
+        spacing = torch.exp2(classes.float()).to(spacing)
+    if whitens:
+        transform = _transform(model, found, spacing)
+        if share and transform is not None:  # the features' steps change
+            classes = _classes(model, found, share, torch.linalg.inv(transform))
+    return (None if part is None else part.cpu() for part in (classes, transform))  # type: ignore[return-value]
 
 
 # -- step classes ------------------------------------------------------------------------------------------------------
 
 
-def grade(
-    model: Model, levels: Sequence[int], views: Sequence[TrainingView], share: float, rounding: Rounding
-) -> list[int]:
-    """Sets the attributes' centres, and step classes whose quantisation adds at most `share` to the squared error of
-    the views at any of the levels, beyond that of class 0. Returns how many anchors each class has. Centres and classes
-    of frozen anchors stay."""
-    errors = added_error(model, levels, views, rounding, rounding_error)[:, model.frozen :]
-    met = errors.isfinite()
-    worst = torch.where(met, errors, 0.0).amax(0)  # a level of large error must not set the budget of the others
-    classes = classes_within(torch.where(met.any(0), worst, torch.inf), share)
-    model.step_class[model.frozen :] = classes
+def rounding_errors(model: Model, level: Measured, back: Tensor | None = None) -> Tensor:
+    """float64 [N]: the squared error of rounding each anchor to steps of class 0. back: [D, D], the inverse of a
+    transform of the features."""
+    feature = level.feature if back is None else level.feature @ back.to(level.feature)
+    return level.others + feature.double().square().sum((0, 2)) * (model.steps.feature**2 / 12)
+
+
+def _classes(model: Model, found: Sequence[Measured], share: float, back: Tensor | None) -> Tensor:
+    """uint8 [N]; frozen anchors keep theirs. A level of large error must not set the budget of the others."""
+    met = torch.stack([level.met for level in found]).any(0)
+    worst = torch.stack([rounding_errors(model, level, back) / level.error for level in found]).amax(0)
+    classes = model.step_class.clone()
+    own = slice(model.frozen, None)
+    classes[own] = classes_within(torch.where(met, worst, torch.inf)[own].cpu(), share).to(classes.device)
+    return classes
+
+
+def grade(model: Model, classes: Tensor) -> list[int]:
+    """Sets the step classes and the attributes' centres. Returns how many of the anchors each class has. The centres of
+    frozen anchors stay."""
+    model.step_class.copy_(classes)
     if not model.frozen:
         model.centre.copy_(centre(model))
-    return torch.bincount(classes.long(), minlength=MAX_CLASS + 1).tolist()
+    return torch.bincount(classes[model.frozen :].long(), minlength=MAX_CLASS + 1).tolist()
 
 
 def classes_within(errors: Tensor, budget: float) -> Tensor:
@@ -110,37 +166,22 @@ def centre(model: Model) -> Tensor:
 # -- whitening ---------------------------------------------------------------------------------------------------------
 
 
-def whiten(
-    model: Model, optimiser: Optimiser, levels: Sequence[int], views: Sequence[TrainingView], rounding: Rounding
-) -> None:
-    """Transforms the features' channels in the anchors and in all layers that read or change them. Pictures stay the
-    same up to rounding, and so does the error of a step, summed over the channels."""
-    transform = workers.alike(lambda: _measured(model, levels, views, rounding))
-    if transform is not None:
-        _apply(model, optimiser, transform.to(model.feature.device))
-
-
-def _measured(model: Model, levels: Sequence[int], views: Sequence[TrainingView], rounding: Rounding) -> Tensor | None:
-    """float64 [D, D]: the transform for the model; None if no picture depends on a feature."""
-    errors = torch.stack([relative_error(model, level, views, rounding, _feature_error)[0] for level in levels]).sum(0)
+def _transform(model: Model, found: Sequence[Measured], spacing: Tensor) -> Tensor | None:
+    """float64 [D, D]: the transform for the model, with anchors whose steps are `spacing` [N] times those of class 0;
+    None if no picture depends on a feature."""
+    slopes = [(level.feature * spacing[:, None]).double().flatten(0, 1) / level.error**0.5 for level in found]
+    errors = torch.stack([slope.T @ slope for slope in slopes]).sum(0)
     active = model.masks(2).detach() > MASK_THRESHOLD
     if not errors.trace() > 0 or int(active.sum()) < 2:
         return None
-    scaled = model.feature.detach()[active].double() / model.spacing[active, None]
-    return whitening_transform(errors, torch.cov(scaled.T)).cpu()
-
-
-def _feature_error(model: Model, *viewpoint: Any, **options: Any) -> tuple[Tensor, Tensor, Tensor]:
-    """As `rounding_error`, but float64 [D, D]: the sum of the anchors' Gauss-Newton matrices by the features, in
-    units of their steps."""
-    slopes, met, image = attribute_slopes(model, *viewpoint, **options)
-    slope = (slopes["feature"] * model.spacing[:, None]).double()
-    return slope.T @ slope, met, image
+    scaled = model.feature.detach()[active].double() / spacing[active, None]
+    return whitening_transform(errors, torch.cov(scaled.T))
 
 
 @torch.no_grad()
-def _apply(model: Model, optimiser: Optimiser, transform: Tensor) -> None:
-    """Replaces features f by A f, A = `transform` [D, D], and adapts the layers that read or change them."""
+def whiten(model: Model, optimiser: Optimiser, transform: Tensor) -> None:
+    """Replaces features f by A f, A = `transform` float64 [D, D], and adapts the layers that read or change them, so
+    that pictures stay the same up to rounding."""
     back, width = torch.linalg.inv(transform), model.widths.feature
     optimiser.transform(model.feature, slice(None), transform.T)
     for name in SCAFFOLD_NETWORKS:
