@@ -28,7 +28,7 @@ const FIRST_KEYS = [4, 5, 6, 7];
  * @typedef {object} Parameters
  * @property {number} rows
  * @property {number} rises one for each row of the layers before, in a later slice none
- * @property {number[] | null} fill the colour behind a prefix that ends here, 0..255
+ * @property {number[] | null} fill the colour behind a prefix that ends here, 0..255, and its spread in units of 1/64
  * @property {Stepped<GridShape>} grids
  * @property {Stepped<ChainShape>} chains
  * @property {number[] | null} kind of the deformation: its number, then its parameters
@@ -81,7 +81,7 @@ export function readParameters(payload, { width, centres, base }, before, known,
   return {
     rows,
     rises,
-    fill: fields.has(3) ? asIntegers(asList(fields.get(3), fill, 3), 0, 255, fill) : null,
+    fill: fields.has(3) ? asIntegers(asItems(fields.get(3), 3, 4, fill), 0, 255, fill) : null,
     grids,
     chains,
     kind: fields.has(6) ? readKind(fields.get(6), `${where}: kind of the deformation`) : null,

@@ -24,7 +24,7 @@ import { VoxelTable, mortonOrder } from "./voxels.js";
  * @property {(header: Header, layers: LayerTables[]) => void} checkLayer
  */
 
-/** @typedef {Omit<LayerTensors, "codes" | "fill" | "rows">} LayerTables */
+/** @typedef {Omit<LayerTensors, "codes" | "fill" | "spread" | "rows">} LayerTables */
 
 /**
  * A layer as far as it has been read: `first` row of its own; codes of the mask, of all rows up to its own, and its own
@@ -317,7 +317,9 @@ export class TensorReader {
     layer.codes.append(slice.codes);
     layer.slices++;
     layer.sorted = !had || (layer.sorted && !voxels.length);
-    layer.fill = parameters.fill?.map((c) => c / 255) ?? header.info.background;
+    const [spread = 0] = parameters.fill?.slice(3) ?? [];
+    layer.fill = parameters.fill?.slice(0, 3).map((c) => c / 255) ?? header.info.background;
+    layer.spread = 1 + spread / 64;
     this._loose.push(voxels);
     this._declared = parameters.declared;
     this.count++;
@@ -330,7 +332,7 @@ export class TensorReader {
     const rows = rowTensors.map(({ channels }) => new Column(Float32Array, channels));
     const { grids, chains } = (!layer && this._layers[0]) || { grids: gridsOf(slice), chains: chainsOf(slice) };
     const made = { grids, chains, codes: new Column(Uint8Array, 1), rowTensors, rows };
-    return { layer, kind, ...made, fill: [], slices: 0, first: this._voxels.rows, sorted: true, priors };
+    return { layer, kind, ...made, fill: [], spread: 1, slices: 0, first: this._voxels.rows, sorted: true, priors };
   }
 
   /** Puts the rows of the latest layer in the order of 12.2. @param {number} [growth] as in Column */
@@ -365,9 +367,9 @@ export class TensorReader {
     if (!this.header || !this._layers.length) throw new TypeError("no layer has been read");
     return {
       header: this.header,
-      layers: this._layers.map(({ layer, codes, fill, grids, chains, kind, rowTensors, rows }) => {
+      layers: this._layers.map(({ layer, codes, fill, spread, grids, chains, kind, rowTensors, rows }) => {
         const arrays = { codes: codes.values, rows: rows.map(({ values }) => values) };
-        return { layer, ...arrays, fill, grids, chains, kind, rowTensors };
+        return { layer, ...arrays, fill, spread, grids, chains, kind, rowTensors };
       }),
       voxels: this._voxels.values,
       positions: this._positions.values,
