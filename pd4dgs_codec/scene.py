@@ -42,6 +42,8 @@ PLANES: tuple[tuple[str, int, int], ...] = (
 MASK_STEP = np.float32(1.0 / 255.0)
 MASK_THRESHOLD = 0.01
 MASK_MIN_CODE = 3
+#: A spread of code k, 0..255, is 1 + k / SPREAD_UNITS.
+SPREAD_UNITS = 64
 #: A Gaussian of less opacity is invisible and skipped.
 MIN_OPACITY = 1.0 / 255.0
 
@@ -354,7 +356,7 @@ class LayeredScene:
     anchor_q: int32 [N, 3] voxel indices.
     mask: per present layer i, uint8 [rows[i]] codes (see MASK_STEP), non-decreasing from layer to layer.
     grading: None if all anchors have the same steps. fills: per present layer, the background while this layer is the
-    highest one, RGB 0..255; None for that of `info`. Without entries all are None.
+    highest one, RGB 0..255, and with four integers the `spread`; None for that of `info`. Without entries all are None.
     """
 
     info: SceneInfo
@@ -363,7 +365,7 @@ class LayeredScene:
     anchor_q: np.ndarray
     mask: tuple[np.ndarray, ...]
     grading: Grading | None = None
-    fills: tuple[tuple[int, int, int] | None, ...] = ()
+    fills: tuple[tuple[int, ...] | None, ...] = ()
 
     @property
     def attributes(self) -> dict[str, np.ndarray]:
@@ -404,9 +406,19 @@ class LayeredScene:
     def background(self, level: int = 2) -> tuple[float, float, float]:
         """Returns what is behind every Gaussian at a level, RGB as displayed, 0..1: the fill of an incomplete file, or
         the background of `info`."""
-        fill = [fill for layer, fill in zip(self.layers, self.fills, strict=False) if layer <= level][-1:]
-        red, green, blue = [code / 255 for code in fill[0]] if fill and fill[0] else self.info.background
+        fill = self._fill(level)
+        red, green, blue = [code / 255 for code in fill[:3]] if fill else self.info.background
         return red, green, blue
+
+    def spread(self, level: int = 2) -> float:
+        """Returns the factor on the scales of all Gaussians at a level of an incomplete file, 1 for others: they stand
+        for their absent neighbours (clause 13.6)."""
+        fill = self._fill(level)
+        return 1 + fill[3] / SPREAD_UNITS if len(fill) > 3 else 1.0
+
+    def _fill(self, level: int) -> tuple[int, ...]:
+        found = [fill for layer, fill in zip(self.layers, self.fills, strict=False) if layer <= level][-1:]
+        return (found[0] or ()) if found else ()
 
     @property
     def utility(self) -> np.ndarray:
@@ -550,7 +562,7 @@ class Scene(LayeredScene):
         return Gaussians(
             means=position[owner] + offset * extent[owner, :3],
             quats=_unit(shape[:, 3:]),
-            scales=extent[owner, 3:] / (1 + np.exp(-shape[:, :3])) * mask[owner, None],
+            scales=extent[owner, 3:] / (1 + np.exp(-shape[:, :3])) * mask[owner, None] * np.float32(self.spread()),
             opacities=opacity[seen] * mask[owner],
             colors=1 / (1 + np.exp(-color)),
             slots=rows[owner] * slots + slot,

@@ -359,7 +359,7 @@ class Layer:
         self.rows = limited(parameters[1], (1 << 24) - rows_before, "own rows")
         length = limited(parameters[2], MAX_LENGTH, "the length of the codes")
         if 3 in parameters:
-            integers(a_list(parameters[3], "the fill", 3), 255, "a colour of the fill")
+            integers(a_list(parameters[3], "the fill", 3, 4), 255, "a number of the fill")
         bare = self.later or (self.number == 0 and 15 in self.header)
         need(not (bare and {4, 5, 6, 7} & set(parameters)), "tables or a kind in a later slice, or over a base")
         for key, read in ((4, self.read_grids), (5, self.read_chains), (6, read_kind)):

@@ -26,7 +26,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fuzzing import ROOT
 from fuzzing.check import (
     DECODED,
     Answer,
@@ -40,6 +39,7 @@ from fuzzing.check import (
 )
 from fuzzing.legal import Seed, seeds
 from fuzzing.mutate import make_case
+from vectors import ROOT
 
 #: Those beside the package's. They are made in the process that asks them.
 DECODERS: dict[str, Callable[[], Decoder]] = {"refdec": lambda: reference_decoder, "javascript": JavaScript}
@@ -67,6 +67,10 @@ class Figures:
         for name, value in vars(other).items():
             own = getattr(self, name)
             setattr(self, name, max(own, value) if name == "memory" else own + value)
+
+    def add_finding(self, index: int, kind: str, message: str, recipe: str) -> None:
+        """Count one of input `index`."""
+        self.findings.append({"input": index, "kind": kind, "message": message, "recipe": recipe})
 
     def text(self) -> str:
         """A table."""
@@ -101,12 +105,8 @@ def examine(files: Sequence[Seed], run: int, index: int, decoders: dict[str, Dec
         if index % MEASURED == 0:
             figures.memory = check_memory(case.data, case.base)
     except Finding as finding:
-        figures.findings.append(_row(index, finding.kind, str(finding), case.recipe))
+        figures.add_finding(index, finding.kind, str(finding), case.recipe)
     return figures
-
-
-def _row(index: int, kind: str, message: str, recipe: str) -> dict[str, Any]:
-    return {"input": index, "kind": kind, "message": message, "recipe": recipe}
 
 
 def make_decoders(names: Sequence[str]) -> dict[str, Decoder]:
@@ -136,9 +136,9 @@ def run_safely(files: Sequence[Seed], run: int, inputs: range, names: Sequence[s
                 yield reader.recv()
             except EOFError:
                 child.join()
-                message = f"the process ended with exit code {child.exitcode}"
-                row = _row(index, "crash", message, make_case(files, run, index).recipe)
-                yield Figures(inputs=1, findings=[row])
+                figures, message = Figures(inputs=1), f"the process ended with exit code {child.exitcode}"
+                figures.add_finding(index, "crash", message, make_case(files, run, index).recipe)
+                yield figures
                 break
         child.join()
         inputs = range(index + 1, inputs.stop)
@@ -151,9 +151,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     p.add_argument("files", nargs="*", type=Path, help="more files to mutate, .pd4 or folders of them")
     p.add_argument("--inputs", type=int, default=20_000, help="number of inputs (default: 20000)")
     p.add_argument("--seed", type=int, default=0, help="seed of the run (default: 0)")
-    p.add_argument(
-        "--decoders", default=",".join(NAMES), help="decoders to compare, of python,refdec,javascript (default: all)"
-    )
+    p.add_argument("--decoders", default=",".join(NAMES), help="of python,refdec,javascript (default: all)")
     p.add_argument("--input", type=int, metavar="I", help="examine input I alone, in this process")
     p.add_argument("--out", type=Path, default=ROOT / "out" / "fuzz", help="folder for findings (default: out/fuzz)")
     args = p.parse_args(argv)

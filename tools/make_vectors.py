@@ -16,18 +16,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from vectors import ROOT, refdec
 from vectors.blocks import MAJOR
 from vectors.cases import vectors
 
-ROOT = Path(__file__).resolve().parents[1]
-sys.path.append(str(ROOT / "spec"))  # one file that can be carried alone, in no package
-
-import refdec  # noqa: E402
-
 VECTORS = ROOT / "spec" / "vectors"
-MANIFEST, SUFFIX = "manifest.json", ".pd4"
-
-
 Vectors = list[tuple[dict[str, Any], bytes]]  #: entry in the manifest, bytes
 
 
@@ -35,7 +28,7 @@ def files(found: Vectors) -> dict[str, bytes]:
     """Path below spec/vectors -> content."""
     rows = ",\n".join(json.dumps(row, ensure_ascii=False) for row, _ in found)
     manifest = f'{{"format": "{MAJOR}.0-draft", "vectors": [\n{rows}\n]}}\n'
-    return {MANIFEST: manifest.encode(), **{row["file"]: data for row, data in found}}
+    return {"manifest.json": manifest.encode(), **{row["file"]: data for row, data in found}}
 
 
 def wrong_outcomes(found: Vectors) -> Iterator[str]:
@@ -54,7 +47,7 @@ def wrong_outcomes(found: Vectors) -> Iterator[str]:
 
 def differences(wanted: dict[str, bytes], folder: Path) -> Iterator[str]:
     """One line per file that is missing, different or not a vector."""
-    there = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.suffix in (SUFFIX, ".json")}
+    there = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.suffix in (".pd4", ".json")}
     for name in sorted(there - set(wanted)):
         yield f"{name}: unexpected file"
     for name, content in wanted.items():
@@ -66,7 +59,7 @@ def differences(wanted: dict[str, bytes], folder: Path) -> Iterator[str]:
 
 def write(wanted: dict[str, bytes], folder: Path) -> None:
     """Make `folder` hold these files and no other vectors."""
-    for path in folder.rglob("*" + SUFFIX):
+    for path in folder.rglob("*.pd4"):
         if path.relative_to(folder).as_posix() not in wanted:
             path.unlink()
     for name, content in wanted.items():

@@ -134,8 +134,11 @@ def number(value: float | None, digits: int = 2) -> str:
 
 
 def color(fill: Sequence[int] | None) -> str:
-    """Formats RGB 0..255 as #rrggbb; "-" for None."""
-    return "-" if fill is None else f"#{bytes(fill).hex()}"
+    """Formats a fill as #rrggbb, and behind it the spread if it has one; "-" for None."""
+    from pd4dgs_codec.scene import SPREAD_UNITS
+
+    spread = f" x{1 + fill[3] / SPREAD_UNITS:.3g}" if fill and len(fill) > 3 else ""
+    return "-" if fill is None else f"#{bytes(fill[:3]).hex()}{spread}"
 
 
 def shown_name(path: str, stream: str = "stdin") -> str:

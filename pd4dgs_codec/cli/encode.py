@@ -30,7 +30,8 @@ Fitting takes a minute or more, and longer with --slices.
 --slices 50k lets the first frame appear after 50 kB and improve with each further slice. The anchors that matter most
 in renderings come first; without target sizes others pass to a higher layer, so that motion need not wait for them.
 This lowers the levels below the highest, as the report shows; --keep-levels leaves them as trained. Ordering the
-anchors takes up to some minutes. A slice also holds the colour that best fills what is still open behind it.
+anchors takes up to some minutes. A slice also holds the colour that best fills what is still open behind it,
+and a factor by which its Gaussians stand for those to come.
 
 Sizes and slices are measured on renderings by cameras of --data, else by training cameras in the checkpoint, else by
 the file's own camera.
@@ -238,7 +239,7 @@ def _slice_lines(result: dict[str, Any]) -> list[str]:
     lines.append(f"anchors ordered by {about['order']}{seen}")
     fills = [row["fill"] for layer in result["layers"] for row in layer["slices"]]
     if any(fills):
-        lines.append(f"fill of each slice: {', '.join(map(color, fills))} (-: the background)")
+        lines.append(f"fill and spread of each slice: {', '.join(map(color, fills))} (-: the background)")
     if "psnr" in about:
         lines.append(f"mPSNR after each slice: {', '.join(f'{db:.2f}' for db in about['psnr'])} dB on held-out views")
     for row in about.get("levels", ()):

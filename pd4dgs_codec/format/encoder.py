@@ -40,7 +40,7 @@ LATER = 2 / 3  #: size of the slices behind the first one of layer 0, of that on
 TRIES = 4  #: most encodes of one slice to reach its size
 SLACK = 0.97  #: share of the size that a slice aims at
 FULL = 0.92  #: share of the size that is large enough
-LONGEST = (255, 255, 255)  #: a fill that takes the most bytes
+LONGEST = (255, 255, 255, 255)  #: a fill that takes the most bytes
 
 
 @dataclass(frozen=True, eq=False)

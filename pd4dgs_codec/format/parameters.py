@@ -125,13 +125,19 @@ def read_parameters(
     rows, codes = fields.integer(OWN_ROWS, MAX_ANCHORS - before.rows), fields.integer(CODES, MAX_PAYLOAD)
     if codes > len(payload) - start:
         raise Malformed(f"{where}: codes of {codes} bytes, expected at most {len(payload) - start}")
-    fill: Any = tuple(as_integer(c, 255, f"{where} fill") for c in fields.sequence(FILL, 3)) if FILL in fields else None
+    fill = _unpack_fill(fields, f"{where} fill") if FILL in fields else None
     tables = Tables(rows=of.rows) if of else _unpack_tables(fields, where)
     rises, width = 0 if later else before.rows, RowTable(tables.rows).channels
     symbols = rises + (table.channels + table.graded + 4) * rows + width * (rises + rows) + tables.symbols
     total = Declared(before.rows + rows, before.symbols + symbols, before.payload_bytes + len(payload))
     _check_declared(tables.cells, total, where)
     return Parameters(rows, codes, fill, tables, rises, symbols), start, total
+
+
+def _unpack_fill(fields: Fields, where: str) -> Fill:
+    found = fields.sequence(FILL)
+    as_integer(len(found), 4, f"{where}: integers", 3)
+    return tuple(as_integer(code, 255, where) for code in found)
 
 
 def _check_declared(cells: int, total: Declared, where: str) -> None:

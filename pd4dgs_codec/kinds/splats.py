@@ -263,12 +263,13 @@ class Moving:
             rows, mask, self._rest = rows[seen], mask[seen], self._rest.taken(seen)
             tensors = {name: x[seen] for name, x in tensors.items()}
         self._rows, self._mask, self._fades = rows, mask, "opacity" in heads or "window" in tensors
+        self._sizes = (mask * np.float32(scene.spread()))[:, None]
         self._logits, self._logs, self._window = tensors["opacity"][:, 0], tensors["scale"], None
         if "window" in tensors:
             self._window = np.array(tensors["window"], order="F")
             self._window[:, 2] = np.exp(self._window[:, 2])
         if "scale" not in heads:
-            self._rest = replace(self._rest, scales=self._rest.scales * mask[:, None])
+            self._rest = replace(self._rest, scales=self._rest.scales * self._sizes)
         columns = {name: np.asfortranarray(getattr(self._rest, name)) for name in ("means", "quats") if heads}
         self._rest = replace(self._rest, **columns)  # in the order in memory of what is added to them
         own = [motion.of_rows(rows) for motion in scene.tracks.values()]
@@ -289,7 +290,7 @@ class Moving:
             turn[:, 0] += 1
             changed["quats"] = _rotations(product(turn, rest.quats))
         if "scale" in added:
-            changed["scales"] = np.exp(self._logs + added["scale"]) * mask[:, None]
+            changed["scales"] = np.exp(self._logs + added["scale"]) * self._sizes
         if "color" in added:
             changed["sh"] = rest.sh.copy(order="K")
             changed["sh"][:, 0] += rgb(added["color"].T).T

@@ -89,6 +89,7 @@ class Model(nn.Module):
         self.info, self.steps = info, steps
         self.frozen = 0
         self.backgrounds = dict[int, tuple[float, float, float]]()  #: of levels of incomplete files
+        self.spreads = dict[int, float]()  #: of levels of incomplete files, see `LayeredScene.spread`
         self.register_buffer("anchor_q", anchor_q)
         widths = Widths(feature.shape[1], offset.shape[1])
         no_class, no_centre = torch.zeros(len(anchor_q), dtype=torch.uint8), torch.zeros(widths.channels)
@@ -157,9 +158,9 @@ class Model(nn.Module):
         return level_mask(self.mask_logits, level)
 
     @torch.no_grad()
-    def _visible(self, masks: Tensor, position: Tensor, camera: Camera, only: Tensor | None = None) -> Tensor:
+    def _visible(self, masks: Tensor, spread: float, camera: Camera, only: Tensor | None) -> Tensor:
         offsets, sizes = (part.amax(1).exp() for part in torch.split(self.scaling_log, 3, dim=1))
-        radius = OFFSET_REACH * offsets + SIGMA_REACH * sizes
+        radius, position = OFFSET_REACH * offsets + SIGMA_REACH * spread * sizes, self.anchor
         seen = in_view(camera, self._viewmat(camera), position, radius, self.info.near) & (masks > MASK_THRESHOLD)
         visible: Tensor = (seen if only is None else seen & only).nonzero()[:, 0]
         return visible
@@ -170,8 +171,9 @@ class Model(nn.Module):
         """Returns the Gaussians of `level` that the camera may see at normalised time t in 0..1, of the anchors `only`
         (bool [N]) if given. The kernels evaluate them if they support the model, else plain torch does."""
         kernels, masks, slots = self._fusible(), self.masks(level), self.widths.slots
+        spread = self.spreads.get(level, 1.0)
         stages: Any = fused if kernels else reference
-        rows, viewmat = self._visible(masks, self.anchor, camera, only), self._viewmat(camera)
+        rows, viewmat = self._visible(masks, spread, camera, only), self._viewmat(camera)
         anchors = self._moved(level, stages.pick(*self._picked(rows, rounding)), t, rounding, kernels)
         step = self.steps.weights_scaffold if rounding.weights else None
         networks = [self.network(name) for name in SCAFFOLD_NETWORKS]
@@ -179,7 +181,8 @@ class Model(nn.Module):
         found, gates, raw_opacity, keep = stages.grow(anchors, masks.index_select(0, rows), eye, networks, step)
         owner = rows.index_select(0, torch.div(keep, slots, rounding_mode="floor"))
         means, scales, quats, opacities, colors = torch.split(found, [3, 3, 4, 1, 3], dim=1)
-        gated, kept = (scales * gates[:, None], opacities[:, 0] * gates), owner * slots + keep % slots
+        gated = scales * (spread * gates)[:, None], opacities[:, 0] * gates
+        kept = owner * slots + keep % slots
         return Gaussians(means, quats, *gated, colors, kept, rows, raw_opacity)
 
     def _picked(self, rows: Tensor, rounding: Rounding) -> tuple[Any, ...]:
@@ -315,6 +318,7 @@ def from_scene(scene: LayeredScene) -> Model:
     )
     found = {level: scene.background(level) for level in range(3)}
     model.backgrounds = {level: color for level, color in found.items() if color != scene.info.background}
+    model.spreads = {level: scene.spread(level) for level in range(3)}
     return model
 
 

@@ -28,6 +28,8 @@ MOST_DB = 100.0
 PARTS = 16
 #: dB that a fill gains at least: for less it is not worth its bytes.
 FILL_GAIN = 0.05
+#: The spreads that are tried, in units of 1/64 above 1: 1 to 3.
+SPREADS = (0, 8, 16, 24, 32, 48, 64, 96, 128)
 
 
 def pictures(
@@ -191,25 +193,58 @@ def _enough(
 # -- what incomplete files leave open ----------------------------------------------------------------------------------
 
 
-def best_fill(prefix: AnyScene, viewpoints: Sequence[Viewpoint], whole: Sequence[np.ndarray]) -> Fill | None:
-    """Returns the colour, RGB 0..255, behind the Gaussians of `prefix` that brings its pictures at `viewpoints` nearest
-    to `whole`, float32 [H, W, 3] each. None if that gains less than FILL_GAIN over the background of the header.
-
-    A picture over the colour b is J = C + T b, T the transmittance that is left. Over b + d its squared error against I
-    is less by 2 d <T, I - J> - d^2 <T, T> in each channel, most for d = <T, I - J> / <T, T>.
+def best_fill(
+    prefix: AnyScene, viewpoints: Sequence[Viewpoint], whole: Sequence[np.ndarray], before: Fill | None = None
+) -> Fill | None:
+    """Returns the colour, RGB 0..255, behind the Gaussians of `prefix` and their spread that bring its pictures at
+    `viewpoints` nearest to `whole`, float32 [H, W, 3] each. None if that gains less than FILL_GAIN over the background
+    of the header without a spread. before: that of the slice before, from which the search for a spread goes downhill;
+    without it all of SPREADS are tried.
     """
-    player, background = drawer(replace(prefix, fills=())), np.array(prefix.info.background)
-    error, slope, curve = 0.0, np.zeros(3), 0.0
+    background = np.array(prefix.info.background)
+    nothing, _ = _filled(prefix, 0, viewpoints, whole, background)
+    tried = dict[int, tuple[float, np.ndarray]]()
+
+    def error(i: int) -> float:
+        if i not in tried:
+            tried[i] = _filled(prefix, SPREADS[i], viewpoints, whole)
+        return tried[i][0]
+
+    if before:
+        best = SPREADS.index(before[3]) if len(before) > 3 else 0
+    else:
+        best = min(range(len(SPREADS)), key=error)
+    for way in (-1, 1):
+        while 0 <= best + way < len(SPREADS) and error(best + way) < error(best):
+            best += way
+    found, fill = tried[best]
+    if found >= nothing * 10 ** (-FILL_GAIN / 10):
+        return None
+    spread = [SPREADS[best]] if SPREADS[best] else []
+    return (*fill.astype(int).tolist(), *spread)
+
+
+def _filled(
+    prefix: AnyScene,
+    spread: int,
+    viewpoints: Sequence[Viewpoint],
+    whole: Sequence[np.ndarray],
+    color: np.ndarray | None = None,
+) -> tuple[float, np.ndarray]:
+    """Returns (the squared error of the pictures of `prefix` with this spread over a colour, the colour float64 [3] in
+    units of 1/255); without `color` it is the best one.
+
+    A picture over the colour b is C + T b, T the transmittance that is left. Its squared error against I is least for
+    b = <T, I - C> / <T, T> in each channel.
+    """
+    player = drawer(replace(prefix, fills=((0, 0, 0, spread),) * len(prefix.layers)))
+    parts = []
     for (camera, time), target in zip(viewpoints, whole, strict=True):
         picture, alpha = player.drawn(camera, time)
-        missing, left = (target - picture).astype(np.float64), 1.0 - alpha.astype(np.float64)
-        error += float(np.square(missing).sum())
-        slope += np.einsum("hw,hwc->c", left, missing)
-        curve += float(np.square(left).sum())
-    fill = np.rint(255 * np.clip(background + slope / max(curve, np.finfo(float).tiny), 0, 1))
-    change = fill / 255 - background
-    gain = float((2 * change * slope - curve * change**2).sum())
-    if gain <= error * (1 - 10 ** (-FILL_GAIN / 10)):
-        return None
-    red, green, blue = fill.astype(int).tolist()
-    return red, green, blue
+        parts.append(((target - picture).astype(np.float64), 1.0 - alpha.astype(np.float64)))
+    if color is None:
+        slope = np.sum([np.einsum("hw,hwc->c", left, missing) for missing, left in parts], axis=0)
+        curve = sum(float(np.square(left).sum()) for _, left in parts)
+        color = np.rint(255 * np.clip(slope / max(curve, np.finfo(float).tiny), 0, 1)) / 255
+    error = sum(float(np.square(missing - left[..., None] * color).sum()) for missing, left in parts)
+    return error, np.rint(255 * color)

@@ -198,15 +198,13 @@ class _Pictures:
         views, planned = self.views, plan(scene, options)
         small, player = [(smaller(camera), time) for camera, time in views.fitting], drawer(planned.scene)
         shown = [player.picture(camera, time) for camera, time in small]
-        closed = set[int]()  # levels of which later slices would gain nothing either
+        fills = dict[int, Fill | None]()  # the latest of each level; after one that gains nothing, none does
 
         def fill(prefix: AnyScene) -> Fill | None:
-            if prefix.level in closed:
-                return None
-            found = best_fill(prefix, small[::2], shown[::2])  # half of the pictures is enough for a colour
-            if found is None:
-                closed.add(prefix.level)
-            return found
+            level = prefix.level
+            if fills.setdefault(level, ()) is not None:  # half of the pictures is enough for a colour
+                fills[level] = best_fill(prefix, small[::2], shown[::2], fills[level])
+            return fills[level]
 
         order: Callable[[AnyScene], np.ndarray] | None = None
         if isinstance(planned.scene, Scene):

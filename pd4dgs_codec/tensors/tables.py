@@ -19,7 +19,7 @@ from pd4dgs_codec.tensors.planes import PlaneShape
 from pd4dgs_codec.tensors.quantise import Rows, dequantise, quantise
 
 Kind = tuple[int, ...]  #: the number of a kind and its parameters, see `kinds`
-Fill = tuple[int, int, int]  #: RGB, 0..255
+Fill = tuple[int, ...]  #: RGB, 0..255, and with four entries the spread, see `scene.LayeredScene.spread`
 
 
 @dataclass(frozen=True)

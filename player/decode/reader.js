@@ -20,7 +20,7 @@ import { VoxelTable, mortonOrder } from "./voxels.js";
  * @typedef {{checkHeader: (header: Header) => void, checkLayer: (header: Header, layers: LayerTables[]) => void}} Rules
  */
 
-/** @typedef {Omit<LayerTensors, "codes" | "fill" | "rows">} LayerTables */
+/** @typedef {Omit<LayerTensors, "codes" | "fill" | "spread" | "rows">} LayerTables */
 
 /**
  * A layer as far as it has been read: `first` row of its own; codes of the mask, of all rows up to its own, and its own
@@ -241,7 +241,9 @@ export class TensorReader {
     if (!had) this.layers = [...this.layers.filter((other) => other.layer !== number), layer];
     layer.slices++;
     layer.sorted = !had || (layer.sorted && !voxels.length);
-    layer.fill = slice.fill?.map((c) => c / 255) ?? header.info.background;
+    const [spread = 0] = slice.fill?.slice(3) ?? [];
+    layer.fill = slice.fill?.slice(0, 3).map((c) => c / 255) ?? header.info.background;
+    layer.spread = 1 + spread / 64;
     layer.priors = slice.priors;
     this._taken.add(voxels);
     this._declared = slice.declared;
@@ -254,7 +256,7 @@ export class TensorReader {
     const { layer, kind, rowTensors, priors } = slice;
     const { grids, chains } = (!layer && this.layers[0]) || slice; // layer 0 over a base has the base's
     const rows = widths(rowTensors).map((channels) => new Column(Float32Array, channels));
-    const empty = { codes: new Column(Uint8Array, 1), rows, fill: [], slices: 0, sorted: true };
+    const empty = { codes: new Column(Uint8Array, 1), rows, fill: [], spread: 1, slices: 0, sorted: true };
     return { layer, kind, grids, chains, rowTensors, priors, first: this._declared.rows, ...empty };
   }
 
@@ -276,9 +278,9 @@ export class TensorReader {
    */
   tensors() {
     if (!this.header || !this.layers.length) throw new TypeError("no layer has been read");
-    const layers = this.layers.map(({ layer, codes, fill, grids, chains, kind, rowTensors, rows }) => {
+    const layers = this.layers.map(({ layer, codes, fill, spread, grids, chains, kind, rowTensors, rows }) => {
       const arrays = { codes: codes.values, rows: rows.map(({ values }) => values) };
-      return { layer, ...arrays, fill, grids, chains, kind, rowTensors };
+      return { layer, ...arrays, fill, spread, grids, chains, kind, rowTensors };
     });
     const [voxels, positions, ...rows] = this._columns.map(({ values }) => values);
     return { header: this.header, layers, voxels, positions, rows: rows.slice(0, this.header.rows.length) };

@@ -64,7 +64,7 @@ const stepped = (read, limit) => (value, where) => {
 const PARAMETERS = map([1, 2, 3, 4, 5, 6, 7], {
   rows: integer(0, MAX_ROWS),
   size: integer(0, MAX_PAYLOAD), // of the codes
-  fill: optional(list(integer(0, 255), 3), null), // the colour behind a prefix that ends here
+  fill: optional(list(integer(0, 255), 3, 4), null), // of a prefix that ends here: colour behind it, spread in 1/64
   grids: optional(stepped(grid, 16), { step: 1, list: [] }),
   chains: optional(stepped(chain, 64), { step: 1, list: [] }),
   kind: optional(kind, null), // of the deformation

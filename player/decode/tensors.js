@@ -40,6 +40,7 @@
  * @property {number} layer its number
  * @property {Uint8Array} codes the mask codes (11.1) of all anchors up to its own, whose number is their length
  * @property {number[]} fill the colour behind a prefix that ends here (13.6), RGB, 0..1
+ * @property {number} spread the factor on its scales (13.6), 1 in whole files
  * @property {Grid[]} grids
  * @property {Chain[]} chains
  * @property {number[] | null} kind of its deformation: its number, then its parameters

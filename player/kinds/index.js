@@ -33,6 +33,7 @@ import { splats } from "./splats.js";
  * @property {Uint8Array[]} mask per layer the codes of its rows[i] rows: the gate times 255; 0 is inactive
  * @property {number} baseRows so many of the first anchors are those of the file's base, the same in all files over it
  * @property {number[][]} fill per layer the colour behind its Gaussians, RGB, 0..1
+ * @property {number[]} spread per layer the factor on their scales, 1 in whole files
  */
 
 const SCENES = [scaffold, splats];
@@ -99,6 +100,7 @@ export function sceneOf(tensors) {
     baseRows: header.base?.rows ?? 0,
     mask: layers.map(({ codes }) => codes),
     fill: layers.map(({ fill }) => fill),
+    spread: layers.map(({ spread }) => spread),
     motion: layers.map(({ kind }, i) => {
       if (!kind) return motion;
       const own = registered(DEFORMATIONS, "deformation", kind).deformationOf(header, layers.slice(0, i + 1));

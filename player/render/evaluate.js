@@ -222,7 +222,7 @@ class Evaluator {
 
   /** @param {number} level @param {number} t @param {number[]} eye @returns {Gaussians} */
   evaluate(level, t, eye) {
-    const { rows, codes, motion } = levelOf(this.scene, level);
+    const { rows, codes, spread, motion } = levelOf(this.scene, level);
     const moving = motion && this._motionOf(motion);
     moving?.field.setTime(t);
     const kept = { slot: new Column(Uint32Array, 1), records: new Column(Float32Array, COLUMNS) };
@@ -230,7 +230,7 @@ class Evaluator {
     for (let a = 0; a < rows; ) {
       let count = 0;
       for (; a < rows && count < BATCH; a++) if (codes[a]) anchors[count++] = a;
-      this._keep(moving, anchors.subarray(0, count), codes, eye, kept);
+      this._keep(moving, anchors.subarray(0, count), codes, spread, eye, kept);
     }
     return { count: kept.slot.rows, slot: kept.slot.values, records: kept.records.values };
   }
@@ -271,10 +271,10 @@ class Evaluator {
   /**
    * Adds the visible Gaussians of at most BATCH anchors to `kept`.
    *
-   * @param {Motion | null} moving at its time @param {Uint32Array} anchors @param {Uint8Array} codes
+   * @param {Motion | null} moving at its time @param {Uint32Array} anchors @param {Uint8Array} codes @param {number} spread
    * @param {number[]} eye @param {{slot: Column<Uint32Array>, records: Column<Float32Array>}} kept
    */
-  _keep(moving, anchors, codes, eye, kept) {
+  _keep(moving, anchors, codes, spread, eye, kept) {
     const { floats } = this.arena;
     const { feature: F, slots: S } = this._widths;
     const { _anchors: records, _anchorStride: wide, _points: points, _inputs: inputs, _stride: stride } = this;
@@ -339,7 +339,7 @@ class Evaluator {
         const offset = from + this._offsetAt + 4 * i;
         for (let k = 0; k < 3; k++) {
           record[k] = records[from + k] + records[offset + k] * records[size + k];
-          record[4 + k] = records[size + 4 + k] * sigmoid(floats[v + k]) * gate;
+          record[4 + k] = records[size + 4 + k] * sigmoid(floats[v + k]) * gate * spread;
           record[12 + k] = sigmoid(floats[w + k]);
         }
         record[3] = opacity * gate;

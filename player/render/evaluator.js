@@ -145,6 +145,8 @@ export class GpuEvaluator {
     this._motion = null;
     /** @type {WebGLTexture | null} */
     this._codes = null;
+    /** Of the level whose codes these are. */
+    this._spread = 1;
     /** @type {WebGLTexture | null} */
     this._list = null;
     /** @type {List} */
@@ -240,7 +242,7 @@ void main() {
    */
   async evaluate(level, t, eye, into, lister) {
     const gpu = this._gpu;
-    const { number, rows, codes, motion } = levelOf(this.scene, level);
+    const { number, rows, codes, spread, motion } = levelOf(this.scene, level);
     const lines = Math.ceil(rows / this._width);
     const held = this._held;
     const levelMoved = number !== held?.level;
@@ -252,6 +254,7 @@ void main() {
       padded.set(codes);
       gpu.free(this._codes);
       this._codes = gpu.plain(this._width, this._height, padded);
+      this._spread = spread;
       this._setMotion(motion);
     }
     if (anchorsMoved) {
@@ -363,6 +366,7 @@ ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i} * vec4(greaterThanEqual(y${
     const { _before: before, _list: list, _opacities: opacities, _codes: codes } = this;
     gpu.use(program, { ...this._anchorTextures(), before, list, opacities, codes });
     gl.uniform3fv(program.uniform("eye"), eye);
+    gl.uniform1f(program.uniform("spread"), this._spread);
     gl.bindBufferBase(gl.UNIFORM_BUFFER, 1, this._covariance.direction);
     gl.bindBufferBase(gl.UNIFORM_BUFFER, 2, this._color.direction);
     for (let i = 0; i < this._slots; i++) {
@@ -382,6 +386,7 @@ ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i} * vec4(greaterThanEqual(y${
 layout(std140) uniform U3 { vec4 vb; mat4 vw[${K}]; vec4 qb; mat4 qw[${K}]; };
 uniform sampler2DArray opacities;
 uniform sampler2D codes;
+uniform float spread;
 void main() {
   ivec2 g = ivec2(gl_FragCoord.xy);
   uint entry = texelFetch(list, g, 0).r;
@@ -402,7 +407,7 @@ ${repeat(K, (k) => `v += vw[${k}] * x${k}; q += qw[${k}] * x${k};`)}
   float gate = texelFetch(codes, p, 0).r;
   float n = length(q);
   out0 = vec4(mean, opacity * gate);
-  out1 = vec4(exp(anchorBlock(p, ${this._offsetBlock - 1}).xyz) / (1. + exp(-v.xyz)) * gate, 0);
+  out1 = vec4(exp(anchorBlock(p, ${this._offsetBlock - 1}).xyz) / (1. + exp(-v.xyz)) * gate * spread, 0);
   out2 = n > 0. ? q / n : vec4(1, 0, 0, 0);
   out3 = colorOf(p, d);
 }`;

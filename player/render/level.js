@@ -5,10 +5,10 @@ import { columnsOf, quantitiesOf } from "./record.js";
 
 /**
  * One level of a scene: the highest layer that is there and at most the requested one. It has the first `rows` anchors.
- * codes: their gates times 255. fill: the colour behind the Gaussians. motion: what moves it, null if nothing does.
+ * codes: their gates times 255. fill: the colour behind the Gaussians. spread: the factor on their scales. motion: what moves it, null if nothing does.
  *
  * @template {Scene} S
- * @typedef {{number: number, rows: number, codes: Uint8Array, fill: number[], motion: S["motion"][number]}} Level
+ * @typedef {{number: number, rows: number, codes: Uint8Array, fill: number[], spread: number, motion: S["motion"][number]}} Level
  */
 
 /** Columns of a Gaussian's record: mean and opacity; scale, 0; quaternion w x y z; colour, 0. In scene units. */
@@ -38,8 +38,9 @@ export const MIN_OPACITY = 1 / 255;
 /** @template {Scene} S @param {S} scene @param {number} level 0, 1 or 2 @returns {Level<S>} */
 export function levelOf(scene, level) {
   const i = scene.layers.filter((layer) => layer <= level).length - 1;
-  const { layers, rows, mask, fill, motion } = scene;
-  return { number: layers[i], rows: rows[i], codes: mask[i], fill: fill[i], motion: motion[i] };
+  const { layers, rows, mask, fill, spread, motion } = scene;
+  const own = { fill: fill[i], spread: spread[i], motion: motion[i] };
+  return { number: layers[i], rows: rows[i], codes: mask[i], ...own };
 }
 
 /** The unit of the head position: a quarter of the longest side of the box, scene units. @param {Scene} scene */

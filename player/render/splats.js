@@ -225,7 +225,7 @@ export class SplatEvaluator {
   _prepare(level) {
     if (level === this._level) return;
     const { anchorQ, offset, color, opacity, scale, rotation, harmonics, window, info } = this.scene;
-    const { rows: count, codes, motion } = levelOf(this.scene, level);
+    const { rows: count, codes, spread, motion } = levelOf(this.scene, level);
     this._level = level;
     this._still = ++stills;
     this._tracks = motion ?? [];
@@ -239,13 +239,15 @@ export class SplatEvaluator {
     const block = rest.length / 4;
     this._windows = window && new Float32Array(block);
     const least = has[COLOR] || harmonics ? -HUGE : 0;
+    const grown = Math.log(spread);
     rows.forEach((row, i) => {
       const gate = codes[row] / 255;
       const from = 3 * row;
       const [at, shape, turn, shade] = [0, 1, 2, 3].map((b) => b * block + 4 * i);
       for (let k = 0; k < 3; k++) {
         rest[at + k] = bounded((anchorQ[from + k] + offset[from + k]) * info.voxelSize);
-        rest[shape + k] = has[SCALE] ? scale[from + k] : bounded(exp(scale[from + k]) * gate);
+        const size = scale[from + k] + grown;
+        rest[shape + k] = has[SCALE] ? size : bounded(exp(size) * gate);
       }
       rest[at + 3] = has[OPACITY] ? opacity[row] : sigmoid(opacity[row]) * gate;
       rest[shape + 3] = gate;

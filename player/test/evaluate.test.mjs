@@ -49,6 +49,19 @@ for (const [inputs, outputs, rows, relu] of /** @type {[number, number, number, 
   });
 }
 
+test("a spread enlarges the scales alone", () => {
+  const scene = readScaffold("valid/layers-0-1-2");
+  const wide = { ...scene, spread: scene.spread.map((spread) => 1.5 * spread) };
+  for (const level of scene.layers) {
+    const [before, after] = [scene, wide].map((own) => evaluate(own, level, 0.4, [0, 0, -3], new Arena()).records);
+    assert.ok(before.length > 0);
+    before.forEach((v, i) => {
+      const wanted = i % 16 >= 4 && i % 16 < 7 ? 1.5 * v : v;
+      assert.ok(Math.abs(after[i] - wanted) <= 1e-6 * Math.abs(wanted));
+    });
+  }
+});
+
 test("a value that is no number stays none", () => {
   for (const arena of [new Arena(), new Arena(false)]) {
     const layer = { inputs: 1, outputs: 1, weight: Float32Array.of(1), bias: Float32Array.of(0) };

@@ -57,6 +57,7 @@ function sceneOf({ degree = 0, window = false, heads = [ALL_HEADS, [0, 1]], grou
     rows: ROWS,
     mask: mask.map((codes) => Uint8Array.from(codes)),
     fill: ROWS.map(() => [0, 0, 0]),
+    spread: ROWS.map((_, i) => 1 + i / 4),
     anchorQ: Int32Array.from(numbers(3 * N, 40)),
     baseRows: 0,
     anchor: new Float32Array(3 * N), // not read
@@ -122,7 +123,8 @@ function residual({ layers, motion, info, anchorQ, offset }, level, head, i, t) 
 /** A Gaussian's record by the formulas of clause 13.7; null if it is not seen. @param {SplatScene} scene
  * @param {number} level @param {number} i @param {number} t @param {number[]} eye */
 function expected(scene, level, i, t, eye) {
-  const gate = levelOf(scene, level).codes[i] / 255;
+  const { codes, spread } = levelOf(scene, level);
+  const gate = codes[i] / 255;
   const of = (/** @type {Float32Array | Int32Array} */ values) => [...values.subarray(3 * i, 3 * (i + 1))];
   const [move, turn, grow, [fade], shade] = COMPONENTS.map((_, head) => residual(scene, level, head, i, t));
   const offset = of(scene.offset);
@@ -147,7 +149,7 @@ function expected(scene, level, i, t, eye) {
     return sqrt(1 / (4 * PI)) * (value + shade[k]) + rest.reduce((sum, v) => sum + v, 0);
   });
   const color = [Y - Cg + Co, Y + Cg, Y - Cg - Co].map((v) => max(0, 0.5 + v));
-  const scale = of(scene.scale).map((v, k) => exp(v + grow[k]) * gate);
+  const scale = of(scene.scale).map((v, k) => exp(v + grow[k]) * gate * spread);
   if (!gate || opacity < 1 / 255) return null;
   return { mean, opacity, scale, quaternion: p.map((v) => v / Math.hypot(...p)), color };
 }

@@ -54,8 +54,9 @@ def test_cameras_in_a_checkpoint_measure_and_their_absence_is_said(cli, model_pt
     row = r"^level [012]: \d+\.\d+ dB with slices, \d+\.\d+ dB without, on the model's own pictures$"
     assert len(re.findall(row, report, re.MULTILINE)) == 3
     assert re.search(r"^first slices of layers \[.*\] exceed 2,000 bytes", report, re.MULTILINE)
-    told = re.search(r"^fill of each slice: (#.*) \(-: the background\)$", before, re.MULTILINE)[1].split(", ")
-    shown = re.findall(r"(#\w{6}|-) +-$", cli("info", tmp_path / "s.pd4").out.decode(), re.MULTILINE)
+    told = re.search(r"^fill and spread of each slice: (#.*) \(-: the background\)$", before, re.MULTILINE)[1]
+    told = told.split(", ")
+    shown = re.findall(r"(#\w{6}(?: x[\d.]+)?|-) +-$", cli("info", tmp_path / "s.pd4").out.decode(), re.MULTILINE)
     assert shown == told and len(set(told)) > 2
     kept = cli("encode", model_pt, *arguments, "--keep-levels")
     assert kept.code == 0 and "dB with slices" not in kept.err

@@ -148,6 +148,20 @@ def test_scenes_without_gaussians_in_view_show_the_background():
         assert level_of(scene.prefix(level)).background == background
 
 
+def test_a_spread_enlarges_all_gaussians_of_its_level():
+    """In every evaluation alike, and alone the scales."""
+    scene, camera = _scene(), _camera(0)
+    wide = replace(scene, fills=((0, 0, 0, 32), None, (0, 0, 0, 64)))
+    for level, spread in enumerate((1.5, 1, 2)):
+        plain, grown = (own.gaussians(0.4, level, camera.eye) for own in (scene, wide))
+        np.testing.assert_allclose(grown.scales, plain.scales * np.float32(spread), rtol=1e-6)
+        for name in ("means", "quats", "opacities", "colors", "slots"):
+            np.testing.assert_array_equal(getattr(grown, name), getattr(plain, name))
+        drawn = Player(wide.prefix(level)).picture(camera, 0.4)
+        np.testing.assert_allclose(drawn, render_image(from_scene(wide), level, 0.4, camera), atol=2e-5)
+        assert (np.abs(drawn - Player(scene.prefix(level)).picture(camera, 0.4)).max() > 0.05) == (spread > 1)
+
+
 def test_features_that_overflow_hide_their_gaussians():
     scene = _scene()
     field = scene.local_deformation

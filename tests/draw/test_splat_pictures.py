@@ -71,6 +71,15 @@ def test_a_fill_is_behind_the_gaussians_of_its_prefix():
     assert load_levels(data, background=(0.0, 0.0, 1.0))[0].picture(scene.info.camera, 0.0)[0, 0].tolist() == [0, 0, 1]
 
 
+def test_a_spread_enlarges_the_gaussians_of_its_prefix():
+    plain = visible_splats()
+    wide = replace(plain, fills=((0, 0, 0, 64), None, (0, 0, 0, 32)))
+    for level, spread in enumerate((2, 1, 1.5)):
+        for t in (0.0, 0.6):
+            sizes = [decode(encode(scene, effort=1)).gaussians(t, level).scales for scene in (plain, wide)]
+            np.testing.assert_allclose(sizes[1], np.float32(spread) * sizes[0], rtol=1e-6)
+
+
 def test_splats_are_no_model():
     with pytest.raises(DataError, match="^found a scene of splats, which has no networks; .* hold scaffolds only$"):
         from_scene(decode(encode(visible_splats(count=40), effort=1)))

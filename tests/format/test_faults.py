@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from fuzzing.mutate import Chunk, put_together, take_apart
+from fuzzing.parts import Chunk, put_together, take_apart
 from strategies import memory_below, small_file
 
 from pd4dgs_codec.errors import DecodeError, LimitExceeded

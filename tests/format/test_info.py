@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fuzzing.mutate import Chunk, put_together, take_apart
+from fuzzing.parts import Chunk, put_together, take_apart
 from strategies import make_scene, small_file
 
 from pd4dgs_codec import FORMAT_VERSION

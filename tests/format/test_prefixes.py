@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from fuzzing.mutate import Chunk, Parts, put_together
+from fuzzing.parts import Chunk, Parts, put_together
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import LAYER_SETS, assert_same_scene, flipped, scenes, small_file

@@ -6,7 +6,7 @@ from itertools import accumulate
 
 import numpy as np
 import pytest
-from fuzzing.mutate import put_together, take_apart
+from fuzzing.parts import put_together, take_apart
 from strategies import assert_same_scene, make_scene, slice_ends
 
 from pd4dgs_codec import decode, encode

@@ -9,7 +9,7 @@ from itertools import chain
 
 import numpy as np
 import pytest
-from fuzzing.mutate import Chunk, put_together, take_apart
+from fuzzing.parts import Chunk, put_together, take_apart
 from strategies import assert_same_scene, by_voxel, slice_ends, small_file
 from streams import cost
 from vectors.blocks import later, line, make_file, make_layer, pattern

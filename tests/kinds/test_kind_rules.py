@@ -191,6 +191,16 @@ def test_old_drafts_are_refused_in_one_line():
         decode(bytes(data))
 
 
+def test_the_spread_of_the_highest_layer_holds():
+    _, layers = symbols()
+    data = file_of([replace(layers[0], fill=(51, 0, 255, 96)), layers[1], replace(layers[2], fill=(0, 0, 0, 255))])
+    scene, spreads = decode(data), [2.5, 1.0, 1 + 255 / 64]
+    assert scene.background(0) == (0.2, 0.0, 1.0) and scene.fills[0] == (51, 0, 255, 96)
+    assert [scene.spread(level) for level in range(3)] == spreads
+    assert [decode(data, max_layer=level).spread() for level in range(3)] == spreads
+    assert hashes(data) == hashes(small_file())
+
+
 def test_the_fill_of_the_highest_layer_is_its_background():
     header, layers = symbols()
     data = file_of([replace(layers[0], fill=(51, 0, 255)), layers[1], replace(layers[2], fill=(0, 0, 0))])

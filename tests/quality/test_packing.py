@@ -189,6 +189,15 @@ def test_a_fill_brings_every_prefix_nearer_to_the_pictures_that_order_anchors(sc
     assert [row["fill"] for row in rows] == [prefix.fills[-1] for prefix in (*prefixes, last)]
 
 
+@pytest.mark.parametrize("spread", [0, 16, 64])
+def test_the_spread_brings_gaussians_nearest_to_the_pictures(scene, spread):
+    """Its search goes downhill from that of the slice before."""
+    shown = plan(scene).symbols.scene().prefix(0)
+    targets = over(replace(shown, fills=((200, 30, 77, spread),)), np.divide((200, 30, 77), 255))
+    for before in (None, (1, 2, 3), (1, 2, 3, 32)):
+        assert best_fill(shown, VIEWPOINTS, targets, before) == (200, 30, 77, *([spread] if spread else []))
+
+
 def test_slices_of_splats_have_fills_too():
     scene = visible_splats(count=200, moving=False)
     first, *_, last = every_prefix(pack(scene, SLICED, views=Views("made up", TWICE)).data)

@@ -33,7 +33,7 @@ CODINGS = {
     "ans gauss": {"priors": "gauss"},
     "lzma": {"mode": "lzma"},
     "slices": {"slices": 1500},
-    "fills": {"slices": 1500, "fill": lambda prefix: (prefix.level, 0, 255)},
+    "fills": {"slices": 1500, "fill": lambda prefix: (prefix.level, 0, 255, 64)},
 }
 
 

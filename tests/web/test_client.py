@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from faulty import Fault, FaultyServer
-from fuzzing.mutate import take_apart
+from fuzzing.parts import take_apart
 from strategies import assert_same_scene, flipped, small_file
 
 from pd4dgs_codec import decode, encode, open_stream

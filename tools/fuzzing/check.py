@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import refdec
+from vectors import ROOT, refdec
 
 from pd4dgs_codec import decode, open_stream
 from pd4dgs_codec.errors import DecodeError
@@ -31,7 +31,6 @@ from pd4dgs_codec.format.info import hashes, info
 from pd4dgs_codec.format.parameters import Declared, read_parameters
 from pd4dgs_codec.tensors.tables import Tables
 
-from . import ROOT
 from .mutate import Case
 
 MAX_SECONDS = 2.0  #: of processor time, per input

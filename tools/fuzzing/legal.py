@@ -1,27 +1,29 @@
 """Legal `.pd4` files: the small valid vectors, and files of random choices that no encoder need make.
 
-A random file is made from its symbols: the writer of the vectors says which hashes a decoder must arrive at. Every
-choice that the format leaves is drawn, near its limits more often than not: tables of tensors, priors and their
-parameters, step classes, predictors, slices, voxels, steps, what may be ignored. Half of the files are scenes, some of
-which are bent: their tensors decode and may make no scene.
+A random file is made from its symbols: the writer of the vectors says which hashes a decoder must arrive at. It has the
+tables of tensors of a valid vector, in half of the files with other sizes, which may make no scene. Every other choice
+that the format leaves is drawn, near its limits more often than not: priors and their parameters, step classes,
+predictors, slices, voxels, steps, what may be ignored.
 """
 
 from __future__ import annotations
 
 import copy
+import itertools
 import json
 import random
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from vectors import lzma2
+from vectors import ROOT, lzma2, refdec
 from vectors.blocks import (
     ANS,
     LZMA,
+    Choice,
     File,
     Grid,
     Layer,
@@ -33,41 +35,48 @@ from vectors.blocks import (
     morton_order,
     ordered,
     pack,
-    row_values,
 )
 
 from pd4dgs_codec.errors import DecodeError
 from pd4dgs_codec.format.info import hashes
 
-from . import ROOT
+from .parts import take_apart
 
 VECTORS = ROOT / "spec" / "vectors"
 LARGEST_SEED = 6000  #: bytes of a vector: larger ones decode slowly
+LARGEST_GRIDS = 2000  #: plane samples of a vector whose tables random files have
 M, K, V = 1 << 23, 1 << 24, 1 << 20  #: largest symbol of a value, of a channel, and voxel index
-GROUP = 5  #: layer rows of splats whose step is 1
 LEAST, LARGEST = 2.0**-126, (2.0 - 2.0**-23) * 2.0**127
 
 
 @dataclass(frozen=True)
 class Seed:
-    """A legal file to mutate, and its base."""
+    """A legal file to mutate, and its base. scene: whether it makes a scene."""
 
     name: str
     data: bytes
     base: bytes | None = None
+    scene: bool = True
+
+
+@cache
+def valid_vectors() -> list[Seed]:
+    """The small ones."""
+    found = list[Seed]()
+    for row in json.loads((VECTORS / "manifest.json").read_text(encoding="utf-8"))["vectors"]:
+        if row["file"].startswith(("valid/", "uncommon/")) and row["size"] <= LARGEST_SEED:
+            data, base = (name and (VECTORS / name).read_bytes() for name in (row["file"], row.get("base")))
+            found.append(Seed(Path(row["file"]).stem, data, base, "scene" not in row))
+    return found
 
 
 def seeds(paths: Sequence[Path] = (), built: int = 60) -> list[Seed]:
     """The files at `paths` (or in them, if folders; those that do not decode are left out), small vectors, and `built`
     random files."""
     files = [file for path in paths for file in (sorted(path.rglob("*.pd4")) if path.is_dir() else [path])]
-    found = [Seed(file.stem, file.read_bytes()) for file in files]
-    for row in json.loads((VECTORS / "manifest.json").read_text(encoding="utf-8"))["vectors"]:
-        if row["file"].startswith(("valid/", "uncommon/")) and row["size"] <= LARGEST_SEED:
-            data, base = (name and (VECTORS / name).read_bytes() for name in (row["file"], row.get("base")))
-            found.append(Seed(Path(row["file"]).stem, data, base))
+    found = [*(Seed(file.stem, file.read_bytes()) for file in files), *valid_vectors()]
     made = [(file.data(), base and base.data()) for file, base in map(numbered, range(built))]
-    return [*(Seed(f"legal-{i}", *own) for i, own in enumerate(made)), *(seed for seed in found if decodes(seed))]
+    return [*(Seed(f"legal-{i}", *own) for i, own in enumerate(made)), *filter(decodes, found)]
 
 
 def decodes(seed: Seed) -> bool:
@@ -102,11 +111,6 @@ def near(rng: random.Random, low: int, high: int) -> int:
     return rng.choice((low, high, rng.randint(low, high), rng.randint(low, min(high, low + 40))))
 
 
-def some_ids(rng: random.Random, count: int) -> list[int]:
-    """Ascending."""
-    return sorted(rng.sample(range(256), count) if rng.random() < 0.5 else range(count))
-
-
 def step(rng: random.Random, values: Sequence[np.ndarray], most: int = 1) -> float:
     """A step that keeps these symbols finite, and all up to `most`."""
     largest = max([most, *(int(abs(v.astype(np.int64)).max(initial=0)) for v in values)])
@@ -116,20 +120,17 @@ def step(rng: random.Random, values: Sequence[np.ndarray], most: int = 1) -> flo
     return rng.choice((LEAST, 2.0**-7, *map(float, single)))
 
 
-class Chooser:
+def chooser(rng: random.Random, known: list[Prior], most: int) -> Choice:
     """Chooses priors for the channels of a slice, also of those that the list has. most: entries of the list."""
+    alike = rng.random()  # how often a channel has a prior of the list
 
-    def __init__(self, rng: random.Random, known: list[Prior], most: int):
-        self._rng, self._known, self._most = rng, known, most
-        self._alike = rng.random()  # how often a channel has a prior of the list
-
-    def __call__(self, piece: str, number: int, k: list[int]) -> Prior:
-        """A choice of `blocks.Choice`."""
-        own, rng = self._known, self._rng
-        left = self._most - sum(prior.n for prior in own)
-        if own and (rng.random() < self._alike or left < 2):
-            return rng.choice(own)
+    def choose(piece: str, number: int, k: list[int]) -> Prior:
+        left = most - sum(prior.n for prior in known)
+        if known and (rng.random() < alike or left < 2):
+            return rng.choice(known)
         return prior(rng, min(k), max(k), min(left, 1 << 14))
+
+    return choose
 
 
 def prior(rng: random.Random, low: int, high: int, most: int) -> Prior:
@@ -157,138 +158,67 @@ def _normal(rng: random.Random, n: int) -> tuple[int, int]:
 
 @dataclass
 class Tables:
-    """Of a layer: channels and sides of grids, inputs and outputs of chains, channels of layer rows, all by id."""
+    """Of a file: its kind, tensors of rows and, by layer, parameters 4 to 7. scene: whether they make one."""
 
-    grids: dict[int, tuple[int, tuple[int, ...]]] = field(default_factory=dict)
-    chains: dict[int, tuple[int, int]] = field(default_factory=dict)
-    rows: dict[int, int] = field(default_factory=dict)
-    kind: list[int] | None = None
-
-
-class Anything:
-    """Tables of no known kind. widths: channels of the rows by id. read: of planes of the layers so far."""
-
-    def __init__(self, rng: random.Random):
-        self.rng = rng
-        self.kind, self.read = self.any_kind(), 0
-        self.widths = self.some(rng.choices((1, 2, 3, 7, 32), (3, 6, 3, 3, 0.2))[0], ((1, 3, 16), (6, 6, 1)))
-        if rng.random() < 0.02:
-            self.widths = {0: 256, 9: 256}
-
-    def some(self, count: int, sizes: tuple[Sequence[int], Sequence[float]]) -> dict[int, int]:
-        """So many sizes by id."""
-        return {i: self.rng.choices(*sizes)[0] for i in some_ids(self.rng, count)}
-
-    def any_kind(self) -> list[int]:
-        """Of a scene or a deformation."""
-        rng = self.rng
-        return [rng.choice((0, 1, 2, 65535)), *(near(rng, 0, 65535) for _ in range(rng.choice((0, 0, 1, 2, 15))))]
-
-    def sides(self, axes: int) -> tuple[int, ...]:
-        """Of a grid."""
-        return tuple(self.rng.choices((1, 2, 3, 5, 40), (8, 8, 8, 4, 1))[0] for _ in range(axes))
-
-    def layer(self, number: int) -> Tables:
-        """Of a layer, some of all forms."""
-        rng, made = self.rng, Tables()
-        channels, ends = ((1, 2, 3, 5, 9, 17, 33), (6, 6, 6, 3, 1, 1, 1)), ((1, 2, 5, 30), (3, 3, 3, 1))
-        if rng.random() < 0.6:
-            own = self.some(rng.choices((1, 2, 16), (9, 3, 0.1))[0], channels)
-            made.grids = {i: (c, self.sides(rng.randint(1, 4))) for i, c in own.items()}
-        if rng.random() < 0.6:
-            own = self.some(rng.choices((1, 2, 5, 64), (3, 3, 3, 0.1))[0], ends)
-            made.chains = {i: (wide, rng.choices(*ends)[0]) for i, wide in own.items()}
-        if rng.random() < 0.3:
-            made.rows = self.some(rng.choices((1, 2, 5, 32), (6, 6, 2, 0.1))[0], ((1, 2, 5, 16), (6, 6, 3, 1)))
-        made.kind = self.any_kind() if rng.random() < 0.5 else None
-        return made
+    kind: list[int]
+    rows: list[list[Any]]
+    layers: dict[int, dict[int, Any]]
+    scene: bool
 
 
-class Scaffold(Anything):
-    """A scaffold with HexPlanes."""
-
-    def __init__(self, rng: random.Random):
-        super().__init__(rng)
-        self.d, self.g = rng.choices(((1, 1), (2, 3), (7, 2), (32, 10), (64, 16)), (9, 9, 6, 2, 1))[0]
-        self.kind, self.widths = [0, self.g, rng.randrange(8)], {0: self.d, 1: 6, 2: 3 * self.g}
-        self.channels = rng.choices((1, 2, 3, 5, 9, 17), (6, 6, 6, 3, 1, 1))[0]  # of all planes
-
-    def layer(self, number: int) -> Tables:
-        """Of a layer."""
-        rng = self.rng
-        if number == 0:
-            inputs = [self.d + 3 * (self.kind[2] >> i & 1) for i in range(3)]
-            return Tables(chains={i: (inputs[i], k * self.g) for i, k in enumerate((1, 7, 3))})
-        if rng.random() < 0.4:
-            return Tables()
-        ids = some_ids(rng, rng.choices((1, 2, 8), (9, 3, 0.3))[0])
-        self.read += self.channels * len(ids)
-        between, heads = rng.choice((1, 2, 5)), {1: 3, 2: self.d, 3: 6, 4: 3 * self.g}
-        chains = {i: (between, heads[i]) for i in sorted(rng.sample(sorted(heads), rng.randint(1, 4)))}
-        kind = rng.choice(([0], [0, near(rng, 0, 65535)]))
-        return Tables({i: (self.channels, self.sides(4)) for i in ids}, {0: (self.read, between)} | chains, {}, kind)
+@cache
+def all_tables() -> list[Tables]:
+    """Those of the small vectors without large grids, and of which no base has a part."""
+    found = list[Tables]()
+    for seed in valid_vectors():
+        parts = take_apart(seed.data)
+        layers = {c.type: {k: v for k, v in c.meta.items() if 3 < k < 8} for c in reversed(parts.chunks) if c.meta}
+        samples = sum(np.prod(s) for x in layers.values() for grid in grids_of(x) for s in grid.shapes())
+        if 15 not in parts.header and samples <= LARGEST_GRIDS:
+            found.append(Tables(parts.header[3], parts.header[4], layers, seed.scene))
+    return found
 
 
-class Splats(Anything):
-    """Splats with tracks, in groups or not."""
-
-    def __init__(self, rng: random.Random):
-        super().__init__(rng)
-        self.kind, self.widths = [1], dict(enumerate((3, 3, 1, 3, 3)))
-        self.widths |= rng.choice(({}, {5: 9}, {5: 24}, {5: 45, 6: 3}, {6: 3}))
-
-    def layer(self, number: int) -> Tables:
-        """Of a layer."""
-        rng = self.rng
-        if number == 0 or rng.random() < 0.4:
-            return Tables()
-        side = rng.choice((2, 3, 7, 40))
-        heads = {h: near(rng, 1, 9) for h in sorted(rng.sample(range(5), rng.randint(1, 3)))}
-        grids = {1 + h: (m * (3, 4, 3, 1, 3)[h], (side,)) for h, m in heads.items()}
-        grids = {0: (1, (side,))} | grids
-        if rng.random() < 0.5:
-            return Tables(grids, {}, heads, [1])
-        count = rng.choice((1, 2, 5, 40))
-        grids |= {6: (3, (count,))} | {7 + h: (4 * m, (count,)) for h, m in heads.items() if rng.random() < 0.6}
-        return Tables(grids, {}, heads | {GROUP: 1}, [1])
+def grids_of(meta: dict[int, Any]) -> list[Grid]:
+    """Those of parameters."""
+    return [Grid(channels, tuple(sides), id=i) for i, channels, sides, _ in meta.get(4, [0])[1:]]
 
 
-def bend(rng: random.Random, tables: Tables) -> None:
-    """One thing of a layer's tables becomes another, still legal."""
-    own: dict[int, Any] = rng.choice((tables.grids, tables.chains, tables.rows))
-    i, act = rng.choice([*own, 0]), rng.randrange(5)
-    if act == 0:
-        tables.kind = rng.choice((None, [0], [1], [0, 7], [1, 7], [5]))
-    elif act == 1:
-        own.pop(i, None)
-    elif act == 2 and i in own:
-        own[rng.choice((5, 255))] = own.pop(i)
-    elif own is tables.grids:
-        c, sides = own.get(i, (1, (2,) * rng.randint(1, 4)))
-        own[i] = (c + rng.randrange(2), sides[rng.randrange(2) :] or (3,))
-    elif own is tables.chains:
-        own[i] = tuple(v + rng.choice((0, 0, 1, 3)) for v in own.get(i, (1, 3)))
-    else:
-        own[i] = own.get(i, 0) + 1
+def vary(rng: random.Random, tables: Tables) -> None:
+    """Gives tensors other sizes, still legal."""
+    tables.scene = False
+    if rng.random() < 0.5:
+        parameters = [near(rng, 0, 65535) for _ in range(rng.choice((0, 0, 1, 2, 15)))]
+        tables.kind = [rng.choice((0, 1, 2, 65535)), *parameters]
+    for row in tables.rows if rng.random() < 0.5 else ():
+        row[1] = rng.choices((1, 3, 16), (6, 6, 1))[0]
+    for meta in tables.layers.values():
+        for grid in meta.get(4, [0])[1:]:
+            if rng.random() < 0.4:
+                sides = [rng.choices((1, 2, 3, 5, 40), (8, 8, 8, 4, 1))[0] for _ in range(rng.randint(1, 4))]
+                grid[1:3] = rng.choices((1, 2, 3, 5, 9, 17, 33), (6, 6, 6, 3, 1, 1, 1))[0], sides
+        for chain in meta.get(5, [0])[1:]:
+            if rng.random() < 0.4:
+                chain[1:] = rng.choices((1, 2, 4, 30), (9, 9, 9, 1), k=rng.choices((2, 3, 5, 17), (9, 5, 2, 0.5))[0])
+        for row in meta.get(7, ()):
+            row[1] = rng.choice((row[1], row[1], 1, 2))
+        if rng.random() < 0.1:
+            meta[6] = rng.choice(([0], [1], [0, 7], [1, 7], [5]))
 
 
 # -- slices and files --------------------------------------------------------------------------------------------------
 
 
 class Maker:
-    """Makes the slices of a file. scene: whether they are sure to make one. base: whether others add to its layer 0."""
+    """Makes the slices of a file. base: whether others add to its layer 0."""
 
     def __init__(self, rng: random.Random, base: bool = False):
-        self.rng, self.plan = rng, rng.choice((Anything, Anything, Scaffold, Splats))(rng)
+        self.rng, self.tables = rng, copy.deepcopy(rng.choice(all_tables()))
+        if rng.random() < 0.5:
+            vary(rng, self.tables)
         self.base, self.adds, self.base_rows = base, False, 0  # rows of the base that it adds to
-        bent = type(self.plan) is not Anything and rng.random() < 0.4
-        self.scene, self.bent = type(self.plan) is not Anything and not bent, bent
         self.mode = LZMA if rng.random() < 0.1 else ANS
-        if bent and rng.random() < 0.3:
-            self.plan.kind[-1] += rng.choice((1, 2, 60))
-        elif bent and rng.random() < 0.4:
-            self.plan.widths[rng.choice((1, 2, 7))] = rng.choice((1, 6, 9))
-        self.table = [[i, c, 1.0, rng.randrange(3)] for i, c in sorted(self.plan.widths.items())]
+        self.table = [[i, c, 1.0, rng.randrange(3)] for i, c, _, _ in self.tables.rows]
         width = sum(c for _, c, _, _ in self.table)
         self.centres = symbols(rng, width).tolist() if rng.random() < 0.4 else None
         self.layer_table = list[Any]()  # of the layer
@@ -300,10 +230,10 @@ class Maker:
     def over(self) -> Maker:
         """The maker of a file that adds to the layer 0 of what this one has made."""
         made = copy.copy(self)
-        made.plan, made.table, made.base, made.adds = copy.copy(self.plan), copy.deepcopy(self.table), False, True
+        made.table, made.base, made.adds = copy.deepcopy(self.table), False, True
         made.codes, made.classes = self.of_base
         made.symbols = len(made.codes) * (4 + (made.centres is not None) + sum(c for _, c, _, _ in made.table))
-        made.base_rows, made.plan.read, made.mode = len(made.codes), 0, LZMA if self.rng.random() < 0.1 else ANS
+        made.base_rows, made.mode = len(made.codes), LZMA if self.rng.random() < 0.1 else ANS
         return made
 
     def cells(self, count: int) -> list[list[int]]:
@@ -330,78 +260,57 @@ class Maker:
         for _, width, _, predictor in table:
             k = symbols(self.rng, width, len(classes), most=few)
             own, centres = centres[:width] or [0] * width, centres[width:]
-            row_values(k, classes, own, predictor, mend=True)
+            for channel, centre in zip(k, own, strict=True):
+                while not _in_range(channel, classes, centre, predictor):
+                    channel[:] = channel / 2  # 0 in the end
             made.append(k)
         return made
 
-    def grids(self, tables: Tables) -> list[Grid]:
+    def grids(self, meta: dict[int, Any]) -> list[Grid]:
         """With samples of any size; those of the first grid of tracks ascend."""
         made = list[Grid]()
-        for i, (channels, sides) in tables.grids.items():
-            grid = Grid(channels, sides, id=i)
+        for grid in grids_of(meta):
             samples = [symbols(self.rng, *shape, most=self.rng.choice((M, 3))) for shape in grid.shapes()]
-            if isinstance(self.plan, Splats) and i == 0:
+            if meta.get(6) == [1] and grid.id == 0:
                 samples = [k * 0 + np.arange(k.size).reshape(k.shape) ** self.rng.choice((1, 2)) for k in samples]
             predictors = tuple(self.rng.randrange(2) for _ in samples)
             made.append(replace(grid, predictors=predictors, fill=lambda place, shape, samples=samples: samples[place]))  # type: ignore[misc]
         return made
 
-    def chain(self, wide: int, last: int) -> list[np.ndarray]:
-        """Weight, bias, weight, .. of up to 16 linear layers."""
-        rng, made = self.rng, list[np.ndarray]()
-        for out in [*(rng.choice((1, 2, 4)) for _ in range(rng.choices((0, 1, 2, 15), (9, 5, 2, 0.5))[0])), last]:
-            most = rng.choice((M, M, 9))
-            made += [symbols(rng, out, wide, most=most), symbols(rng, out, most=most)]
-            wide = out
-        return made
+    def chain(self, widths: Sequence[int]) -> list[np.ndarray]:
+        """Weight, bias, weight, .. from the input side."""
+        shapes = [shape for pair in itertools.pairwise(widths) for shape in (pair[::-1], pair[1:])]
+        return [symbols(self.rng, *shape, most=self.rng.choice((M, M, 9))) for shape in shapes]
 
     def slice(self, number: int, first: bool, known: list[Prior]) -> Layer:
         """One slice, which refers to the priors of those before."""
-        rng, tables = self.rng, Tables() if not first or (self.adds and number == 0) else self.plan.layer(number)
-        if self.bent and tables != Tables() and rng.random() < 0.5:
-            bend(rng, tables)
-        tables.rows = {} if self.base and number == 0 else tables.rows
+        rng, meta = self.rng, self.tables.layers[number] if first and (number or not self.adds) else {}
         if first:
-            whole = {GROUP} if isinstance(self.plan, Splats) else set()
-            steps = {i: 1.0 if i in whole else step(rng, (), M) for i in sorted(tables.rows)}
-            self.layer_table = [[i, tables.rows[i], own, rng.randrange(3)] for i, own in steps.items()]
+            own = () if self.base and number == 0 else meta.get(7, ())
+            self.layer_table = [[i, c, q if q == 1 else step(rng, (), M), rng.randrange(3)] for i, c, q, _ in own]
         cells = self.cells(rng.choices((0, 1, 2, 3, 5, 12, 40, 150), (4, 4, 4, 4, 4, 4, 1, 0.2))[0])
         lowest, high = rng.choice((3, 3, 200, 255)), rng.choice((0, 2, 255))
         graded = self.centres is not None
         classes, earlier = [near(rng, 0, 6) * graded for _ in cells], self.classes.tolist() if first else []
         rises = [near(rng, 0, min(high, 255 - int(code)) if number else 1) for code in self.codes] if first else []
         rises = [rise if code or number == 0 or rise > 2 else 0 for rise, code in zip(rises, self.codes, strict=False)]
-        rows, layer_rows = (
-            self.rows(classes, self.table, self.centres or []),
-            self.rows(earlier + classes, self.layer_table, []),
-        )
-        grids = self.grids(replace(tables, grids=dict(sorted(tables.grids.items()))))
-        chains = {i: self.chain(*ends) for i, ends in sorted(tables.chains.items())}
+        rows = self.rows(classes, self.table, self.centres or [])
+        layer_rows = self.rows(earlier + classes, self.layer_table, [])
+        grids, chains = self.grids(meta), {i: self.chain(own) for i, *own in meta.get(5, [0])[1:]}
         planes, weights = [plane for grid in grids for plane in grid.planes()], sum(chains.values(), [])
         self.symbols += len(rises) + (4 + graded) * len(cells)
         self.symbols += sum(map(np.size, (*rows, *layer_rows, *planes, *weights)))
+        fill = [near(rng, 0, 255) for _ in range(rng.choice((3, 4)))] if rng.random() < 0.2 else None
         layer = make_layer(
-            number,
-            cells,
-            rises=rises,
-            codes=[near(rng, lowest, 255) for _ in cells],
-            rows=np.concatenate(rows),
-            widths=[c for _, c, _, _ in self.table],
-            classes=classes if graded else None,
-            earlier=earlier,
-            layer_rows={row[0]: k for row, k in zip(self.layer_table, layer_rows, strict=True)},
-            grids=grids,
-            chains=chains,
-            fill=[near(rng, 0, 255) for _ in range(3)] if rng.random() < 0.2 else None,
-            steps=(step(rng, planes), step(rng, weights)),
-            choose=Chooser(rng, known, self.symbols + (1 << 18)),
-            base=self.base_rows if first else 0,
-            known=known,
-            first=first,
-        )
-        meta = {key: value for key, value in layer.meta.items() if key < 6}
-        extra = {6: tables.kind, 7: self.layer_table if first else None}
-        return replace(layer, meta=meta | {key: value for key, value in extra.items() if value})
+            number, cells, rises=rises, codes=[near(rng, lowest, 255) for _ in cells], rows=np.concatenate(rows),
+            widths=[c for _, c, _, _ in self.table], classes=classes if graded else None, earlier=earlier, fill=fill,
+            layer_rows={row[0]: k for row, k in zip(self.layer_table, layer_rows, strict=True)}, grids=grids,
+            chains=chains, steps=(step(rng, planes), step(rng, weights)), base=self.base_rows if first else 0,
+            choose=chooser(rng, known, self.symbols + (1 << 18)), known=known, first=first,
+        )  # fmt: skip
+        extra = {6: meta.get(6), 7: self.layer_table if first else None}
+        own = {key: value for key, value in layer.meta.items() if key < 6}
+        return replace(layer, meta=own | {key: value for key, value in extra.items() if value})
 
     def header(self, layers: Sequence[Layer]) -> dict[int, Any]:
         """The fields of a file of these slices."""
@@ -409,7 +318,7 @@ class Maker:
         for i, row in enumerate(self.table):  # centres and the rows before add to symbols; others may add rows
             most = M if self.centres is not None or row[3] or self.base else 1
             row[2] = step(rng, [x.rows[i] for x in layers], most)
-        header: dict[int, Any] = {2: self.mode, 3: self.plan.kind, 4: self.table, 5: self.centres}
+        header: dict[int, Any] = {2: self.mode, 3: self.tables.kind, 4: self.table, 5: self.centres}
         header[6] = step(rng, [x.cells for x in layers], V if self.base else 1)
         if rng.random() < 0.3:
             box = sorted(rng.choice((-LARGEST, -1.0, -0.0, 2.0**-149, LARGEST)) for _ in range(2))
@@ -425,16 +334,22 @@ def legal(rng: random.Random) -> tuple[File, File | None, bool]:
     """(a file of random layers, slices, tables and priors, its base if it has one, whether it is sure to make a scene).
     `File.hashes` says what it decodes to."""
     maker = Maker(rng, rng.random() < 0.25)
-    file = made(rng, maker)
-    if not maker.base:
-        return file, None, maker.scene
-    return made(rng, maker.over(), file), file, maker.scene
+    file, scene = made(rng, maker), maker.tables.scene
+    return (made(rng, maker.over(), file), file, scene) if maker.base else (file, None, scene)
+
+
+def _in_range(k: np.ndarray, classes: list[int], centre: int, predictor: int) -> bool:
+    """Whether these symbols lead to legal values."""
+    try:
+        return refdec.row_values(k.tolist(), classes, centre, predictor) is not None
+    except refdec.Fault:
+        return False
 
 
 def made(rng: random.Random, maker: Maker, base: File | None = None) -> File:
     """A file of a maker, whose base is another one."""
     layers = list[Layer]()
-    for number in sorted({0, *rng.sample((1, 2), rng.randrange(3))}):
+    for number in sorted(maker.tables.layers):
         known = list[Prior]()
         count = 1 if maker.mode == LZMA else rng.choice((1, 1, 2, 3, rng.choice((5, 12))))
         own = [maker.slice(number, not index, known) for index in range(count)]

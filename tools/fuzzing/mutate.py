@@ -9,18 +9,15 @@ from __future__ import annotations
 import copy
 import itertools
 import random
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import refdec
-from vectors.blocks import Chunk as Framed
-from vectors.blocks import File, pack, varint
+from vectors.blocks import varint
 
 from .legal import Seed, legal
+from .parts import Parts, put_together, take_apart
 
-CODES = 2  # key of the parameters of a slice: the length of its codes
 VARINT_MAX = (1 << 35) - 1
 _POWERS = (7, 8, 9, 12, 14, 15, 16, 20, 21, 22, 23, 24, 26, 28, 31, 32)
 #: Around every limit of the format and every width of an integer.
@@ -101,13 +98,11 @@ def _containers(value: Any) -> list[Any]:
 
 def _other_value(rng: random.Random, value: Any) -> Any:
     if rng.random() < 0.08:
-        return rng.choice((rng.choice(INTEGERS), rng.choice(REALS), True, "text", b"bytes", [], {}, [0] * 20))
+        return rng.choice((rng.choice(REALS), True, "text", b"bytes", [], {}, [0] * 20))
     if isinstance(value, float):
-        return rng.choice(REALS) if rng.random() < 0.7 else -value
-    if isinstance(value, int):
-        near = (value + 1, value - 1, 2 * value, -value, value ^ 1 << rng.randrange(12))
-        return rng.choice((rng.choice(INTEGERS), *near))
-    return rng.choice(INTEGERS)
+        return rng.choice((*REALS, -value))
+    near = (value + 1, value - 1, 2 * value, -value, value ^ 1 << rng.randrange(12)) if isinstance(value, int) else ()
+    return rng.choice((rng.choice(INTEGERS), *near))
 
 
 def change_value(rng: random.Random, tree: Any) -> None:
@@ -134,64 +129,10 @@ def change_value(rng: random.Random, tree: Any) -> None:
 # -- parts -------------------------------------------------------------------------------------------------------------
 
 
-@dataclass
-class Chunk:
-    """A chunk. meta: the parameters of a slice, without the length of its codes; None for other chunks, and for a slice
-    whose payload was changed as bytes."""
-
-    type: int
-    flags: int
-    payload: bytes
-    meta: dict[int, Any] | None = None
-    codes: bytes = b""
-    stream: bytes = b""
-
-    def packed(self) -> bytes:
-        """The payload, written anew if it was taken apart."""
-        if self.meta is None:
-            return self.payload
-        meta = pack(dict(sorted({**self.meta, CODES: len(self.codes)}.items())))
-        return b"".join([struct.pack("<I", len(meta)), meta, self.codes, self.stream])
-
-
-@dataclass
-class Parts:
-    """A file taken apart."""
-
-    header: dict[int, Any]
-    chunks: list[Chunk]
-
-
-def take_apart(data: bytes) -> Parts:
-    """The parts of a valid file, each a copy."""
-    (size,) = struct.unpack_from("<I", data, 12)
-    header, chunks, offset = refdec.unpack(data[20 : 20 + size]), list[Chunk](), 20 + size
-    while offset < len(data):
-        kind, flags, length = struct.unpack_from("<HHI", data, offset)
-        part = Chunk(kind, flags, data[offset + 16 : offset + 16 + length])
-        if kind < 3:
-            at = 4 + struct.unpack_from("<I", part.payload)[0]
-            part.meta = refdec.unpack(part.payload[4:at])
-            end = at + part.meta.pop(CODES)
-            part.codes, part.stream = part.payload[at:end], part.payload[end:]
-        chunks.append(part)
-        offset += 20 + length
-    return Parts(header, chunks)
-
-
-def put_together(parts: Parts, header: bytes | None = None) -> bytes:
-    """The file of `parts`, or with other bytes for a header, which may be none. ValueError if a value has no canonical
-    form."""
-    fields = {14: None} | {key: value for key, value in parts.header.items() if key != 1}
-    try:
-        return File(tuple(Framed(c.type, c.packed(), c.flags) for c in parts.chunks), fields, header).data()
-    except (struct.error, OverflowError, TypeError) as error:
-        raise ValueError("a value without a form") from error
-
-
 #: What `change_part` changes, and how often: bytes of codes or stream; codes, a stream or parameters from elsewhere; a
-#: value in the parameters; one in the header, half of the time in its kind or rows; bytes of a payload; chunks.
-PARTS = {"coded": 40, "swap": 8, "parameter": 22, "header": 14, "payload": 10, "chunks": 6}
+#: value in the parameters; one in the header, half of the time in its kind or rows; bytes of a payload; chunks; and in
+#: `change_parts` bytes of the header.
+PARTS = {"coded": 40, "swap": 8, "parameter": 22, "header": 14, "payload": 10, "chunks": 6, "header bytes": 8}
 
 
 def change_part(rng: random.Random, part: str, parts: Parts, other: Parts, names: list[str]) -> None:
@@ -209,7 +150,7 @@ def change_part(rng: random.Random, part: str, parts: Parts, other: Parts, names
         change_value(rng, rng.choice(tables) if tables and rng.random() < 0.5 else parts.header)
     elif part == "parameter":
         change_value(rng, rng.choice(own).meta)
-    else:
+    elif part != "header bytes":
         chunk, donor, size = rng.choice(own), rng.choice(donors or own), rng.randint(1, 200)
         name = rng.choice(("codes", "stream", "meta") if part == "swap" else ("codes", "codes", "codes", "stream"))
         value = copy.deepcopy(getattr(donor, name))
@@ -223,43 +164,36 @@ def change_part(rng: random.Random, part: str, parts: Parts, other: Parts, names
 
 def _change_chunks(rng: random.Random, parts: Parts, other: Parts) -> None:
     """Chunks are dropped, doubled, swapped, of another type, flagged, or from another file; then numbered, or not."""
-    i, j, act = rng.randrange(len(parts.chunks)), rng.randrange(len(parts.chunks)), rng.randrange(6)
-    if act == 0 and len(parts.chunks) > 1:
-        del parts.chunks[i]
+    chunks, act = parts.chunks, rng.randrange(6)
+    i, j = (rng.randrange(len(chunks)) for _ in range(2))
+    if act == 0 and len(chunks) > 1:
+        del chunks[i]
     elif act == 1:
-        parts.chunks.insert(i, copy.deepcopy(parts.chunks[j]))
+        chunks.insert(i, copy.deepcopy(rng.choice((chunks[j], *other.chunks))))
     elif act == 2:
-        parts.chunks[i], parts.chunks[j] = parts.chunks[j], parts.chunks[i]
+        chunks[i], chunks[j] = chunks[j], chunks[i]
     elif act == 3:
-        parts.chunks[i].type = rng.choice((0, 1, 2, 3, 99, 65535))
+        chunks[i].type = rng.choice((0, 1, 2, 3, 99, 65535))
     elif act == 4:
-        parts.chunks[i].flags ^= 1 << rng.choice((0, 1, 2, 6, 15))
-    else:
-        parts.chunks[i] = copy.deepcopy(rng.choice(other.chunks))
+        chunks[i].flags ^= 1 << rng.choice((0, 1, 2, 6, 15))
     if act != 4 and rng.random() < 0.7:  # else a changed order of slices hardly gets past the flags
-        for kind, run in itertools.groupby(parts.chunks, key=lambda chunk: chunk.type):
-            own = list(run)
+        for kind, own in ((kind, list(run)) for kind, run in itertools.groupby(chunks, key=lambda chunk: chunk.type)):
             for number, chunk in enumerate(own if kind < 3 else ()):
                 chunk.flags = number << 6 | 2 * (number + 1 < len(own))
 
 
 def change_parts(rng: random.Random, data: bytes, other: bytes, names: list[str]) -> bytes:
     """A file whose parts were changed, with lengths, chunk list, scene ids and CRCs right again."""
-    parts, donor = take_apart(data), take_apart(other)
+    parts, donor, header = take_apart(data), take_apart(other), None
     try:
         for part in rng.choices([*PARTS], [*PARTS.values()], k=rng.choice((1, 1, 1, 2))):
+            if part == "header bytes":  # msgpack in forms that nobody writes
+                size = int.from_bytes(data[12:16], "little")
+                header = change_bytes(rng, data[20 : 20 + size], other[20:200], names)[:4096]
             change_part(rng, part, parts, donor, names)
-        return put_together(parts)
+        return put_together(parts, header)
     except ValueError:  # a number that has no form
         return data
-
-
-def change_header_bytes(rng: random.Random, data: bytes, other: bytes, names: list[str]) -> bytes:
-    """The bytes of the header changed, ids and CRCs right again: msgpack in forms that nobody writes."""
-    (size,) = struct.unpack_from("<I", data, 12)
-    header = change_bytes(rng, data[20 : 20 + size], other[20:200], names)[:4096]
-    names.append("in the header")
-    return put_together(take_apart(data), header)
 
 
 def make_case(seeds: Sequence[Seed], run: int, index: int) -> Case:
@@ -272,8 +206,8 @@ def make_case(seeds: Sequence[Seed], run: int, index: int) -> Case:
     chosen, donor = rng.choice(seeds), rng.choice(seeds)
     names: list[str] = []
     act = rng.random()
-    change = change_header_bytes if act < 0.05 else change_parts if act < SEALED_SHARE else change_bytes
-    data, sealed = change(rng, chosen.data, donor.data, names), act < SEALED_SHARE
+    change, sealed = (change_parts, True) if act < SEALED_SHARE else (change_bytes, False)
+    data = change(rng, chosen.data, donor.data, names)
     base = chosen.base
     if base is not None and rng.random() < 0.3:
         under = [seed for seed in (donor, *seeds) if seed.base is not None]

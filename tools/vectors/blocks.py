@@ -1,7 +1,7 @@
 """Writes `.pd4` structures from explicit choices, right or wrong.
 
-This is written from the specification and shares no code with the package but the library that packs msgpack, so that
-a misreading of either is found.
+This is written from the specification. It shares frequency tables and Morton codes with the reference decoder, and with
+the package no code but the library that packs msgpack, so that a misreading of either is found.
 Nothing here searches, fits or rounds: the caller names every prior, predictor and field, or it follows from the symbols
 by a rule on integers, so the bytes are the same on every machine. Lengths, scene ids and CRCs are right unless the
 caller asks for others.
@@ -16,34 +16,21 @@ import struct
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cached_property
 from typing import Any
 
 import msgpack
 import numpy as np
+from refdec import PATTERNS, less_minimum, morton_code, norm_cdf, row_values, table_of
 
 from . import lzma2
 
 SIGNATURE, MAJOR = b"\x89PD4\r\n\x1a\n", 5
 ANS, LZMA = 0, 1
-TOTAL = 1 << 24  # of a frequency table
-PAIRS = {sides: [*itertools.combinations(range(sides), 2)] for sides in range(2, 6)}  # the axes of a grid's planes
-HEADER: dict[int, Any] = {
-    2: ANS,
-    6: 2.0**-7,
-    7: [-1.0, -2.0, -3.0, 1.0, 2.0, 3.0],
-    8: [0.5, 3.25],
-    9: [0.0, 0.5, 1.0],
-    10: [0.125, 64.0],
-    11: [0.0, -1.0, 0.0],
-    12: 1.5,
-}
-CAMERA: dict[int, Any] = {
-    1: [1.0, 0.0, 0.0, 0.25, 0.0, 0.0, -1.0, 0.5, 0.0, 1.0, 0.0, 4.0],
-    2: [500.0, 501.0, 320.0, 240.0],
-    3: 640,
-    4: 480,
-}
+HEADER: dict[int, Any] = {2: ANS, 6: 2.0**-7, 7: [-1.0, -2.0, -3.0, 1.0, 2.0, 3.0], 8: [0.5, 3.25],
+    9: [0.0, 0.5, 1.0], 10: [0.125, 64.0], 11: [0.0, -1.0, 0.0], 12: 1.5}  # fmt: skip
+CAMERA: dict[int, Any] = {1: [1.0, 0.0, 0.0, 0.25, 0.0, 0.0, -1.0, 0.5, 0.0, 1.0, 0.0, 4.0],
+    2: [500.0, 501.0, 320.0, 240.0], 3: 640, 4: 480}  # fmt: skip
 STEPS = (0.0625, 0.03125, 0.125)  # of the tensors of rows, in turn
 
 # -- primitives --------------------------------------------------------------------------------------------------------
@@ -87,9 +74,6 @@ def pattern(*shape: int, low: int = -3, high: int = 3, seed: int = 0) -> np.ndar
 
 # -- coded channels (clauses 7 and 8) ----------------------------------------------------------------------------------
 
-T = [round(2**27 * math.erf(i / (32 * math.sqrt(2)))) for i in (*range(257), 256)]
-M = [round(2 ** (31 - j / 64)) for j in range(64)]
-
 
 @dataclass(frozen=True)
 class Prior:
@@ -104,35 +88,23 @@ class Prior:
 
     @property
     def family(self) -> int:
-        """Clause 8.1."""
         return 0 if self.n == 1 else 1 if self.mixed is None else 2
 
     def parameters(self) -> bytes:
-        """Clause 8.2."""
         if self.n == 1:
             return zigzag(self.kmin)
         one = zigzag(self.kmin) + varint(self.n - 2) + zigzag(self.g) + varint(self.si + 640)
         return one + zigzag(self.mixed[1]) + varint(self.mixed[0] + 640) + bytes([self.mixed[2]]) if self.mixed else one
 
-    @cache  # noqa: B019  (few priors, each used often)
-    def cum(self, q: int) -> int:
-        """Clauses 7.3 and 7.4."""
-        if not 0 < q < self.n:
-            return TOTAL if q else 0
-        c = normal(q - 1, self.n, self.si, self.g)
+    @cached_property
+    def cum(self) -> list[int]:
+        """Clauses 7.2 to 7.4."""
+        middle = 128 * (self.n - 1)
+        cdf = norm_cdf(self.n, middle + self.g, self.si)
         if self.mixed:
             si, g, w = self.mixed
-            c = (256 - w) * c + w * normal(q - 1, self.n, si, g) >> 8
-        return (c * (TOTAL - 16 * self.n) >> 28) + 16 * q
-
-
-def normal(k: int, n: int, si: int, g: int) -> int:
-    """C(k) of clause 7.3."""
-    e, j = si >> 6, si & 63
-    down, t = max(0, e - 8), 256 * k + 128 - g - 128 * (n - 1)
-    z = min(min(abs(t) >> down, (1 << 21) - 1) * M[j] >> 23 + e - down, 1 << 19)
-    v = T[z >> 11] + ((T[(z >> 11) + 1] - T[z >> 11]) * (z & 2047) >> 11)
-    return (1 << 27) + (-v if t < 0 else v)
+            cdf = [(256 - w) * a + w * b >> 8 for a, b in zip(cdf, norm_cdf(self.n, middle + g, si), strict=True)]
+        return table_of(cdf)
 
 
 SMALL = Prior(-3, 7)
@@ -186,9 +158,8 @@ class Coder:
         """Clause 7.5, run backwards from state 0."""
         x, out = 0, list[int]()
         for entries, prior in reversed(self.parts):
-            spans = {s: (prior.cum(s), prior.cum(s + 1)) for s in set(entries)} if prior.n > 1 else {}
-            for s in reversed(entries if spans else []):
-                low, high = spans[s]
+            for s in reversed(entries if prior.n > 1 else []):
+                low, high = prior.cum[s : s + 2]
                 if x >= high - low << 40:
                     out.append(x & 0xFFFFFFFF)
                     x >>= 32
@@ -202,14 +173,9 @@ class Coder:
 # -- positions (clause 10) ---------------------------------------------------------------------------------------------
 
 
-def morton(cell: Sequence[int]) -> int:
-    """Clause 10.1: binary digits read as octal ones lie three bits apart."""
-    return sum(int(f"{v:b}", 8) << axis for axis, v in enumerate(cell))
-
-
 def morton_order(cells: np.ndarray) -> list[int]:
-    """The rows of int [n, 3] in Morton order."""
-    codes = [morton(cell) for cell in (cells.astype(np.int64) - cells.min(axis=0, initial=1 << 21)).tolist()]
+    """The rows of int [n, 3] in Morton order (clause 10.1)."""
+    codes = [*map(morton_code, less_minimum(cells.tolist()))]
     return sorted(range(len(codes)), key=codes.__getitem__)
 
 
@@ -217,19 +183,18 @@ def octree(cells: np.ndarray) -> tuple[bytes, list[np.ndarray]]:
     """Head and channels of int32 [n, 3] in Morton order."""
     low = cells.min(axis=0)
     depth = int((cells.astype(np.int64) - low).max()).bit_length()
-    codes = [morton(cell) for cell in (cells - low).tolist()]
-    patterns = {k: [byte for byte in range(256) if byte.bit_count() == k] for k in range(1, 9)}
-    out, channels = zigzag(*low.tolist()) + bytes([depth]), list[list[int]]()
-    indices = list[list[int]]()
+    codes = [morton_code(cell) for cell in (cells - low).tolist()]
+    channels, indices = list[list[int]](), list[list[int]]()
     for level in range(depth - 1, -1, -1):
         children = dict[int, list[int]]()
         for node in sorted({code >> 3 * level for code in codes}):
             children.setdefault(node >> 3, []).append(node & 7)
         if len(children) < len(codes):
             channels.append([len(own) - 1 for own in children.values()])
-        for k, alike in patterns.items():
+        for k, alike in enumerate(PATTERNS, 1):
             indices.append([alike.index(sum(1 << c for c in own)) for own in children.values() if len(own) == k])
-    return out, [np.array(channel, np.int64) for channel in channels + indices]
+    head = zigzag(*low.tolist()) + bytes([depth])
+    return head, [np.array(channel, np.int64) for channel in channels + indices]
 
 
 # -- grids (clauses 8.6, 8.7 and 11.3) ---------------------------------------------------------------------------------
@@ -246,20 +211,14 @@ class Grid:
     id: int = 0
 
     def row(self) -> list[Any]:
-        """As it stands in the parameters."""
         return [self.id, self.channels, list(self.sides), list(self.predictors or [0] * len(self.shapes()))]
 
     def shapes(self) -> list[tuple[int, int, int]]:
         """[C, H, W] of each plane."""
-        pairs = PAIRS.get(len(self.sides))
-        return (
-            [(self.channels, self.sides[j], self.sides[i]) for i, j in pairs]
-            if pairs
-            else [(self.channels, 1, self.sides[0])]
-        )
+        pairs = itertools.combinations(self.sides, 2) if len(self.sides) > 1 else [(self.sides[0], 1)]
+        return [(self.channels, h, w) for w, h in pairs]
 
-    def planes(self) -> list[np.ndarray]:
-        """Samples int32 [C, H, W]."""
+    def planes(self) -> list[np.ndarray]:  # [C, H, W] each
         return [self.fill(number, shape) for number, shape in enumerate(self.shapes())]
 
 
@@ -342,7 +301,6 @@ class Layer:
 
     @cached_property
     def residuals(self) -> list[np.ndarray]:
-        """int64, of the planes."""
         return [residual(p, k) for p, k in zip((p for g in self.grids for p in g.row()[3]), self.planes, strict=True)]
 
     def channels(self) -> dict[str, list[np.ndarray]]:
@@ -385,9 +343,8 @@ class Layer:
         """With its codes and its stream in mode lzma. base: of all channels; None takes the first symbol of each.
         width: log2 of the bytes of every number; None takes the narrowest. cells: others, int64."""
         codes, data = b"", b""
-        differences = np.diff(
-            self.cells.astype(np.int64) if cells is None else cells, axis=0, prepend=0 * self.cells[:1]
-        )
+        cells = self.cells.astype(np.int64) if cells is None else cells
+        differences = np.diff(cells, axis=0, prepend=0 * self.cells[:1])
         for channel in itertools.chain(differences.T, *self.channels().values()):
             k = channel.ravel().astype(np.int64)
             if k.size:
@@ -400,7 +357,6 @@ class Layer:
         return replace(self, pieces={"lzma": codes}, stream=stream(data) if data else b"")
 
     def parameters(self) -> dict[int, Any]:
-        """The parameters."""
         return dict(sorted({**self.meta, 2: sum(map(len, self.pieces.values()))}.items()))
 
     def payload(self, packed: bytes | None = None) -> bytes:
@@ -434,31 +390,13 @@ def ordered(cells: Any) -> list[list[int]]:
 
 
 def make_layer(
-    number: int = 0,
-    cells: Sequence[Sequence[int]] = ((-1, 0, 2),),
-    *,
-    before: int = 0,
-    below: int = 0,
-    rises: Sequence[int] | None = None,
-    codes: Sequence[int] | None = None,
-    rows: Any = None,
-    widths: Sequence[int] = (2, 6, 3),
-    classes: Sequence[int] | None = None,
-    earlier: Sequence[int] = (),
-    layer_rows: Mapping[int, np.ndarray] = {},  # noqa: B006  (never changed)
-    labels: Sequence[int] = (),
-    grids: Sequence[Grid] = (),
-    chains: Mapping[int, Any] | None = None,
-    kind: list[int] | None = None,
-    fill: list[int] | None = None,
-    steps: tuple[float, float] = (2.0**-4, 2.0**-7),
-    priors: Mapping[str, Mapping[int, Prior]] = {},  # noqa: B006  (never changed)
-    choose: Choice | None = None,
-    tree: tuple[bytes, list[np.ndarray]] | None = None,
-    base: int = 0,
-    known: list[Prior] | None = None,
-    first: bool = True,
-) -> Layer:
+    number: int = 0, cells: Sequence[Sequence[int]] = ((-1, 0, 2),), *, before: int = 0, below: int = 0,
+    rises: Any = None, codes: Any = None, rows: Any = None, widths: Sequence[int] = (2, 6, 3), classes: Any = None,
+    earlier: Any = (), layer_rows: Mapping[int, np.ndarray] = {}, labels: Sequence[int] = (),
+    grids: Sequence[Grid] = (), chains: Mapping[int, Any] | None = None, kind: Any = None, fill: Any = None,
+    steps: tuple[float, float] = (2.0**-4, 2.0**-7), priors: Mapping[str, Mapping[int, Prior]] = {},
+    choose: Choice | None = None, tree: Any = None, base: int = 0, known: list[Prior] | None = None, first: bool = True,
+) -> Layer:  # noqa: B006  # fmt: skip
     """A slice of `cells` (in Morton order) after `before` earlier rows. below: plane channels of the layers below.
 
     Defaults: every rise 0, every code 77, rows all 2; in layer 0 the networks of a scaffold without hidden layers,
@@ -475,16 +413,16 @@ def make_layer(
     for i, own in chains.items():
         made[i] = constant_chain(own, symbol) if isinstance(own, tuple) else own
         symbol += len(own) - 1
+    tables = [[i, len(k), *((1.0, 2) if i in labels else (2.0**-5, i % 2))] for i, k in layer_rows.items()]
     meta: dict[int, Any] = {
         1: n,
         3: fill,
         4: [steps[0], *(grid.row() for grid in grids)] if grids else None,
         5: [steps[1], *([i, own[0].shape[1], *map(len, own[1::2])] for i, own in made.items())] if made else None,
         6: [0] if number and grids and kind is None else kind,
-        7: [[i, len(k), *((1.0, 2) if i in labels else (2.0**-5, i % 2))] for i, k in layer_rows.items()]
-        if first and layer_rows
-        else None,
+        7: tables if first and tables else None,
     }
+    rows = np.full((sum(widths), n), 2, np.int32) if rows is None else np.asarray(rows)
     return Layer(
         number,
         np.array(cells, np.int32).reshape(-1, 3),
@@ -492,7 +430,7 @@ def make_layer(
         np.array([77] * n if codes is None else codes, np.int32),
         None if classes is None else np.array(classes, np.int32),
         np.array(earlier, np.int32),
-        np.split(np.full((sum(widths), n), 2, np.int32) if rows is None else np.asarray(rows), np.cumsum(widths)[:-1]),
+        np.split(rows, np.cumsum(widths)[:-1]),
         list(layer_rows.values()),
         grids,
         [array for own in made.values() for array in own],
@@ -556,14 +494,12 @@ class File:
     tail: bytes = b""
 
     def fields(self) -> dict[int, Any]:
-        """The header map."""
         chunk_list = [list(c.listed or (c.type, len(c.payload))) for c in self.chunks]
         payloads = b"".join(c.payload for c in self.chunks if not c.flags & 1)
         fields = {1: chunk_list, 14: hashlib.sha256(payloads).digest()[:16], **self.header}
         return {k: fields[k] for k in sorted(fields) if fields[k] is not None}
 
     def header_bytes(self) -> bytes:
-        """The header."""
         return pack(self.fields()) if self.packed is None else self.packed
 
     def start(self, index: int) -> int:
@@ -590,7 +526,6 @@ class File:
         return [self.scene_id, digest, rows, sum(map(len, parts))]
 
     def data(self) -> bytes:
-        """Its bytes."""
         header, scene_id = self.header_bytes(), self.scene_id
         declared = len(header) if self.declared is None else self.declared
         front = struct.pack("<8sHHI", self.signature, self.major, self.minor, declared)
@@ -648,19 +583,11 @@ def slices_of(*parts: Layer) -> File:
     return make_file(*[layer.written(known[layer.number]) for layer in parts])
 
 
-def row_values(k: np.ndarray, classes: Any, centres: Any, predictor: int, mend: bool = False) -> np.ndarray:
-    """int64 [C, n] of symbols (clause 11.2). mend: put 0 in the places of symbols that lead out of the range."""
-    last = np.repeat(np.array(centres, np.int64)[:, None], 7, axis=1)
-    v = np.zeros(k.shape, np.int64)
-    for row, c in enumerate(np.broadcast_to(classes, k.shape[1:]).tolist()):
-        c = 0 if predictor == 2 else c
-        v[:, row] = last[:, c] + (k[:, row].astype(np.int64) << c)
-        if mend:
-            k[abs(v[:, row]) > 1 << 23, row] = 0
-            v[:, row] = np.where(k[:, row], v[:, row], last[:, c])
-        if predictor:
-            last[:, c:] = v[:, row, None]
-    return v
+def _values(k: np.ndarray, classes: np.ndarray | None, centres: Sequence[int], predictor: int) -> np.ndarray:
+    """int64 [C, n] of symbols (clause 11.2)."""
+    own = [0] * k.shape[1] if classes is None else classes.tolist()
+    v = [row_values(channel, own, centre, predictor) for channel, centre in zip(k.tolist(), centres, strict=True)]
+    return np.array(v, np.int64).reshape(k.shape)
 
 
 def _hashes(slices: list[Layer], header: Mapping[int, Any]) -> dict[str, Any]:
@@ -670,14 +597,14 @@ def _hashes(slices: list[Layer], header: Mapping[int, Any]) -> dict[str, Any]:
     arrays = [(cells[order], header[6]), (first.rises, 0), (codes[order], 0)]
     if first.classes is not None:
         arrays.append((np.concatenate([x.classes for x in slices])[order], 0))
-    centres = np.array(header.get(5, [0] * sum(row[1] for row in header[4])))
+    centres = header.get(5, [0] * sum(row[1] for row in header[4]))
     for i, (_, width, step, predictor) in enumerate(header[4]):
         own, centres = centres[:width], centres[width:]
-        k = [row_values(x.rows[i], 0 if x.classes is None else x.classes, own, predictor) for x in slices]
+        k = [_values(x.rows[i], x.classes, own, predictor) for x in slices]
         arrays.append((np.concatenate(k, axis=1)[:, order], step))
     for i, (_, width, step, predictor) in enumerate(first.meta.get(7, ())):
-        classes = [0 if x.classes is None else np.append(x.earlier, x.classes) for x in slices]
-        k = [row_values(x.layer_rows[i], c, [0] * width, predictor) for x, c in zip(slices, classes, strict=True)]
+        classes = [None if x.classes is None else np.append(x.earlier, x.classes) for x in slices]
+        k = [_values(x.layer_rows[i], c, [0] * width, predictor) for x, c in zip(slices, classes, strict=True)]
         k[:1] = np.split(k[0], [before], axis=1)
         arrays.append((np.concatenate([k[0], np.concatenate(k[1:], axis=1)[:, order]], axis=1), step))
     tensors = [a.T if i else a for i, a in enumerate(a.astype(np.float64) * step for a, step in arrays if step)]

@@ -110,18 +110,9 @@ def _lines() -> Iterator[str]:
 def _vector(text: str, folder: str, base: File, clauses: str, error: str | None, names: dict[str, Any]) -> Any:
     text, _, what = text.partition("  # ")
     name, patches, *options = re.split(r" {2,}", text.strip())
-    target = scene = under = None
-    for option in options:
-        if option.startswith("!"):
-            error = option[1:]
-        elif option.startswith("~"):
-            scene = option[1:]
-        elif option.startswith("^"):
-            under = option[1:] + ".pd4"
-        elif option.startswith("@"):
-            target = option[1:]
-        else:
-            clauses = option
+    marks = {option[0]: option[1:] for option in options if option[0] in "!~^@"}
+    (clauses,) = [option for option in options if option[0] not in marks] or [clauses]
+    error, target = marks.get("!", error), marks.get("@")
     file, edits, place = base, list[Any](), None
     for patch in patches.split(" ; "):
         file, found = _patched(file, patch, edits, {**names, "base": base})
@@ -146,8 +137,8 @@ def _vector(text: str, folder: str, base: File, clauses: str, error: str | None,
         "clause": error and clauses.split()[0],
         "chunk": chunk if error else None,
         "offset": at if error else None,
-        "scene": scene,
-        "base": under,
+        "scene": marks.get("~"),
+        "base": marks["^"] + ".pd4" if "^" in marks else None,
         "ans_only": "UnsupportedFeature" if file.fields().get(2) == LZMA else "same",
         "slices": slices[: len(file.slices(count))] if len(slices) > len(set(slices)) else None,
     }
