@@ -372,7 +372,7 @@ def _summary(args: argparse.Namespace, trainer: Trainer) -> dict[str, Any]:
         "resume": None if trainer.finished else _resuming(args, trainer),
         "interrupted": trainer.interrupted,
         "seconds": round(trainer.seconds, 3),
-        "spent": {name: round(seconds, 3) for name, seconds in learner.spent.most_common()},
+        "spent": {name: round(seconds, 3) for name, seconds in learner.spent.items()},
         "phases_not_reached": learner.schedule.phases_not_reached(learner.position),
         "skipped": learner.skipped,
         "doubts": trainer.doubts(),

@@ -137,6 +137,16 @@ def backward(
     return result
 
 
+def compile_kernels(size: int = 16) -> None:
+    """Compiles the kernels of `draw` and of its gradients, or loads them from numba's cache: draws a Gaussian."""
+    means, quats, scales, colors = (np.ones((1, k), np.float32) for k in (3, 4, 3, 3))
+    viewmat, K = np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32)
+    geometry = Geometry(means, quats, scales, np.ones(1, np.float32))
+    projected = project(geometry, Camera(viewmat, K, size, size), 0.01)
+    drawn = composite(projected, colors, np.zeros(3, np.float32))
+    backward(projected, geometry, colors, *drawn, *drawn)
+
+
 def _pack_camera(camera: Camera) -> Array:
     """Packs float64 [20]: R, t, fx, fy, cx, cy and the limits of x/z, y/z in J (gsplat: 1.3 x the field of view)."""
     viewmat, K = (np.asarray(a, np.float64) for a in (camera.viewmat, camera.K))

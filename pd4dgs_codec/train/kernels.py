@@ -6,9 +6,11 @@ data. A second thread therefore trains a model of a few anchors first: compilers
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from subprocess import DEVNULL, Popen
 from threading import Event, Thread
 
 import numpy as np
@@ -16,9 +18,12 @@ import torch
 
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.model.config import PRESETS
+from pd4dgs_codec.threads import available
+from pd4dgs_codec.train import initialise
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.learner import Learner
 from pd4dgs_codec.train.schedule import Schedule
+from pd4dgs_codec.train.ssim import image_loss
 
 
 @contextmanager
@@ -38,16 +43,31 @@ def compiling(config: TrainConfig, device: str) -> Iterator[None]:
 
 
 def _compile(learner: Learner, ready: Event) -> None:
-    """Finds the gradients of one picture as in the first step, then as in the last, at the highest level."""
+    """Finds the gradients of one picture as in the first step, then as in the last, at the highest level. A process
+    compiles one kernel at a time, so another one, without torch, meanwhile compiles those of the rasteriser."""
     with suppress(Exception):  # the run compiles for itself, or has ended: it failed to read its data
+        words = [sys.executable, "-c", "from pd4dgs_codec.draw import rasteriser; rasteriser.compile_kernels()"]
+        beside = Popen(words, stderr=DEVNULL) if _fresh() and available() > 1 else None
+        view = learner.views[0]
+        image = view.image.requires_grad_()
+        terms = list(image_loss(image, view.image, view.weights))
+        terms += [x.sum() for x in vars(learner.model.gaussians(0, 0.0, view.view.camera)).values() if x.requires_grad]
+        torch.autograd.backward(torch.stack(terms).sum())
+        if beside:
+            beside.wait()
         for step, level in ((0, 0), (99, learner.model.level)):
             learner.iteration = step
             finish = learner.model_loss.begin(learner.model, level, learner.schedule, learner.position)
             _, _, loss = learner.picture_loss(0, level)
-            loss.backward()  # type: ignore[no-untyped-call]
+            torch.autograd.backward(loss)
             finish()
             ready.set()
     ready.set()
+
+
+def _fresh() -> bool:
+    """Whether numba had to compile the first kernel of this process: its cache is empty."""
+    return bool(initialise._nearest_squares.__wrapped__.stats.cache_misses)  # type: ignore[attr-defined]
 
 
 def _ball() -> Dataset:
