@@ -4,6 +4,7 @@ Outside `interruptible` a program has nothing to clean up, and a signal kills it
 KeyboardInterrupt in the main thread, as Ctrl-C does in any Python program.
 """
 
+import os
 import signal
 import sys
 import threading
@@ -95,6 +96,23 @@ def stop_request() -> Iterator[threading.Event]:
 
     with _handled(ENDING, received, lambda handler: handler is not signal.SIG_IGN):
         yield stop
+
+
+def follow_parent(clean: Callable[[], None]) -> None:
+    """Makes this process, which `multiprocessing` started, ignore Ctrl-C, which its parent handles, and end with its
+    parent, also if that is killed, after a call of `clean`."""
+    import multiprocessing  # only by commands that start processes
+
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def follow() -> None:
+        parent.join()
+        clean()
+        os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()
 
 
 @contextmanager

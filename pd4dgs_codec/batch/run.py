@@ -27,6 +27,7 @@ from typing import Any
 from pd4dgs_codec.batch.job import ALREADY, DONE, FAILED, Command, Job, Outcome, run_job
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.io import remove_temporaries
+from pd4dgs_codec.signals import follow_parent
 
 Work = Callable[[Job], Outcome]
 GRACE_SECONDS = 5.0  #: for a process to clean up before it is killed
@@ -188,20 +189,15 @@ class Local(Engine):
 
 
 def _follow_parent(folder: str) -> None:
-    """Makes a worker ignore Ctrl-C, which its parent handles, and end with its parent. If one of the two is killed, the
-    other removes `folder`, which holds the worker's temporary files."""
+    """Prepares a worker. If it or its parent is killed, the other removes `folder`, which holds the worker's temporary
+    files."""
     tempfile.tempdir = folder
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
 
-    def follow() -> None:
-        parent.join()
+    def clean() -> None:
         remove_temporaries()
         shutil.rmtree(folder, ignore_errors=True)
-        os._exit(1)
 
-    threading.Thread(target=follow, daemon=True).start()
+    follow_parent(clean)
 
 
 # -- Ray ---------------------------------------------------------------------------------------------------------------

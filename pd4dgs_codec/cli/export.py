@@ -210,7 +210,8 @@ def _write_sequence(args: argparse.Namespace, player: Drawer, eyes: Eyes | None)
     starts = frame_times(player.info, args.fps)
 
     def frames(step: Callable[[], None]) -> Iterator[tuple[float, Splats, np.ndarray]]:
-        part, number = None, -1
+        part: Drawer | None = None
+        number = -1
         for seconds in starts:
             t = min(seconds / (stop - start), 1.0) if stop > start else 0.0
             before, part = part, player.at(t)[0]

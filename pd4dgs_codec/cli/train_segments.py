@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import json
 import multiprocessing
-import signal
 import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -15,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.cli.common import TrainingProgress, number, say
 from pd4dgs_codec.errors import DataError, DecodeError, Pd4Error, TrainError
-from pd4dgs_codec.io import check_path, write_bytes
+from pd4dgs_codec.io import check_path, remove_temporaries, write_bytes
 from pd4dgs_codec.segments import INDEX, File, Index, Segment, file_of, parse
-from pd4dgs_codec.signals import stop_request
+from pd4dgs_codec.signals import follow_parent, stop_request
 from pd4dgs_codec.threads import available, configure
 
 if TYPE_CHECKING:
@@ -129,10 +128,12 @@ def train_folder(capture: Capture, output: str, overwrite: bool) -> dict[str, An
         index = _grown(folder, index, cuts)
         lacking = [k for k in range(len(ranges)) if _segment(folder, k, cuts, index.bases[0]) is None]
         before = len(ranges) - len(lacking)
+        if other := [name for name in map(name_of, lacking) if (folder / name).exists()]:
+            raise DataError(f"{folder / other[0]}: is of another base or other times; remove it to train it again")
         for _ in () if interrupted else _trained(capture, folder, lacking):
             trained += 1
             index = _grown(folder, index, cuts)
-    finished = before + trained == len(ranges)
+    finished = len(index.segments) == len(ranges)
     sizes = [sum(file.bytes for file in files) for files in (index.bases, index.segments)]
     return {
         "output": output,
@@ -230,8 +231,8 @@ def _trained(capture: Capture, folder: Path, lacking: list[int]) -> Iterator[int
 
 
 def _child(capture: Capture, k: int, folder: Path, threads: int) -> None:
-    """Trains a segment in a process of its own. Its parent handles Ctrl-C."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Trains a segment in a process of its own."""
+    follow_parent(remove_temporaries)
     configure(threads)
     try:
         train_one(capture, k, folder / name_of(k), folder / BASE, told=False)

@@ -88,7 +88,7 @@ class Sampled:
 
         def shows(t: float) -> np.ndarray:
             i = np.abs(self.times - t).argmin()
-            return bright[i] if windows is None else visible(windows, t) > 0.5
+            return np.asarray(bright[i] if windows is None else visible(windows, t) > 0.5)
 
         most = min(LOOKS, count)
         seen = np.where(other, most, np.sum([shows(t) for t in found], axis=0))

@@ -116,6 +116,9 @@ def test_another_training_is_not_continued_and_parts_are_trained_alone(cli, trai
     (alone / "00001.pt").unlink()  # the file of a segment is enough
     assert train(alone).json["kept"] == 1
     assert parts(alone) == before
+    (alone / "00001.pd4").write_bytes(parts(alone)[1][0])  # not taken for one that was trained, nor replaced
+    assert "00001.pd4: is of another base or other times" in train(alone).err
+    assert (alone / "00001.pd4").exists()
     stills = [json.loads(checkpoint.load(alone / name)[1]["config"])["still"] for name in ("base-0000.pt", "00000.pt")]
     assert stills == [True, False]
     assert train(alone, "--seed", 3, "--overwrite").json["kept"] == 0
