@@ -5,42 +5,31 @@ import { INDEX_SHIFT } from "./tables.js";
 
 const LOW = 0xffffff;
 
-/**
- * Decodes one stream, symbol by symbol.
- *
- * The state x < 2^64 is held as th·2^48 + tl·2^24 + q with th < 2^16 and tl, q < 2^24, so that every product with a
- * frequency, at most 2^24, is exact in binary64 and its lowest 24 bits follow from 32-bit products.
- */
+/** Decodes one stream, symbol by symbol. The state x < 2^64 is held as th·2^48 + tl·2^24 + q with th < 2^16 and tl,
+ * q < 2^24, so that every product with a frequency, at most 2^24, is exact in binary64 and its lowest 24 bits follow
+ * from 32-bit products. */
 export class AnsDecoder {
   /** @param {Uint8Array} bytes */
   constructor(bytes) {
     if (bytes.length % 4) throw malformed(`an ANS stream of ${bytes.length} bytes, expected a multiple of 4`);
-    const count = bytes.length / 4;
     const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
-    this._words = new Uint32Array(count);
-    for (let i = 0; i < count; i++) this._words[i] = view.getUint32(4 * i, true);
-    if (count && this._words[0] === 0) throw malformed("an ANS stream begins with a zero word");
-    const [first = 0, second] = this._words;
-    const both = second !== undefined; // the state is one word, or two if there are
-    this._at = Math.min(count, 2);
-    this._th = both ? first >>> 16 : 0;
-    this._tl = both ? ((first & 0xffff) << 8) | (second >>> 24) : first >>> 24;
-    this._q = (both ? second : first) & LOW;
+    this._words = new Uint32Array(bytes.length / 4);
+    for (let i = 0; i < this._words.length; i++) this._words[i] = view.getUint32(4 * i, true);
+    if (this._words[0] === 0) throw malformed("an ANS stream begins with a zero word");
+    this._at = Math.min(this._words.length, 2); // the state is one word, or two if there are
+    const [low = 0, high = 0] = this._words.slice(0, 2).reverse();
+    this._th = high >>> 16;
+    this._tl = ((high & 0xffff) << 8) | (low >>> 24);
+    this._q = low & LOW;
   }
 
   /** Writes the next symbols under a prior to out[start .. end - 1]. @param {import("./tables.js").Prior} prior
    * @param {Int32Array} out @param {number} start @param {number} end */
   symbols({ kmin, n, cum, index }, out, start, end) {
-    if (n === 1) {
-      out.fill(kmin, start, end); // a table of one symbol does not change the state
-      return;
-    }
+    if (n === 1) return void out.fill(kmin, start, end); // a table of one symbol does not change the state
     const words = this._words;
     const available = words.length;
-    let at = this._at;
-    let th = this._th;
-    let tl = this._tl;
-    let q = this._q;
+    let { _at: at, _th: th, _tl: tl, _q: q } = this;
     for (let i = start; i < end; i++) {
       const bucket = q >>> INDEX_SHIFT;
       let s = index[bucket];

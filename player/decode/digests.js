@@ -6,15 +6,16 @@ const CRC_TABLE = /* @__PURE__ */ Uint32Array.from({ length: 256 }, (_, c) => {
   return c;
 });
 
-/** CRC-32 of `bytes`, which follow bytes whose CRC-32 is `before`. @param {Uint8Array} bytes @param {number} [before] */
+/** CRC-32 of `bytes`, which follow bytes whose CRC-32 is `before`. @param {Uint8Array} bytes
+ * @param {number} [before] */
 export function crc32(bytes, before = 0) {
   let c = ~before;
   for (let i = 0; i < bytes.length; i++) c = (c >>> 8) ^ CRC_TABLE[(c ^ bytes[i]) & 255];
   return ~c >>> 0;
 }
 
-/** The first 32 bits of the fractional parts of a root of the first primes: SHA-256's constants, as binary64 has 52 bits
- * of each and none is near a whole number. @param {number} count @param {(n: number) => number} root */
+/** The first 32 bits of the fractional parts of a root of the first primes: SHA-256's constants, as binary64 has 49 bits
+ * of each or more and none is near a whole number. @param {number} count @param {(n: number) => number} root */
 function fractions(count, root) {
   const primes = [2];
   for (let n = 3; primes.length < count; n += 2) if (primes.every((prime) => n % prime)) primes.push(n);
@@ -72,7 +73,14 @@ function compress(state, bytes) {
       b = a;
       a = (t1 + t2) | 0;
     }
-    [a, b, c, d, e, f, g, h].forEach((word, i) => (state[i] += word));
+    state[0] += a;
+    state[1] += b;
+    state[2] += c;
+    state[3] += d;
+    state[4] += e;
+    state[5] += f;
+    state[6] += g;
+    state[7] += h;
   }
 }
 

@@ -1,7 +1,7 @@
 // Clause 15: the one kind of error that a decoder of `.pd4` files raises.
 
-/** The names of clause 15. @typedef {"BadSignature" | "UnsupportedVersion" | "Truncated" | "ChecksumMismatch" | "LimitExceeded"
- *   | "UnsupportedFeature" | "BaseMissing" | "BaseMismatch" | "Malformed"} ErrorKind */
+/** The names of clause 15. @typedef {"BadSignature" | "UnsupportedVersion" | "Truncated" | "ChecksumMismatch"
+ *   | "LimitExceeded" | "UnsupportedFeature" | "BaseMissing" | "BaseMismatch" | "Malformed"} ErrorKind */
 
 /**
  * Bytes that are not a valid `.pd4` file, or one that this decoder does not support.

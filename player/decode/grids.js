@@ -11,12 +11,8 @@ const CLASSES = 8;
 /** Relative magnitudes of residuals below this come from a table. */
 const LOOKED_UP = 256;
 
-/**
- * The samples of each plane of all grids.
- *
- * @param {ChannelReader} reader @param {Plane[]} shapes
- * @returns {Int32Array[]} [channels, height, width] each
- */
+/** The samples of each plane of all grids, [channels, height, width]. @param {ChannelReader} reader
+ * @param {Plane[]} shapes */
 export function decodePlanes(reader, shapes) {
   const planes = shapes.map(({ channels, height, width }) => new Int32Array(channels * height * width));
   const all = planes.map((plane, i) => channelsOf(plane, shapes[i].channels));
@@ -27,7 +23,7 @@ export function decodePlanes(reader, shapes) {
     shapes.forEach(({ channels, height, width }, i) => {
       const stage = all[i].slice(first, end);
       if (!stage.length) return;
-      const groups = first ? groupByActivity(sumOfNine(magnitudes[i], height, width)) : null;
+      const groups = first ? groupByActivity(sumOfThree(sumOfThree(magnitudes[i], width, 1), height, width)) : null;
       for (const channel of stage) reader.fill(channel, groups);
       if (end >= channels) return;
       if (!first) magnitudes[i] = new Float64Array(height * width);
@@ -43,23 +39,18 @@ export function decodePlanes(reader, shapes) {
 function addRelativeMagnitudes(residuals, sums) {
   const n = residuals.length;
   let total = 1;
-  let largest = 0;
-  for (let p = 0; p < n; p++) {
-    const e = Math.abs(residuals[p]);
-    total += e;
-    largest = Math.max(largest, e);
-  }
+  for (let p = 0; p < n; p++) total += Math.abs(residuals[p]);
   const factor = 256 * n;
-  if (largest * factor > Number.MAX_SAFE_INTEGER) {
-    for (let p = 0; p < n; p++) sums[p] += Number((BigInt(Math.abs(residuals[p])) * BigInt(factor)) / BigInt(total));
-    return;
-  }
-  // The quotient of two integers below 2^53, rounded to binary64, does not reach the next integer: the floor is exact.
-  const known = new Float64Array(Math.min(largest + 1, LOOKED_UP));
-  for (let e = 0; e < known.length; e++) known[e] = Math.floor((e * factor) / total);
+  /** The floor is exact: the quotient of two integers below 2^53, rounded to binary64, does not reach the next integer.
+   * @param {number} e */
+  const relative = (e) => {
+    if (e * factor <= Number.MAX_SAFE_INTEGER) return Math.floor((e * factor) / total);
+    return Number((BigInt(e) * BigInt(factor)) / BigInt(total));
+  };
+  const known = Float64Array.from({ length: LOOKED_UP }, (_, e) => relative(e));
   for (let p = 0; p < n; p++) {
     const e = Math.abs(residuals[p]);
-    sums[p] += e < LOOKED_UP ? known[e] : Math.floor((e * factor) / total);
+    sums[p] += e < LOOKED_UP ? known[e] : relative(e);
   }
 }
 
@@ -75,26 +66,20 @@ function groupByActivity(activity) {
   return groupByClass(classes, CLASSES);
 }
 
-/** Per cell the sum over the nine cells around it; beyond the border the border's cells count again.
- * @param {Float64Array} values @param {number} height @param {number} width */
-function sumOfNine(values, height, width) {
-  const rows = new Float64Array(values.length);
-  for (let i = 0, at = 0; i < height; i++) {
-    for (let j = 0; j < width; j++, at++) {
-      rows[at] = values[at] + values[j ? at - 1 : at] + values[j + 1 < width ? at + 1 : at];
-    }
-  }
+/** Per cell the sum of it and the cells beside it along an axis of `length` cells, `stride` apart; beyond the border
+ * the border's cells count again. @param {Float64Array} values @param {number} length @param {number} stride */
+function sumOfThree(values, length, stride) {
   const sums = new Float64Array(values.length);
-  for (let i = 0, at = 0; i < height; i++) {
-    const up = i ? width : 0;
-    const down = i + 1 < height ? width : 0;
-    for (let j = 0; j < width; j++, at++) sums[at] = rows[at] + rows[at - up] + rows[at + down];
+  for (let at = 0, i = 0; at < sums.length; i = (i + 1) % length) {
+    const back = i ? stride : 0;
+    const on = i + 1 < length ? stride : 0;
+    for (const end = at + stride; at < end; at++) sums[at] = values[at] + values[at - back] + values[at + on];
   }
   return sums;
 }
 
-/** 11.3, in place: residuals of a channel become samples. Each is checked before others are predicted from it, so that a
- * sum stays small. @param {Int32Array} samples @param {Plane} shape */
+/** 11.3, in place: residuals of a channel become samples. Each is checked before others are predicted from it, so that
+ * a sum stays small. @param {Int32Array} samples @param {Plane} shape */
 function restore(samples, { width, predictor }) {
   check(samples[0]);
   // both predictors give W in row 0 and N in column 0
@@ -113,7 +98,7 @@ function restore(samples, { width, predictor }) {
   }
 }
 
-/** The median of three numbers below 2^30 in magnitude, without branches, which a processor would mispredict.
+/** Of three numbers below 2^30 in magnitude, without branches, which a processor would mispredict.
  * @param {number} a @param {number} b @param {number} c */
 function median(a, b, c) {
   let step = (a - b) & ((a - b) >> 31);
