@@ -25,11 +25,8 @@ export class ByteReader {
     return this.bytes[this.offset++];
   }
 
-  /**
-   * A varint of at most `limit`: LimitExceeded above it, Malformed if it is cut, over five bytes or not the shortest.
-   *
-   * @param {number} limit @param {string} what
-   */
+  /** A varint of at most `limit`: LimitExceeded above it, Malformed if it is cut, over five bytes or not the shortest.
+   * @param {number} limit @param {string} what */
   varint(limit, what) {
     let value = 0;
     let scale = 1;

@@ -22,12 +22,9 @@ const NUMBER_SHIFT = 6;
 /** @param {Uint8Array} bytes */
 const viewOf = (bytes) => new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
 
-/**
- * The header's bytes out of a file's first bytes; what follows them is not looked at.
- *
+/** The header's bytes out of a file's first bytes; what follows them is not looked at.
  * @param {Uint8Array} bytes
- * @returns {Uint8Array}
- */
+ * @returns {Uint8Array} */
 export function readPreamble(bytes) {
   const begin = bytes.subarray(0, SIGNATURE.length);
   if (begin.some((byte, i) => byte !== SIGNATURE[i])) {
@@ -50,12 +47,9 @@ export function readPreamble(bytes) {
   return header;
 }
 
-/**
- * The chunk that `bytes` begin with; what follows is not looked at.
- *
+/** The chunk that `bytes` begin with; what follows is not looked at.
  * @param {Uint8Array} bytes @param {ListedChunk} listed as the header says @param {string} sceneId that of the file
- * @returns more: whether the layer has further slices; number: of the slice (3.6); payload: not copied
- */
+ * @returns more: whether the layer has further slices; number: of the slice (3.6); payload: not copied */
 export function readChunk(bytes, listed, sceneId) {
   need(bytes, CHUNK_HEAD, "a chunk's head");
   const view = viewOf(bytes);

@@ -13,13 +13,10 @@ export class FetchError extends Error {
   }
 }
 
-/**
- * Limits of a download: highest layer, bytes from the first of the file, seconds from the first slice's arrival or a
+/** Limits of a download: highest layer, bytes from the first of the file, seconds from the first slice's arrival or a
  * later call. The first slice is fetched if it ends within `bytes`, a later one only if it would also arrive in time at
  * the connection's rate so far.
- *
- * @typedef {{maxLayer?: number, bytes?: number, seconds?: number}} Budget
- */
+ * @typedef {{maxLayer?: number, bytes?: number, seconds?: number}} Budget */
 
 /**
  * @typedef {object} SourceOptions
@@ -178,13 +175,10 @@ export class SceneSource {
     return late ? null : next.end;
   }
 
-  /**
-   * Feeds the decoder up to byte `end`, before which it completes nothing: the scenes that it makes. Ends earlier,
+  /** Feeds the decoder up to byte `end`, before which it completes nothing: the scenes that it makes. Ends earlier,
    * without any, where the response is of no use, or the server has no more. Raises Cut or FetchError.
-   *
    * @param {number} end @param {number} until seconds
-   * @returns {Promise<Scene[]>}
-   */
+   * @returns {Promise<Scene[]>} */
   async _load(end, until) {
     if (!this._body && !this._ended) await this._request(until);
     while (this._body && this.received < end) {
@@ -235,13 +229,10 @@ export class SceneSource {
     }
   }
 
-  /**
-   * Waits for the connection. One timer serves all of it, since one for each wait would take longer than a small piece
+  /** Waits for the connection. One timer serves all of it, since one for each wait would take longer than a small piece
    * does; waits that follow lapse no earlier.
-   *
    * @template T @param {() => Promise<T>} start @param {number} until @param {string} lost says that it is gone
-   * @returns {Promise<T>}
-   */
+   * @returns {Promise<T>} */
   _wait(start, until, lost) {
     return new Promise((resolve, reject) => {
       this._controller?.signal.throwIfAborted();
@@ -284,12 +275,9 @@ export class SceneSource {
     else this._body = { reader: (response.body ?? new Blob().stream()).getReader(), skip, rest: NOTHING };
   }
 
-  /**
-   * Checks a response; restarts if the file has changed. What does not say so is taken: slices have checksums. Returns
+  /** Checks a response; restarts if the file has changed. What does not say so is taken: slices have checksums. Returns
    * how many of its bytes are here already, null if it is of no use.
-   *
-   * @param {Response} response @param {boolean} resumes whether a range was requested
-   */
+   * @param {Response} response @param {boolean} resumes whether a range was requested */
   _accept({ status, statusText, headers }, resumes) {
     const beyond = status === 416 && resumes; // there is no such byte
     if (status !== 200 && status !== 206 && !beyond) {

@@ -47,7 +47,8 @@ function addRelativeMagnitudes(residuals, sums) {
     if (e * factor <= Number.MAX_SAFE_INTEGER) return Math.floor((e * factor) / total);
     return Number((BigInt(e) * BigInt(factor)) / BigInt(total));
   };
-  const known = Float64Array.from({ length: LOOKED_UP }, (_, e) => relative(e));
+  const known = new Float64Array(LOOKED_UP);
+  for (let e = 0; e < LOOKED_UP; e++) known[e] = relative(e);
   for (let p = 0; p < n; p++) {
     const e = Math.abs(residuals[p]);
     sums[p] += e < LOOKED_UP ? known[e] : relative(e);

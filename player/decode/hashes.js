@@ -22,13 +22,10 @@ function digest(arrays) {
   return hex(sha256(bytes));
 }
 
-/**
- * Per layer the SHA-256 of its integers and of its float32 values, of a complete file, of its layers up to maxLayer,
+/** Per layer the SHA-256 of its integers and of its float32 values, of a complete file, of its layers up to maxLayer,
  * or, if allowPartial, of the slices that a cut file has. Raises as `decodeTensors` does.
- *
  * @param {Uint8Array} bytes @param {import("./index.js").Options} [options]
- * @returns {LayerHashes[]}
- */
+ * @returns {LayerHashes[]} */
 export function hashes(bytes, options = {}) {
   /** @type {Slice[]} */
   const slices = [];

@@ -44,14 +44,11 @@ const HEADER = map([1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15], {
   base: optional(BASE, null),
 });
 
-/**
- * width: W, the channels of all tensors of rows. centres: of these channels; null if anchors have no step classes.
+/** width: W, the channels of all tensors of rows. centres: of these channels; null if anchors have no step classes.
  * identity: SHA-256 of the `described` bytes behind the chunk list; it begins with the scene id (3.3), in hexadecimal.
  * base: null where the file holds its scene whole.
- *
  * @typedef {Pick<ReturnType<typeof HEADER>, "chunks" | "kind" | "rows" | "centres" | "base"> & {width: number,
- *   info: Info, identity: Uint8Array, described: number, sceneId: string}} Header
- */
+ * info: Info, identity: Uint8Array, described: number, sceneId: string}} Header */
 /** @typedef {Made<typeof CHUNK>} ListedChunk */
 
 /** @param {Uint8Array} packed @returns {Header} */

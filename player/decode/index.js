@@ -25,7 +25,7 @@ export { Stream } from "./stream.js";
 /** @typedef {import("./tensors.js").Plane} Plane */
 /** @typedef {import("./errors.js").ErrorKind} ErrorKind */
 
-/** maxLayer: bytes behind the layers up to it are not looked at. allowPartial: a cut file, which raises Truncated, yields
+/** maxLayer: bytes behind the layers up to it are not looked at. allowPartial: a cut file (else Truncated) gives
  * its longest prefix of complete slices, at least one, or its base alone. base: of a file that names one (clause 5.6),
  * the bytes, or a Base of them, which decodes it once for many files.
  * @typedef {{maxLayer?: number | null, allowPartial?: boolean, base?: GivenBase}} Options */

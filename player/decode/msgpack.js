@@ -10,11 +10,8 @@ export class Real {
   }
 }
 
-/**
- * An integer is a number. Beyond ±2^53 it is rounded, which is above every limit.
- *
- * @typedef {number | boolean | string | Real | Uint8Array | Value[] | Map<number, any>} Value
- */
+/** An integer is a number. Beyond ±2^53 it is rounded, which is above every limit.
+ * @typedef {number | boolean | string | Real | Uint8Array | Value[] | Map<number, any>} Value */
 
 const UTF8 = /* @__PURE__ */ new TextDecoder("utf-8", { fatal: true, ignoreBOM: true });
 

@@ -269,13 +269,10 @@ export class TensorReader {
     layer.sorted = true;
   }
 
-  /**
-   * The tensors of the slices read so far, at least one, or of the base. Arrays of rows are views of those of later
+  /** The tensors of the slices read so far, at least one, or of the base. Arrays of rows are views of those of later
    * tensors, which leave these rows as they are; those of a layer that is not whole stand as they came, unless `sort`
    * was called.
-   *
-   * @returns {Tensors}
-   */
+   * @returns {Tensors} */
   tensors() {
     if (!this.header || !this.layers.length) throw new TypeError("no layer has been read");
     const layers = this.layers.map(({ layer, codes, fill, spread, grids, chains, kind, rowTensors, rows }) => {

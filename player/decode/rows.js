@@ -11,14 +11,11 @@ import { MAX_SYMBOL } from "./limits.js";
 const WHOLE = 2;
 export const STEP_CLASSES = 7;
 
-/**
- * The values in steps of tensors of rows, [channels, count] of all tensors one behind the other.
- *
+/** The values in steps of tensors of rows, [channels, count] of all tensors one behind the other.
  * @param {ChannelReader} reader @param {RowTensor[]} tensors @param {number} count of rows
  * @param {Int32Array | Uint8Array | null} classes [count] step classes, null if rows have none
  * @param {number[] | null} centres of the channels, null if they are 0
- * @param {number} [base] rows of a base, the first ones, which are channels of their own
- */
+ * @param {number} [base] rows of a base, the first ones, which are channels of their own */
 export function decodeRows(reader, tensors, count, classes, centres, base = 0) {
   const values = new Int32Array(widthOf(tensors) * count);
   const parts = base ? new Uint8Array(count).fill(STEP_CLASSES, base) : classes;

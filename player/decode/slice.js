@@ -71,13 +71,10 @@ const PARAMETERS = map([1, 2, 3, 4, 5, 6, 7], {
   layerRows: optional(rows, []),
 });
 
-/**
- * The parameters of a slice's payload, with all counts held against the limits and the payload, and what follows them.
+/** The parameters of a slice's payload, with all counts held against the limits and the payload, and what follows them.
  * rises: one for each row of the layers before, in a later slice none. layerRows: those of the layer, with a row for
  * each rise and each own row. declared: by the slices so far, this one included.
- *
- * @param {Uint8Array} payload @param {number} layer @param {Header} header @param {Before} before
- */
+ * @param {Uint8Array} payload @param {number} layer @param {Header} header @param {Before} before */
 function readParameters(payload, layer, { width, centres, base }, { declared: before, layer: known }) {
   const where = `layer ${layer}`;
   if (payload.length < 4) throw malformed(`${where}: a payload of ${payload.length} bytes, expected at least 4`);
@@ -158,7 +155,8 @@ export function decodeSlice(payload, layer, header, before) {
   const layerRows = decodeRows(reader, rowTensors, earlier + n, classes, null, base);
   const planes = decodePlanes(reader, parameters.planes);
   const weights = parameters.linears.flatMap(({ inputs, outputs }) => {
-    return [inputs * outputs, outputs].map((size) => reader.read(size, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of a chain"));
+    const sizes = [inputs * outputs, outputs];
+    return sizes.map((size) => reader.read(size, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of a chain"));
   });
   reader.finish();
   parameters.planes.forEach((plane, i) => (plane.data = dequantise(planes[i], grids.step)));
