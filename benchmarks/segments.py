@@ -4,13 +4,15 @@
 the same way twice, and imports it in three ways at the same dB. It measures bytes, dB inside segments and at their
 seams, and how far pictures half a frame before and after differ there. `--long 10` imports it as segments, and a
 sequence ten times as long, and measures bytes, what a client fetches for a seek, and memory: that of the import, and of
-a page that plays.
+a page that plays. `--visit DIR` plays a package of segments, and seeks in it over a link of 2 Mbps.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -19,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from browser import ELEMENT, launched, until
+from browser import ELEMENT, call, launched, until
 from common import Row, command, say, table
 
 from pd4dgs_codec import decode
@@ -34,7 +36,7 @@ from pd4dgs_codec.scene import Camera
 from pd4dgs_codec.segments import INDEX, read_index
 from pd4dgs_codec.web.page import page
 from pd4dgs_codec.web.segments import SegmentsClient
-from pd4dgs_codec.web.server import Server
+from pd4dgs_codec.web.server import Link, Server
 
 FPS, DB = 12, 40
 CAMERAS, SIZE = 36, 240  #: that an import decides by, fewer and smaller than usual
@@ -196,13 +198,108 @@ def played(url: str, seconds: int) -> Row:
         return {"heap early": early, "heap at the end": shown.evaluate(heap), "parts": most}
 
 
+#: Seconds from a seek until what shows its time has been drawn.
+SEEK = """async (seconds) => {
+  const { player } = document.querySelector("pd4-player");
+  const started = performance.now();
+  player.seek(seconds);
+  while (player.awaited || player._front?.scene !== player.scene || player._dirty || player._drawing) {
+    await new Promise((resolve) => setTimeout(resolve, 5));
+  }
+  return (performance.now() - started) / 1000;
+}"""
+
+
+def memory_of_browser() -> float:
+    """Memory of all processes that this one started and theirs, shared pages by share, MB."""
+    parents = {}
+    for status in Path("/proc").glob("[0-9]*/status"):
+        with contextlib.suppress(OSError):
+            fields = dict(line.split(":", 1) for line in status.read_text().splitlines())
+            parents[int(fields["Pid"])] = int(fields["PPid"])
+    own, total = {os.getpid()}, 0.0
+    while more := {pid for pid, parent in parents.items() if parent in own} - own:
+        own |= more
+    for pid in own - {os.getpid()}:
+        with contextlib.suppress(OSError):
+            total += int(re.findall(r"^Pss: *([0-9]+)", Path(f"/proc/{pid}/smaps_rollup").read_text(), re.M)[0]) / 1e3
+    return total
+
+
+def endured(folder: Path) -> None:
+    """Plays a package of segments to its end; prints the memory on the way."""
+    _, index = read_index(folder)
+    low, high = index.time_range
+    heap = "(gc(), performance.memory.usedJSHeapSize / 1e6)"
+    with Server(folder) as server, server.running(), launched() as browser:
+        shown = browser.new_page(viewport={"width": 320, "height": 240})
+        shown.goto(f"{server.url}?loop=0&autoplay=0&speed={SPEED}")
+        until(shown, f"{ELEMENT}?.player?.scene?.layers.length > 1")
+        shown.evaluate(f"{ELEMENT}.play()")
+        rows, most = list[list[object]](), 0
+        for tenth in range(1, 11):
+            while shown.evaluate(f"{ELEMENT}.time < {low + tenth * (high - low) / 10} && !{ELEMENT}.paused"):
+                most = max(most, shown.evaluate(f"{ELEMENT}.player._parts.size"))
+                shown.wait_for_timeout(200)
+            rows.append([f"{shown.evaluate(f'{ELEMENT}.time'):.0f}", f"{shown.evaluate(heap):.1f}"])
+            rows[-1] += [f"{memory_of_browser():.0f}", shown.evaluate(f"{ELEMENT}.player.counts.drawn")]
+            say(str(rows[-1]))
+        print(table(["seconds", "heap MB", "browser MB", "pictures"], rows), f"\n\nparts held: {most} at most\n")
+
+
+def sought(folder: Path, out: Path, seeks: int = 12) -> None:
+    """Seeks in a package of segments over a slow link, then takes segments away; prints what it finds, and writes
+    screenshots to `out`."""
+    out.mkdir(parents=True, exist_ok=True)
+    _, index = read_index(folder)
+    low, high = index.time_range
+    rate, rng, rows = 2e6, np.random.default_rng(0), []
+    with Server(folder, link=Link(rate)) as server, server.running(), launched() as browser:
+        shown = browser.new_page(viewport={"width": 320, "height": 240})
+        shown.goto(f"{server.url}?loop=0&autoplay=0")
+        until(shown, f"{ELEMENT}?.player?.scene?.layers.length > 1 && {ELEMENT}.player._isSettled()")
+        for seconds in rng.uniform(low, high, seeks):
+            files = [s for s in index.segments if s.time_range[0] <= seconds < s.time_range[1]]
+            missing = sum(file.bytes for file in files)
+            took = call(shown, SEEK, seconds)
+            rows.append([f"{seconds:.1f}", len(files), missing, f"{took:.2f}", f"{8 * missing / rate + 0.4:.2f}"])
+        print(table(["seek to s", "segments", "bytes missing", "drawn after s", "8 bytes/B + 0.4"], rows), "\n")
+        shown.screenshot(path=out / "there.png")
+        faults: dict[str, Callable[[Any], None]] = {
+            "missing": lambda route: route.fulfill(status=404),
+            "damaged": lambda route: route.fulfill(body=bytes(index.segments[2 * seeks].bytes)),
+            "late": lambda route: None,
+        }
+        places = dict(zip(faults, (seeks, 2 * seeks, 3 * seeks), strict=True))
+        for name, k in places.items():
+            shown.route(f"**/{index.segments[k].file}", faults[name])
+        for name, k in places.items():
+            start, end = index.segments[k].time_range
+            shown.evaluate(f"{ELEMENT}.seek({(start + end) / 2})")
+            shown.wait_for_timeout(3000)
+            words = [
+                shown.evaluate(f"{ELEMENT}.shadowRoot.querySelector('{c}').textContent") for c in (".error", ".status")
+            ]
+            print(f"{name}: {words}")
+            shown.screenshot(path=out / f"{name}.png")
+        shown.evaluate(f"{ELEMENT}.play()")  # past it
+        after = index.segments[3 * seeks + 2].time_range[0]
+        until(shown, f"{ELEMENT}.time > {after} && {ELEMENT}.player.scene.layers.length > 1")
+        print(f"it goes on after it: {shown.evaluate(f'{ELEMENT}.player.problem')!r}")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", default="out/segments", help="folder for frames and files")
     parser.add_argument("--seconds", type=int, default=6)
     parser.add_argument("--length", type=int, default=1, help="seconds of a segment")
     parser.add_argument("--long", type=int, default=0, metavar="N", help="measure N times the length instead, and once")
+    parser.add_argument("--visit", type=Path, metavar="DIR", help="visit this package of segments instead")
     args = parser.parse_args()
+    if args.visit:
+        endured(args.visit)
+        sought(args.visit, Path(args.output))
+        return
     imported.CAMERAS, imported.SIZE = CAMERAS, SIZE
     out = Path(args.output)
     if args.long:

@@ -119,7 +119,8 @@ export class Segments {
       this._have.add(k);
     } catch (error) {
       signal.throwIfAborted();
-      this._told({ part: k, problem: /** @type {Error} */ (error).message });
+      const { message } = /** @type {Error} */ (error);
+      this._told({ part: k, problem: message.includes(file) ? message : `${file}: ${message}` });
     }
   }
 
