@@ -91,15 +91,13 @@ def fitted(model: Model, found: Sequence[Measured], share: float, whitens: bool)
     """(uint8 [N], step classes whose quantisation adds at most `share` to the squared error of the views at any of the
     levels in `found`, beyond that of class 0, if `share` is not 0; float64 [D, D], the features' transform, if it
     `whitens`). Both on the CPU."""
-    classes, transform, spacing = None, None, model.spacing
-    if share:
-        classes = _classes(model, found, share, None)
-        spacing = torch.exp2(classes.float()).to(spacing)
-    if whitens:
-        transform = _transform(model, found, spacing)
-        if share and transform is not None:  # the features' steps change
-            classes = _classes(model, found, share, torch.linalg.inv(transform))
-    return (None if part is None else part.cpu() for part in (classes, transform))  # type: ignore[return-value]
+    classes = _classes(model, found, share) if share else None
+    if not whitens:
+        return classes, None
+    transform = _transform(model, found, model.spacing if classes is None else torch.exp2(classes.float()))
+    if classes is not None and transform is not None:  # the features' steps change
+        classes = _classes(model, found, share, torch.linalg.inv(transform))
+    return classes, transform
 
 
 # -- step classes ------------------------------------------------------------------------------------------------------
@@ -112,14 +110,12 @@ def rounding_errors(model: Model, level: Measured, back: Tensor | None = None) -
     return level.others + feature.double().square().sum((0, 2)) * (model.steps.feature**2 / 12)
 
 
-def _classes(model: Model, found: Sequence[Measured], share: float, back: Tensor | None) -> Tensor:
+def _classes(model: Model, found: Sequence[Measured], share: float, back: Tensor | None = None) -> Tensor:
     """uint8 [N]; frozen anchors keep theirs. A level of large error must not set the budget of the others."""
     met = torch.stack([level.met for level in found]).any(0)
     worst = torch.stack([rounding_errors(model, level, back) / level.error for level in found]).amax(0)
-    classes = model.step_class.clone()
-    own = slice(model.frozen, None)
-    classes[own] = classes_within(torch.where(met, worst, torch.inf)[own].cpu(), share).to(classes.device)
-    return classes
+    own = torch.where(met, worst, torch.inf)[model.frozen :].cpu()
+    return torch.cat([model.step_class[: model.frozen].cpu(), classes_within(own, share)])
 
 
 def grade(model: Model, classes: Tensor) -> list[int]:
@@ -169,13 +165,14 @@ def centre(model: Model) -> Tensor:
 def _transform(model: Model, found: Sequence[Measured], spacing: Tensor) -> Tensor | None:
     """float64 [D, D]: the transform for the model, with anchors whose steps are `spacing` [N] times those of class 0;
     None if no picture depends on a feature."""
+    spacing = spacing.to(model.feature)
     slopes = [(level.feature * spacing[:, None]).double().flatten(0, 1) / level.error**0.5 for level in found]
     errors = torch.stack([slope.T @ slope for slope in slopes]).sum(0)
     active = model.masks(2).detach() > MASK_THRESHOLD
     if not errors.trace() > 0 or int(active.sum()) < 2:
         return None
     scaled = model.feature.detach()[active].double() / spacing[active, None]
-    return whitening_transform(errors, torch.cov(scaled.T))
+    return whitening_transform(errors, torch.cov(scaled.T)).cpu()
 
 
 @torch.no_grad()
