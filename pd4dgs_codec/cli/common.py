@@ -295,7 +295,7 @@ def read_dataset(source: str, args: argparse.Namespace, info: SceneInfo) -> Data
 
     place = next((p for p in (Path(args.input), Path(args.input).parent) if is_folder(p)), None)
     reading = place and read_index(place)[1].made.get("reading")  # of its training
-    fps = reading.get("fps") if isinstance(reading, dict) else None
+    fps: Any = reading.get("fps") if isinstance(reading, dict) else None
     fps = fps if type(fps) in (int, float) and 0.01 <= fps <= 1000 else None  # as --fps of the training
     dataset = load_source(source, downscale=args.downscale, holdout=args.holdout, background=info.background, fps=fps)
     for remark in dataset.origin.notes:

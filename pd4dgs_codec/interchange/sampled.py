@@ -38,6 +38,7 @@ MOVES = 0.02  #: Gaussians are static if they move by less than this share of th
 
 #: Pictures that show a Gaussian before it counts as one that no view needs, and how many are added for that, at most.
 LOOKS, MOST_LOOKS = 4, 1024
+LATE = 0.9  #: half widths after its centre at which a window is looked at: it is still open
 
 Step = Callable[[], None]
 
@@ -82,9 +83,10 @@ class Sampled:
         peak = self.opacities.max(axis=0)
         bright = self.opacities >= np.maximum(peak / 2, SEEN)
         end, other = self.times[last - bright[::-1].argmax(axis=0)], peak < SEEN
-        if windows is not None:  # half of a bell and more
-            start, end = (windows[:, 0] + sign * (windows[:, 1] + windows[:, 2]) for sign in (-1, 1))
-            end, other = np.clip(end, 0, 1), other | (start > 1) | (end < 0)
+        if windows is not None:
+            center, half, softness = windows.T
+            other |= (center - half - softness > 1) | (center + half + softness < 0)
+            end = np.clip(center + LATE * half, 0, 1)
 
         def shows(t: float) -> np.ndarray:
             i = np.abs(self.times - t).argmin()
@@ -175,8 +177,8 @@ def _by_error(read: Callable[[float], Splats], where: str, step: Step) -> tuple[
             step()
         return found[t]
 
-    inner = np.arange(1, FIRST - 1)
-    inner = inner + (inner * GOLDEN % 1 - 0.5) / 2  # a motion that repeats with even samples would stand still
+    order = np.arange(1, FIRST - 1)
+    inner = order + (order * GOLDEN % 1 - 0.5) / 2  # a motion that repeats with even samples would stand still
     grid = [0.0, *(inner / (FIRST - 1)).tolist(), 1.0]
     open_ = [(a, b) for a, b in zip(grid[:-1], grid[1:], strict=True)]
     for t in grid:
