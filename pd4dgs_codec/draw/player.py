@@ -120,7 +120,7 @@ class Player(Drawer):
         self.slots = scene.widths.slots  #: Gaussians of an anchor
         #: float32 [N, 9 + D + 3 G]: rows of the kernels, to which the deformation adds
         flat = [scene.attributes[name].reshape(-1, math.prod(shape)) for name, shape in scene.widths.attributes.items()]
-        flat[1] = flat[1] + np.repeat(np.log(np.float32([1, scene.spread()])), 3)
+        flat[1] = flat[1] + np.repeat(np.log(np.array([1, scene.spread()], np.float32)), 3)
         self._table = np.concatenate([self._anchor, *flat], axis=1)
         extent = np.exp(flat[1])
         self._radius = OFFSET_REACH * extent[:, :3].max(axis=1) + SIGMA_REACH * extent[:, 3:].max(axis=1)

@@ -271,8 +271,8 @@ class Evaluator {
   /**
    * Adds the visible Gaussians of at most BATCH anchors to `kept`.
    *
-   * @param {Motion | null} moving at its time @param {Uint32Array} anchors @param {Uint8Array} codes @param {number} spread
-   * @param {number[]} eye @param {{slot: Column<Uint32Array>, records: Column<Float32Array>}} kept
+   * @param {Motion | null} moving at its time @param {Uint32Array} anchors @param {Uint8Array} codes
+   * @param {number} spread @param {number[]} eye @param {{slot: Column<Uint32Array>, records: Column<Float32Array>}} kept
    */
   _keep(moving, anchors, codes, spread, eye, kept) {
     const { floats } = this.arena;

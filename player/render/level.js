@@ -5,10 +5,12 @@ import { columnsOf, quantitiesOf } from "./record.js";
 
 /**
  * One level of a scene: the highest layer that is there and at most the requested one. It has the first `rows` anchors.
- * codes: their gates times 255. fill: the colour behind the Gaussians. spread: the factor on their scales. motion: what moves it, null if nothing does.
+ * codes: their gates times 255. fill: the colour behind the Gaussians. spread: the factor on their scales. motion: what
+ * moves it, null if nothing does.
  *
  * @template {Scene} S
- * @typedef {{number: number, rows: number, codes: Uint8Array, fill: number[], spread: number, motion: S["motion"][number]}} Level
+ * @typedef {{number: number, rows: number, codes: Uint8Array, fill: number[], spread: number,
+ *   motion: S["motion"][number]}} Level
  */
 
 /** Columns of a Gaussian's record: mean and opacity; scale, 0; quaternion w x y z; colour, 0. In scene units. */

@@ -48,7 +48,7 @@ def kinds(figures):
 def test_a_short_run_finds_nothing():
     names = [name for name in fuzz.DECODERS if name == "refdec" or NODE]
     decoders = fuzz.make_decoders(names)
-    figures = run_inputs(20, range(150), decoders)
+    figures = run_inputs(21, range(150), decoders)
     assert figures.findings == []
     assert figures.inputs == 150 == figures.outcomes.total() and figures.sealed > 60 and figures.legal > 20
     assert set(figures.compared) == set(names) and figures.compared["refdec"] > 30

@@ -255,6 +255,7 @@ SHAPES: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("options", SHAPES.values(), ids=SHAPES)
 def test_both_evaluators_agree(harness, folder, server, options):
     scene = lively_scene(**{"anchors": 150, **options})
+    scene = replace(scene, fills=((0, 0, 0, 24), None, (0, 0, 0, 64))[: len(scene.layers)])  # spreads
     (folder / "agree.pd4").write_bytes(encode(scene, layers=2, effort=1))
     eyes = ([0.0, 0.0, -5.0], [2.0, 1.0, -4.0])
     moments = ((0.0, eyes[0]), (0.4, eyes[0]), (0.4, eyes[1]), (1.0, eyes[1]))
