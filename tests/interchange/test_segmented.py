@@ -101,11 +101,11 @@ def test_an_interruption_leaves_a_folder_that_can_be_read_and_continued(tmp_path
     source, out = write(tmp_path / "set", swaying()), tmp_path / "out"
     make, count = segmented.SegmentPacker._scene, []
 
-    def cut(self, theta, error):
+    def cut(self, theta):
         count.append(0)
         if len(count) > limit:
             raise KeyboardInterrupt
-        return make(self, theta, error)
+        return make(self, theta)
 
     limit = 1 << 30
     monkeypatch.setattr(segmented.SegmentPacker, "_scene", cut)
