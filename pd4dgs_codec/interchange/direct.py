@@ -79,9 +79,11 @@ class Packer:
         self.source = source = canonical(source, self.key)
         deciding, others = held_out(cameras, HOLDOUT if len(cameras) >= FEW else 0)
         times, self._often = source.looks(len(deciding))
-        views = Views(source.near, deciding, times[: len(deciding)])
-        self.deciding = Pictures(views, info.background, info.near)
-        weights = sensitivity(replace(self.deciding, views=Views(source.near, deciding, times)))
+
+        def views(every: int, times: Sequence[float]) -> Pictures:
+            return Pictures(Views(source.near, deciding[::every], times[::every]), info.background, info.near)
+
+        weights, self.deciding = sensitivity(views(1, times)), views(EACH, times[: len(deciding)])
         step()
         self.few, self.cameras = not others, others or evenly(deciding, CHECKED)
         self.times = [model.nearest(t) for t in spread(len(self.cameras))]  # also between samples
@@ -116,11 +118,9 @@ class Packer:
         """Returns the packer of the Gaussians whose absence would add more to the error than their bits are worth: of
         all that a view sees if there are few, which would not tell what other views miss."""
         worth = BIT * SCALAR_BITS * sum(self.ordered.channels.values())
-        views = self.deciding.views
-        some = replace(self.deciding, views=Views(views.at, views.cameras[::EACH], views.times[::EACH]))
         moving = len(self.source.times) > 1
         while not self.few and self._reached < theta * (EARLY if moving else 1):
-            at, kept = absence(some, self._leave > self._reached) / worth, self._leave > self._reached
+            at, kept = absence(self.deciding, self._leave > self._reached) / worth, self._leave > self._reached
             next_ = 2 * self._reached or FIRST * theta
             leaving = kept & self._often & (at < next_)
             self._leave[leaving] = np.maximum(at[leaving], self._reached)

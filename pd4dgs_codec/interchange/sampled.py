@@ -8,6 +8,7 @@ space and colour. A row is then a chain of matches, and is shown only in its own
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -19,7 +20,7 @@ from pd4dgs_codec.errors import DamageWarning, DataError
 from pd4dgs_codec.format.registry import MAX_SIDE
 from pd4dgs_codec.interchange.splats import evenly
 from pd4dgs_codec.interchange.teacher import GOLDEN, Teacher, spread
-from pd4dgs_codec.kinds.splats import Splats, unit, visible
+from pd4dgs_codec.kinds.splats import MAX_DEGREE, Splats, unit, visible
 
 MOST_NUMBERS = 1 << 29  #: numbers of all samples, which take 2 GiB
 NUMBERS = 14  #: of a Gaussian that may change over time: all but harmonics
@@ -115,11 +116,11 @@ class Sampled:
 def sampled(model: Teacher, where: str, fps: float = 30.0, step: Step = lambda: None) -> Sampled:
     """Samples a model. where: its name for messages. fps: of models that give other Gaussians at other times. step:
     called after each sample. Raises DataError."""
-    read, times = model.bare or model.splats, model.times
+    read, times, kept = model.bare or model.splats, model.times, _Kept()
     if times is None and model.varies:
         times = tuple(np.linspace(0, 1, max(round(model.seconds * fps), 1) + 1))
     if times is None:
-        exact, frames = _by_error(read, where, step)
+        exact, frames = _by_error(lambda t: kept.without_rest(read(t)), where, step)
         same = True
     else:
         if len(times) > MAX_SIDE:
@@ -128,18 +129,40 @@ def sampled(model: Teacher, where: str, fps: float = 30.0, step: Step = lambda: 
         for t in times:
             frame = read(float(t))
             _check_size(where, len(times), len(frame.means))
-            frames.append(frame)
+            frames.append(kept.without_rest(frame))
             step()
         same = len({len(frame.means) for frame in frames}) == 1 and in_order(frames)
-    degree, most = (choose(frame.degree for frame in frames) for choose in (min, max))
-    if most > degree:
-        left = f"harmonics above degree {degree} are left out, expected degree {most} at all instants"
-        warnings.warn(DamageWarning(f"{where}: {left}"), stacklevel=2)
-    frames = [replace(frame, sh=frame.sh[:, : (degree + 1) ** 2]) for frame in frames]
+    kept.say(where)
     if same:
         order = "one instant" if len(frames) == 1 else "rows in a stable order"
-        return stacked(exact, frames, model.windows, order)
+        return stacked(exact, frames, model.windows, order, kept.total / np.float32(len(frames)))
+    frames = [read(float(t)) for t in exact]
+    frames = [replace(frame, sh=frame.sh[:, : 1 + kept.harmonics]) for frame in frames]
     return matched_frames(where, exact, frames)
+
+
+class _Kept:
+    """What is kept of the harmonics above the constants of many frames. total: float32 [n, harmonics, 3], their sum if
+    all frames have as many rows. harmonics, most: the least and the largest number of any frame."""
+
+    def __init__(self) -> None:
+        self.total, self.harmonics, self.most = np.zeros((0, 0, 3), np.float32), MAX_DEGREE * (MAX_DEGREE + 2), 0
+
+    def without_rest(self, frame: Splats) -> Splats:
+        """Returns a frame with the constants alone."""
+        rest = frame.sh[:, 1:]
+        self.harmonics, self.most = min(self.harmonics, rest.shape[1]), max(self.most, rest.shape[1])
+        if len(self.total) in (0, len(rest)):
+            before = self.total[:, : self.harmonics] if len(self.total) else np.float32(0)
+            self.total = before + rest[:, : self.harmonics]
+        return replace(frame, sh=frame.sh[:, :1].copy())
+
+    def say(self, where: str) -> None:
+        """Warns if harmonics of some frames are left out."""
+        if self.most > self.harmonics:
+            degree, most = (math.isqrt(1 + count) - 1 for count in (self.harmonics, self.most))
+            left = f"harmonics above degree {degree} are left out, expected degree {most} at all instants"
+            warnings.warn(DamageWarning(f"{where}: {left}"), stacklevel=3)
 
 
 def _check_size(where: str, frames: int, count: int) -> None:
@@ -148,14 +171,21 @@ def _check_size(where: str, frames: int, count: int) -> None:
         raise DataError(f"{where}: {found}, expected at most {MOST_NUMBERS // NUMBERS:,} in all")
 
 
-def stacked(times: np.ndarray, frames: Sequence[Splats], windows: np.ndarray | None, order: str) -> Sampled:
-    """Stacks frames with the same rows. Harmonics but the constants are means over the frames."""
+def stacked(
+    times: np.ndarray,
+    frames: Sequence[Splats],
+    windows: np.ndarray | None,
+    order: str,
+    rest: np.ndarray | None = None,
+) -> Sampled:
+    """Stacks frames with the same rows. rest: harmonics but the constants; by default means over the frames."""
     names = ("means", "quats", "scales", "opacities")
     means, quats, scales, opacities = (np.stack([getattr(frame, name) for frame in frames]) for name in names)
     flips = np.einsum("tnd,tnd->tn", quats[1:], quats[:-1])
     quats[1:] *= np.cumprod(np.where(flips < 0, np.float32(-1), np.float32(1)), axis=0)[..., None]
     colors = np.stack([frame.sh[:, 0] for frame in frames])
-    rest = np.asarray(sum(frame.sh[:, 1:] for frame in frames) / len(frames), np.float32)
+    if rest is None:
+        rest = np.asarray(sum(frame.sh[:, 1:] for frame in frames) / len(frames), np.float32)
     return Sampled(times, means, quats, scales, opacities, colors, rest, windows, order)
 
 

@@ -52,7 +52,6 @@ from pd4dgs_codec.scene import Camera, Grading, SceneInfo
 from pd4dgs_codec.segments import INDEX, File, Index, Segment, check, file_of, parse
 from pd4dgs_codec.threads import one_blas_thread
 
-JUDGED = 3  #: pictures that measure a segment
 #: The steps of a segment's coefficients are finer by this: their error is largest at its ends, where neighbours meet.
 #: 2 dB at seams for 1 % of the bytes.
 SEAM = 0.5
@@ -348,7 +347,7 @@ def joined(base: SplatScene, added: SplatScene) -> SplatScene:
 
 @dataclass(frozen=True)
 class Made:
-    """A folder of segments. psnr: mean in dB over `JUDGED` pictures of each segment that was made now, None without
+    """A folder of segments. psnr: mean in dB over CHECKED pictures of each segment that was made now, None without
     one. kept: the segments that were there already. gaussians: of the first frame. still: of each base."""
 
     index: Index
@@ -506,8 +505,7 @@ class _Writer:
         views = ((camera, self.frames[i]) for camera, i in zip(self.cameras, chosen, strict=True))
         precise = None if self.reach is None else PRECISE / int(np.diff(self.cuts).max())
         packer = BasePacker(still, views, len(self.cameras), self._info(a, b), precise)
-        error = 10 ** (-self.psnr / 10)
-        guess, source = error / packer.scalars, self.samples(own[0], still)
+        guess, source = 10 ** (-self.psnr / 10) / packer.scalars, self.samples(own[0], still)
         info = self._info(a, self.cuts[own[0] + 1])
         first = SegmentPacker(source, still.mean, packer._scene(guess), self.cameras, info, guess)
 
@@ -549,7 +547,7 @@ class _Writer:
 
     def _quality(self, scene: SplatScene, source: Sampled, behind: Splats | None) -> float:
         """Returns the mean PSNR in dB from cameras that decided nothing."""
-        views, player, found = Backed(source, evenly(self.judges, JUDGED), behind), SplatPlayer(scene), []
+        views, player, found = Backed(source, evenly(self.judges, CHECKED), behind), SplatPlayer(scene), []
         for (camera, shown), t in zip(views, views.times, strict=True):
             truth = picture(shown, camera, self.info.background, self.info.near)
             image = picture(player.splats(t)[0], camera, player.background, self.info.near)

@@ -114,6 +114,15 @@ def test_random_frames_have_no_order():
         np.testing.assert_array_equal(np.sort(shown.means[seen], axis=0), np.sort(frame.means, axis=0))
 
 
+def test_harmonics_are_means_over_frames_of_the_least_degree():
+    frames = [replace(body(degree=d), sh=make_splats(300, d, seed).sh) for seed, d in enumerate((2, 1, 2))]
+    frames = [replace(frame, sh=np.concatenate([frames[0].sh[:, :1], frame.sh[:, 1:]], axis=1)) for frame in frames]
+    model = Teacher(lambda t: frames[round(2 * t)], (0.0, 0.5, 1.0), 1.0)
+    found = sampled(model, "frames")
+    assert found.order == "rows in a stable order" and found.frame(1).degree == 1
+    np.testing.assert_allclose(found.rest, np.mean([frame.sh[:, 1:4] for frame in frames], axis=0), atol=1e-6)
+
+
 def test_a_function_is_sampled_where_it_bends(tmp_path, monkeypatch, cli):
     (tmp_path / "late.py").write_text(
         "from test_import import body, moved\ndef model(t):\n    return vars(moved(body(), 4 * max(t - 0.75, 0)))\n"
