@@ -135,7 +135,10 @@ def continued(config: TrainConfig, dataset: Dataset, whole: Scene) -> Model:
         replace(whole.info, time_range=info.time_range),
         replace(whole.steps, weights_global=whole.steps.weights_scaffold),  # a few seconds need no finer ones
         old.anchor_q,
-        *(getattr(old, name).detach() for name in ("feature", "scaling_log", "offset", "mask_logits")),
+        old.feature.detach(),
+        old.scaling_log.detach(),
+        old.offset.detach(),
+        old.mask_logits.detach(),
         {name: old.network(name) for name in old.networks},
         DeformationField.fresh(motion, whole.info.box, old.widths.heads),
         None,
@@ -178,7 +181,8 @@ def encoded(model: Model, base: tuple[Base, Scene] | None, metadata: Metadata) -
         return encode_with_report(scene, metadata=metadata)[0]
     file, own = base
     masks = (own.mask[0],) * len(scene.layers)
-    scene = replace(scene, mask=masks, grading=own.grading, networks=own.networks, **own.attributes)
+    rows: dict[str, Any] = own.attributes
+    scene = replace(scene, mask=masks, grading=own.grading, networks=own.networks, **rows)
     return encode_with_report(scene, base=file, metadata=metadata)[0]
 
 
