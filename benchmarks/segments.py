@@ -143,7 +143,7 @@ def compared(out: Path, seconds: int, length: int) -> list[Row]:
     for name, at, sizes in (
         ("one file", lambda t: (whole, t / seconds), [size]),
         ("files of their own", of_parts, [len(data) for data in parts]),
-        ("segments", lambda t: timeline.at(t / seconds), [base + own[0], *own[1:]]),
+        ("segments", lambda t: (timeline, t / seconds), [base + own[0], *own[1:]]),
     ):
         row = {"way": name, "bytes": sum(sizes), "first": sizes[0], "later": np.mean(sizes[1:]) if sizes[1:] else None}
         row |= {"inside": decibels(at, inside), "seams": decibels(at, just)}

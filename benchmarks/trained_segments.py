@@ -1,4 +1,4 @@
-"""A long capture trained as one file, as files of their own, and as segments that continue a base, at equal steps.
+"""A long capture trained as one file, as files of their own, and as segments that continue a whole, at equal steps.
 
 `python benchmarks/trained_segments.py` trains a synthetic scene in three ways, whose steps are as many in all, and
 measures bytes, dB on held-out views, and how far pictures half a frame before and after an instant differ, at seams and
@@ -23,7 +23,7 @@ from pd4dgs_codec.quality.image import mpsnr
 from pd4dgs_codec.quality.timeline import Timeline
 from pd4dgs_codec.segments import read_index
 from pd4dgs_codec.train.config import TrainConfig
-from pd4dgs_codec.train.segmented import Cuts, Part, train_part
+from pd4dgs_codec.train.segmented import Cuts, Part, segment_config, train_part
 
 INSIDE = 4  #: instants of each segment that are compared with seams
 At = Callable[[float], tuple[Drawer, float]]  #: seconds -> what draws them, and the normalised time there
@@ -49,10 +49,15 @@ def steps(at: At, dataset: Dataset, instants: list[float], half: float) -> float
     return float(np.mean(found))
 
 
+def all_steps(config: TrainConfig, count: int) -> int:
+    """Steps of a whole and of so many segments."""
+    return (config.total or 0) + count * (segment_config(config).total or 0)
+
+
 def alone(out: Path, capture: Capture, dataset: Dataset, cuts: Cuts) -> list[Path]:
     """Trains each segment as a file of its own; returns the files."""
     count = len(cuts.ranges)
-    share = round(capture.config.total * (count + 1) / count)  # type: ignore[operator]
+    share = round(all_steps(capture.config, count) / count)
     files = [out / f"alone-{k}.pd4" for k in range(count)]
     for file, times in zip(files, cuts.ranges, strict=True):
         if not file.exists():
@@ -73,7 +78,9 @@ def compared(out: Path, capture: Capture, every: float) -> list[Row]:
     )  # fmt: skip
     files = alone(out, capture, dataset, cuts)
     if not whole.exists():
-        command("train", source, "-o", out / "whole.pt", *common, "--iterations", steps_each * (count + 1), "-f")
+        command(
+            "train", source, "-o", out / "whole.pt", *common, "--iterations", all_steps(capture.config, count), "-f"
+        )
         command("encode", out / "whole.pt", "-o", whole)
     timeline, one = Timeline(folder), drawer(decode(whole))
     own, (_, index) = [drawer(decode(file)) for file in files], read_index(folder)
@@ -91,7 +98,7 @@ def compared(out: Path, capture: Capture, every: float) -> list[Row]:
     for name, at, first, later in (
         ("one file", lambda t: (one, (t - low) / (high - low)), size, []),
         ("files of their own", of_own, alone_sizes[0], alone_sizes[1:]),
-        ("segments", lambda t: timeline.at((t - low) / (high - low)), base + sizes[0], sizes[1:]),
+        ("segments", lambda t: (timeline, (t - low) / (high - low)), base + sizes[0], sizes[1:]),
     ):
         row: Row = {"way": name, "bytes": first + sum(later), "first": first}
         row |= {"later": float(np.mean(later)) if later else None, "dB": quality(at, dataset)}
@@ -110,7 +117,7 @@ def main() -> None:
     parser.add_argument("--source", default="synthetic:local?seconds=12&frames=144")
     parser.add_argument("--length", type=float, default=2.0, help="seconds of a segment")
     parser.add_argument("--overlap", type=float, default=0.0, help="seconds that segments share")
-    parser.add_argument("--iterations", type=int, default=1000, help="steps of the base and of each segment")
+    parser.add_argument("--iterations", type=int, default=1000, help="steps of the whole")
     args = parser.parse_args()
     out = Path(args.output)
     out.mkdir(parents=True, exist_ok=True)

@@ -49,7 +49,7 @@ class Op:
 
 OPS = {
     "prepare": Op("", (".mp4", ".mov", ".mkv", ".webm", ".avi")),
-    "train": Op(".pt", inputs=("base",)),
+    "train": Op(".pt", inputs=("whole",)),
     "encode": Op(".pd4", (".pt",), inputs=("data",)),
     "eval": Op(".json", (".pd4",), stdout=True, inputs=("data",)),
     "package": Op("", (".pd4",)),

@@ -40,11 +40,12 @@ tenth of every run trains level 0.
 --without turns off: rate, the bitrate terms; planes, the bitrate term of the planes; binary, the term of the
 masks; noise, the simulated quantisation; whitening, the transform of the feature channels.
 
---segments 10s writes a folder, -o DIR, for a long SOURCE: a base, of what stands still all the time, and a file for
-each ten seconds that continues it. pd4dgs-info, -render, -eval, -export, -package and -view take the folder as one
-scene. --iterations and --max-seconds are those of the base and of each segment; as many segments train at a time as
--j has threads. The same command goes on where it was interrupted. --manifest writes the lines by which pd4dgs-batch
-trains base and segments, each by --part; the same command without --manifest then adds the index.
+--segments 10s writes a folder, -o DIR, for a long SOURCE: a base, which holds what all times share, and a file for each
+ten seconds that continues it. pd4dgs-info, -render, -eval, -export, -package and -view take the folder as one scene.
+First a whole is trained, of all times, by --iterations and --max-seconds; its layer 0 is the base. Segments start from
+it and train for an eighteenth of its steps each, as many at a time as -j has threads. The same command goes on where it
+was interrupted. --manifest writes the lines by which pd4dgs-batch trains whole and segments, each by --part; the same
+command without --manifest then adds the index.
 
 torchrun starts several workers for one scene: they share the V views of a step and average their gradients, and the
 first worker writes the files. Their number must divide V and may change when a run is resumed.
@@ -84,17 +85,17 @@ def parser() -> options.Parser:
     parts("--segments", type=options.duration, metavar="T", help="write segments of about this length, such as 10s")
     what = "seconds that neighbouring segments share (default: 0s)"
     parts("--overlap", type=options.duration, metavar="T", help=what)
-    what = "train only the base (base) or segment N, from 0 on, into -o FILE.pd4"
-    parts("--part", type=options.checked(_part, lambda _: True, "base or a number"), metavar="N", help=what)
-    parts("--base", type=options.named, metavar="FILE.pd4", help="with --part N, the trained base")
-    what = "write a manifest of base and segments for pd4dgs-batch, and train nothing"
+    what = "train only the whole (whole) or segment N, from 0 on, into -o FILE.pd4"
+    parts("--part", type=options.checked(_part, lambda _: True, "whole or a number"), metavar="N", help=what)
+    parts("--whole", type=options.named, metavar="FILE.pd4", help="with --part N, the trained whole")
+    what = "write a manifest of whole and segments for pd4dgs-batch, and train nothing"
     parts("--manifest", type=options.named, metavar="FILE.jsonl", help=what)
     p.add_common()
     return p
 
 
 def _part(text: str) -> int | str:
-    return text if text == "base" else options.count(text)
+    return text if text == "whole" else options.count(text)
 
 
 def _add_fields(p: options.Parser) -> None:
@@ -184,8 +185,8 @@ def _train_segments(args: argparse.Namespace, console: Console) -> int:
         console.result(result, _segments_text(result))
         return OK
     check_output(args.output, args.overwrite)
-    k, base = (None, None) if args.part == "base" else (args.part, Path(args.base))
-    result = segmented.train_one(capture, k, Path(args.output), base)
+    k, whole = (None, None) if args.part == "whole" else (args.part, Path(args.whole))
+    result = segmented.train_one(capture, k, Path(args.output), whole)
     console.result({"output": args.output, **result}, f"{args.output}: {'' if result['finished'] else 'not '}finished")
     return OK
 
@@ -203,11 +204,11 @@ def check_usage(args: argparse.Namespace) -> None:
     """Raises UsageError for options that do not fit together."""
     options.conditional(args, args.rollout in (None, "key"), "needs --rollout key", key_instant=None)
     segments = args.segments is not None
-    options.conditional(args, segments, "needs --segments", overlap=0.0, part=None, base=None, manifest=None)
+    options.conditional(args, segments, "needs --segments", overlap=0.0, part=None, whole=None, manifest=None)
     if segments:
         options.conditional(args, False, "has no effect with --segments", log=None, view=None)
-        if (args.base is None) == isinstance(args.part, int):
-            raise UsageError("expected --part N and --base FILE.pd4 together, or neither")
+        if (args.whole is None) == isinstance(args.part, int):
+            raise UsageError("expected --part N and --whole FILE.pd4 together, or neither")
         if args.resume and not common.same_file(args.resume, args.output):
             raise UsageError(f"found --resume {args.resume}, expected the folder of -o {args.output}")
     if args.rate_scale and "rate" in args.without:

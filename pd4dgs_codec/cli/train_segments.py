@@ -1,4 +1,4 @@
-"""Trains a capture as a folder of segments for `pd4dgs-train`: first the base, then segments, some at a time."""
+"""Trains a capture as a folder of segments for `pd4dgs-train`: first the whole, then segments, some at a time."""
 
 from __future__ import annotations
 
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from pd4dgs_codec.train.config import TrainConfig
     from pd4dgs_codec.train.segmented import Cuts
 
-BASE = "base-0000.pd4"
+#: The trained whole, which segments start from and players do not need, and its layer 0.
+WHOLE, BASE = "whole.pd4", "base-0000.pd4"
 POLL_SECONDS = 0.5  #: between looks at signals while segments train in other processes
 
 
@@ -61,30 +62,32 @@ def name_of(k: int) -> str:
     return f"{k:05d}.pd4"
 
 
-def train_one(capture: Capture, k: int | None, output: Path, base: Path | None, *, told: bool = True) -> dict[str, Any]:
-    """Trains segment `k`, or the base for None, into a file. told: whether steps are shown. Returns numbers as
+def train_one(
+    capture: Capture, k: int | None, output: Path, whole: Path | None, *, told: bool = True
+) -> dict[str, Any]:
+    """Trains segment `k`, or the whole for None, into a file. told: whether steps are shown. Returns numbers as
     `train_part`. Raises DataError and TrainError."""
-    from pd4dgs_codec.train.segmented import Part, base_config, train_part
+    from pd4dgs_codec.train.segmented import Part, train_part
 
     dataset, cuts = capture.read()
     if k is None:
-        part = Part(base_config(capture.config), output, device=capture.device)
-        say(f"the base, {cuts.base_views} views of all times")
+        part = Part(capture.config, output, device=capture.device)
+        say(f"the whole, {cuts.whole_views} views of all times")
     elif k >= len(cuts.ranges):
         raise DataError(f"found segment {k}, expected 0 to {len(cuts.ranges) - 1}")
     else:
         start, stop = cuts.ranges[k]
-        part = Part(capture.config, output, (start, stop), base, capture.device)
+        part = Part(capture.config, output, (start, stop), whole, capture.device)
         say(f"segment {k}, {start:.4g} to {stop:.4g} s, {cuts.views[k]} views")
     result = train_part(part, dataset, TrainingProgress() if told else None)
-    what = "the base" if k is None else f"segment {k}"
+    what = "the whole" if k is None else f"segment {k}"
     levels = ", ".join(map(number, result["psnr"]))
     say(f"{what}: {result['iterations']} steps, {result['anchors']:,} anchors, {levels} dB")
     return result
 
 
 def manifest(capture: Capture) -> bytes:
-    """The lines of a manifest for pd4dgs-batch, of a base and of segments that need it."""
+    """The lines of a manifest for pd4dgs-batch, of the whole and of segments that need it."""
     from pd4dgs_codec.train.config import OPTIONS, TrainConfig
 
     _, cuts = capture.read()
@@ -96,35 +99,39 @@ def manifest(capture: Capture) -> bytes:
             text = ",".join(map(str, value)) if isinstance(value, tuple) else value
             options[name.replace("_", "-")] = text
     common = {"source": named.source}
-    lines: list[dict[str, Any]] = [common | {"output": BASE, "options": options | {"part": "base"}}]
+    lines: list[dict[str, Any]] = [common | {"output": WHOLE, "options": options | {"part": "whole"}}]
     for k in range(len(cuts.ranges)):
-        lines.append(common | {"output": name_of(k), "options": options | {"part": k}, "needs": {"base": BASE}})
+        lines.append(common | {"output": name_of(k), "options": options | {"part": k}, "needs": {"whole": WHOLE}})
     return "".join(json.dumps(line) + "\n" for line in lines).encode()
 
 
 def train_folder(capture: Capture, output: str, overwrite: bool) -> dict[str, Any]:
     """Trains all parts that the folder lacks, and writes its index after each. Returns the numbers of the command.
     Raises DataError and TrainError, also for a folder of another training without `overwrite`."""
+    from pd4dgs_codec.train.segmented import SHARE, base_of
+
     check_path(output)
     dataset, cuts = capture.read()
     folder, ranges = Path(output), cuts.ranges
     if folder.exists() and not folder.is_dir():
         raise DataError(f"{folder}: is a file, expected a folder to write segments into")
     made = capture.made(cuts)
-    _check_folder(folder, made, overwrite, [BASE, *map(name_of, range(len(ranges)))])
+    _check_folder(folder, made, overwrite, [WHOLE, BASE, *map(name_of, range(len(ranges)))])
     shown = ", ".join(map(str, cuts.views[:12])) + ", ..." * (len(ranges) > 12)
     start, stop = dataset.time_range
     say(f"{len(ranges)} segments from {start:.4g} to {stop:.4g} s, with {shown} training views of them; "
-        f"{cuts.base_views} of all times for the base; steps and time limits are those of each")  # fmt: skip
+        f"{cuts.whole_views} of all times for the whole, whose steps and time limit are those asked for; segments have "
+        f"one in {1 / SHARE:.0f} of them each")  # fmt: skip
     for remark in dataset.remarks():
         say(f"note: {remark}")
     del dataset
     folder.mkdir(parents=True, exist_ok=True)
-    base, trained, interrupted = folder / BASE, 0, False
-    if not base.exists():
-        interrupted = train_one(capture, None, base, None)["interrupted"]
+    whole, trained, interrupted = folder / WHOLE, 0, False
+    if not whole.exists():
+        interrupted = train_one(capture, None, whole, None)["interrupted"]
     index, before = Index((), (), made), 0
-    if base.exists():
+    if whole.exists():
+        write_bytes(folder / BASE, base_of(whole.read_bytes()), overwrite=True)
         index = _grown(folder, index, cuts)
         lacking = [k for k in range(len(ranges)) if _segment(folder, k, cuts, index.bases[0]) is None]
         before = len(ranges) - len(lacking)
@@ -198,7 +205,7 @@ def _trained(capture: Capture, folder: Path, lacking: list[int]) -> Iterator[int
     workers = min(cores, len(lacking))
     if workers < 2:
         for k in lacking:
-            if not train_one(capture, k, folder / name_of(k), folder / BASE)["finished"]:
+            if not train_one(capture, k, folder / name_of(k), folder / WHOLE)["finished"]:
                 return
             yield k
         return
@@ -235,7 +242,7 @@ def _child(capture: Capture, k: int, folder: Path, threads: int) -> None:
     follow_parent(remove_temporaries)
     configure(threads)
     try:
-        train_one(capture, k, folder / name_of(k), folder / BASE, told=False)
+        train_one(capture, k, folder / name_of(k), folder / WHOLE, told=False)
     except Pd4Error as error:
         say(f"segment {k}: {error}")
         sys.exit(1)

@@ -210,8 +210,12 @@ class Model(nn.Module):
 
     def moved_points(self, points: Tensor, level: int, t: float, rounding: Rounding = EXACT) -> Tensor:
         """Returns points [n, 3], world, as the deformation of `level` moves them to normalised time t."""
+        return self.moved_rows(points, level, t, rounding)[:, :3]
+
+    def moved_rows(self, points: Tensor, level: int, t: float, rounding: Rounding = EXACT) -> Tensor:
+        """Returns [n, 3 + channels]: `moved_points`, and what is added to the attributes of anchors there."""
         rows = torch.cat([points, points.new_zeros(len(points), self.widths.channels)], dim=1)
-        return self._moved(level, rows, t, rounding, self._fusible())[:, :3]
+        return self._moved(level, rows, t, rounding, self._fusible())
 
     def _viewmat(self, camera: Camera) -> Tensor:
         """[4, 4] world to camera."""

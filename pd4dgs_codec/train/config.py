@@ -219,7 +219,6 @@ class TrainConfig:
     #: share of the run, at its end, over which all learning rates fall to 0: otherwise the last steps move weights
     #: across rounding boundaries, and the PSNR jumps by tenths of a dB from one step to the next
     cooldown: float = option(0.4, least=0, most=1, fixed=False)
-    still: bool = False  #: level 0 alone, of views of all times, without what moves
     ssim: float = 0.2
     volume: float = 0.01  #: weight of the mean product of scales (Scaffold-GS)
     noise: bool = True  #: simulate quantisation: noise on attributes, rounding of planes and weights, finally of all

@@ -15,7 +15,7 @@ from dataclasses import replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import avg_pool2d, max_pool2d
+from torch.nn.functional import max_pool2d
 
 from pd4dgs_codec.data.view import View
 from pd4dgs_codec.train.phases.levels import MIN_VIEWS, other_views
@@ -40,10 +40,6 @@ STILL_ODDS, NEAR_ODDS = 0.15, 1 / 3
 MOST_NEAR = 60
 #: Motion has changed a pixel if a colour differs by at least this between level 0 and the training image.
 STILL_CONTRAST = 0.15
-#: A base does not train pixels that show what moves: the mean difference of a patch of REACH pixels a side, in which
-#: the errors of texture cancel, is MOVED. After half a run on `synthetic:local`, patches told 34 % of what moved, and
-#: 1.6 % of what stood still.
-MOVED = 0.08
 #: Share of the steps that train level 1 where there is a level 2.
 GLOBAL_ODDS = 0.1
 
@@ -51,7 +47,7 @@ GLOBAL_ODDS = 0.1
 def draw_levels(state: TrainState) -> tuple[tuple[int, ...], Probabilities]:
     """The levels of this step, ascending, and the probabilities of levels 0, 1, 2 that they were drawn with."""
     rollout, top = state.config.rollout, state.model.level
-    if state.position < state.schedule.coarse_end:
+    if state.position < state.schedule.coarse_end and not state.model.frozen:
         return (0,), LOWEST
     if rollout == "all":
         return tuple(range(top + 1)), (1.0, 1.0, 1.0)
@@ -133,8 +129,6 @@ def without_motion(state: TrainState, shown: TrainingView, image: Tensor) -> Tra
     there could never return. In scenes of little else (`TrainState.guided`) the pixels around them have weight 0, too,
     since their SSIM depends on them: otherwise the faint edge of a body that has moved away would be erased, then the
     next edge, until the body is gone."""
-    if state.config.still:
-        return at_rest(shown, image) if state.schedule.opening(state.position) >= 1 else shown
     whole = state.key is None or state.practising or state.position < state.schedule.coarse_end
     if whole or _is_near(state, shown.view):
         return shown
@@ -142,12 +136,3 @@ def without_motion(state: TrainState, shown: TrainingView, image: Tensor) -> Tra
     if state.guided:
         change = max_pool2d(change[None], 2 * REACH + 1, 1, REACH)[0]
     return replace(shown, weights=shown.weights * (change < STILL_CONTRAST))
-
-
-def at_rest(shown: TrainingView, image: Tensor) -> TrainingView:
-    """The view without the pixels that show what moves, as it trains a base from the middle of its run on, when what
-    moves has become a blur (trimmed least squares: Rousseeuw, Least median of squares regression, 1984). image: its
-    picture."""
-    apart = avg_pool2d((image.detach() - shown.image).permute(2, 0, 1), REACH, 1, REACH // 2).abs().amax(0)
-    moved = max_pool2d(apart[None], REACH, 1, REACH // 2)[0] >= MOVED
-    return replace(shown, weights=shown.weights * ~moved)

@@ -1,8 +1,9 @@
 """Trains a long capture as a folder of segments, see `segments`, with views of one segment at a time in memory.
 
-A base is trained on views of all times: level 0 alone, without what moves. Each segment then starts with the rows and
-networks of the base as its file decodes, which stay as they are, and learns from the views of its time what the base
-lacks: anchors of its own, and the motion of all. Its file names the base's layer 0 and does not repeat it (clause 5.6).
+First a model is trained on views of all times, with its motion: the *whole*. Its layer 0 alone is the base, which holds
+all anchors and the networks that make Gaussians of them. Each segment then starts with the rows and networks of the
+base as its file decodes, which stay as they are, and with the part of the whole's motion that is in its time, and
+learns the motion in the views of its time. Its file names the base's layer 0 and does not repeat it (clause 5.6).
 Segments do not depend on each other.
 """
 
@@ -16,42 +17,50 @@ from typing import Any
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch.nn import functional as F
 
 from pd4dgs_codec.data.view import Dataset, LaterView, View, spread
 from pd4dgs_codec.errors import DataError, TrainError
+from pd4dgs_codec.format.container import CHUNK_OVERHEAD, read_preamble, write_preamble
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode_with_report
+from pd4dgs_codec.format.header import pack_header, unpack_header
 from pd4dgs_codec.format.metadata import Metadata
 from pd4dgs_codec.format.reader import Base, read_base
 from pd4dgs_codec.io import write_bytes
 from pd4dgs_codec.model.config import PRESETS
+from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model, from_scene, to_scene
-from pd4dgs_codec.model.networks import EXACT
-from pd4dgs_codec.scene import SCALING_DIM, Grading, Scene
+from pd4dgs_codec.model.networks import Rounding
+from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.train.config import TrainConfig
-from pd4dgs_codec.train.initialise import fresh_mask_logits, fresh_model, nearest_distances
+from pd4dgs_codec.train.initialise import scene_info
 from pd4dgs_codec.train.loop import Progress, Trainer
-from pd4dgs_codec.train.phases.grow import contained
-from pd4dgs_codec.train.phases.levels import MIN_VIEWS
-from pd4dgs_codec.train.phases.matching import Points, moving_points
-from pd4dgs_codec.train.schedule import Schedule
-from pd4dgs_codec.train.state import TrainState
+from pd4dgs_codec.train.optimiser import Optimiser
 
-#: Views of all times from which a base is trained, at most.
-BASE_VIEWS = 600
+#: Views of all times from which a whole is trained, at most.
+WHOLE_VIEWS = 600
 #: Times differ by rounding; a view at the seam belongs to both segments. Seconds.
 ROUNDING = 1e-4
+#: Steps of a segment, as a share of those of the whole, from which it starts.
+SHARE = 1 / 18
+#: Pictures of a segment for each of its finest planes' instants, see `ModelConfig`.
+PICTURES = 4
+#: Steps that fit a segment's motion to that of the whole, before pictures do.
+FITTING = 600
+#: Squared steps that an attribute's error grows by when it has a bit less, at high rates (Gersho and Gray, Vector
+#: quantization and signal compression, 1992).
+SQUARES_PER_BIT = math.log(2) / 6
 
 
 @dataclass(frozen=True)
 class Cuts:
     """A dataset's segments. ranges: seconds of each, of which neighbours share the overlap. views: numbers of training
-    views, of each segment and of the base."""
+    views, of each segment and of the whole."""
 
     ranges: tuple[tuple[float, float], ...]
     views: tuple[int, ...]
-    base_views: int
+    whole_views: int
 
 
 def cuts_of(dataset: Dataset, length: float, overlap: float) -> Cuts:
@@ -76,7 +85,7 @@ def cuts_of(dataset: Dataset, length: float, overlap: float) -> Cuts:
                 f"{dataset.name}: segment {k}, {times}, has training views of {len(own)} instants, expected two at "
                 "least; longer --segments"
             )
-    return Cuts(tuple(ranges), tuple(views), min(len(dataset.train), BASE_VIEWS))
+    return Cuts(tuple(ranges), tuple(views), min(len(dataset.train), WHOLE_VIEWS))
 
 
 def seconds_of(dataset: Dataset, view: View) -> float:
@@ -90,11 +99,11 @@ def _within(dataset: Dataset, views: Sequence[View], times: tuple[float, float])
 
 
 def part_of(dataset: Dataset, times: tuple[float, float] | None) -> Dataset:
-    """The dataset of a time range, seconds, with its pixels in memory; None: of all times, for the base."""
+    """The dataset of a time range, seconds, with its pixels in memory; None: of all times, for the whole."""
     test: Sequence[View]
     if times is None:
-        train, times = spread(dataset.train, BASE_VIEWS), dataset.time_range
-        test = spread(dataset.test, BASE_VIEWS // 10) if dataset.test else ()
+        train, times = spread(dataset.train, WHOLE_VIEWS), dataset.time_range
+        test = spread(dataset.test, WHOLE_VIEWS) if dataset.test else ()
     else:
         train, test = (_within(dataset, views, times) for views in (dataset.train, dataset.test))
     start, stop = times
@@ -113,84 +122,80 @@ def part_of(dataset: Dataset, times: tuple[float, float] | None) -> Dataset:
 # -- the model of a segment --------------------------------------------------------------------------------------------
 
 
-def continued(config: TrainConfig, dataset: Dataset, base: Scene) -> Model:
-    """Returns the model with which the training of a segment starts: the rows and networks of its base, frozen, anchors
-    at points of what moves near the key instant, and fresh deformations."""
-    size, own = PRESETS[config.preset], from_scene(base)
-    key = config.key_instant if config.rollout == "key" else None
-    shared = {name: getattr(base.steps, name) for name in (*base.steps.attributes, "weights_scaffold")}
-    few, steps = replace(size, initial_anchors=8), replace(config.model_steps(size.steps), **shared)
-    dataset = replace(dataset, box=base.info.box)
-    fresh = fresh_model(few, dataset, config.widths, steps, config.seed, config.max_layer, key)
-
-    def joined(added: dict[str, Tensor]) -> Model:
-        rows = {name: torch.cat([getattr(own, name).detach(), values]) for name, values in added.items()}
-        classes = own.step_class.new_zeros(len(rows["anchor_q"]))
-        classes[: len(own.step_class)] = own.step_class
-        model = Model(
-            replace(base.info, time_range=fresh.info.time_range),
-            steps,
-            networks={name: own.network(name) for name in own.networks},
-            global_deformation=fresh.global_deformation,
-            local_deformation=fresh.local_deformation,
-            step_class=classes,
-            centre=own.centre,
-            **rows,
-        )
-        model.freeze(len(own.anchor_q))
-        return model
-
-    names = ("anchor_q", "feature", "scaling_log", "offset", "mask_logits")
-    model = joined({name: getattr(own, name).detach()[:0] for name in names})
-    state = TrainState(replace(config, noise=False), dataset, Schedule(1), torch.device("cpu"), size, model)
-    state.iteration = 1
-    points, _ = moving_points(state)
-    apart = (points.time - config.key_instant).abs()
-    near = torch.unique(apart)[:MIN_VIEWS]
-    return joined(_anchors_at(state, points.at(torch.isin(apart, near))))
+def continued(config: TrainConfig, dataset: Dataset, whole: Scene) -> Model:
+    """Returns the model with which the training of a segment starts: the rows and networks of the whole, frozen, and a
+    single layer of motion, fitted to that of the whole within the segment's time."""
+    old, info, size = from_scene(whole), scene_info(dataset), PRESETS[config.preset]
+    finest = [field for field in (size.global_deformation, size.local_deformation) if field][-1]
+    side, most = finest.scales[-1]
+    instants = math.ceil(len({view.time for view in dataset.train}) / PICTURES) + 1
+    torch.manual_seed(config.seed)
+    motion = replace(finest, scales=((side, min(instants, most)),))
+    model = Model(
+        replace(whole.info, time_range=info.time_range),
+        replace(whole.steps, weights_global=whole.steps.weights_scaffold),  # a few seconds need no finer ones
+        old.anchor_q,
+        old.feature.detach(),
+        old.scaling_log.detach(),
+        old.offset.detach(),
+        old.mask_logits.detach(),
+        {name: old.network(name) for name in old.networks},
+        DeformationField.fresh(motion, whole.info.box, old.widths.heads),
+        None,
+        old.step_class,
+        old.centre,
+    )
+    model.freeze(len(old.anchor_q))
+    fit(model, old, config)
+    return model
 
 
-@torch.no_grad()
-def _anchors_at(state: TrainState, points: Points) -> dict[str, Tensor]:
-    """The attributes of anchors at points in free voxels, by name. Networks that do not change make of their features
-    what they make of those of the base, so each takes the one of the base's Gaussian of most similar colour."""
-    model = state.model
-    cells = torch.round(points.position.double() / model.info.voxel_size).to(torch.int32)
-    unique, first = np.unique(cells.numpy(), axis=0, return_index=True)
-    found = torch.from_numpy(unique)
-    free = ~contained(found.long(), model.anchor_q.long()) if len(found) else torch.zeros(0, dtype=torch.bool)
-    found, colour = found[free], points.colour[torch.from_numpy(first)][free]
-    feature = model.feature.new_zeros(len(found), model.widths.feature)
-    if len(found):
-        shown = model.gaussians(0, 0.0, state.dataset.camera, EXACT)
-        solid = (shown.opacities >= 0.5).nonzero()[:, 0]
-        if len(solid):
-            nearest = torch.cdist(colour, shown.colors[solid]).argmin(1)
-            feature = model.feature[shown.slots[solid[nearest]] // model.widths.slots]
-    size = nearest_distances((found.double() * model.info.voxel_size).float()).clamp(min=model.info.voxel_size)
-    return {
-        "anchor_q": found,
-        "feature": feature.detach().clone(),
-        "scaling_log": size.log()[:, None].repeat(1, SCALING_DIM),
-        "offset": model.offset.new_zeros(len(found), *model.offset.shape[1:]),
-        "mask_logits": fresh_mask_logits(len(found), model.level),
-    }
+def fit(model: Model, old: Model, config: TrainConfig) -> None:
+    """Trains the motion of a segment's model until it is that of `old`, the model of the whole. They are compared at
+    the anchors, in units of the attributes' steps, under a rate of the planes. Residuals of `old` count from its key
+    instant, which may be in another segment; the segment has none."""
+    (low, high), times, planes = old.info.time_range, model.info.time_range, model.deformations[1].planes
+    generator, step = torch.Generator().manual_seed(config.seed), model.steps.planes(1)
+    units = [torch.full((3,), float(model.info.voxel_size))]
+    units += [torch.full((c.numel(),), float(getattr(model.steps, name))) for name, c in model.centres.items()]
+    adam, unit = Optimiser(model, config.rates, config.cooldown), torch.cat(units)
+    for k in range(FITTING):
+        t = float(torch.rand((), generator=generator))
+        seconds, rounding = times[0] + t * (times[1] - times[0]), Rounding(weights=k > FITTING / 2)
+        with torch.no_grad():
+            wanted = old.moved_rows(old.anchor, old.level, (seconds - low) / (high - low)) / unit
+        apart = F.smooth_l1_loss(model.moved_rows(old.anchor, 1, t, rounding) / unit, wanted)
+        adam.zero_grad()
+        rate = planes.rate(planes.grid, step) / wanted.numel()
+        torch.autograd.backward(apart + SQUARES_PER_BIT * rate)
+        adam.step(k / FITTING, None)
+    adam.zero_grad()
 
 
 def encoded(model: Model, base: tuple[Base, Scene] | None, metadata: Metadata) -> bytes:
-    """The file of a trained base, or of a segment that continues one, whose first rows it takes bit for bit."""
+    """The file of a trained whole, or of a segment that continues its layer 0, whose rows it takes bit for bit. Layer 0
+    of a whole has the anchors of all levels."""
     scene = to_scene(model)
     if base is None:
+        scene = replace(scene, mask=(scene.mask[-1],) * len(scene.layers))
         return encode_with_report(scene, metadata=metadata)[0]
     file, own = base
-    n, graded = len(own.anchor_q), None
-    if own.grading is not None:
-        classes = np.concatenate([own.grading.classes, model.step_class[n:].numpy()])
-        graded = Grading(classes, own.grading.centre)
-    rows: dict[str, Any] = {name: np.concatenate([x, getattr(scene, name)[n:]]) for name, x in own.attributes.items()}
-    masks = tuple(np.concatenate([own.mask[0], codes[n:]]) for codes in scene.mask)
-    scene = replace(scene, mask=masks, grading=graded, networks=own.networks, **rows)
+    masks = (own.mask[0],) * len(scene.layers)
+    rows: dict[str, Any] = own.attributes
+    scene = replace(scene, mask=masks, grading=own.grading, networks=own.networks, **rows)
     return encode_with_report(scene, base=file, metadata=metadata)[0]
+
+
+def base_of(whole: bytes) -> bytes:
+    """The layer 0 of a file as a file of its own."""
+    preamble = read_preamble(whole)
+    header, offset, parts = unpack_header(preamble.header), preamble.size, []
+    for kind, length in header.chunks:
+        end = offset + CHUNK_OVERHEAD + length
+        parts += [whole[offset:end]] if kind == 0 else []
+        offset = end
+    chunks = tuple(chunk for chunk in header.chunks if chunk[0] == 0)
+    return write_preamble(pack_header(replace(header, chunks=chunks))) + b"".join(parts)
 
 
 # -- a part ------------------------------------------------------------------------------------------------------------
@@ -198,13 +203,13 @@ def encoded(model: Model, base: tuple[Base, Scene] | None, metadata: Metadata) -
 
 @dataclass(frozen=True)
 class Part:
-    """A base or a segment to train. config: with `still` for a base. output: its file, beside which its checkpoint
-    lies. times: seconds, None for a base. base: the file that a segment continues."""
+    """The whole or a segment to train. config: of the whole. output: its file, beside which its checkpoint lies. times:
+    seconds, None for the whole. whole: the file that a segment continues."""
 
     config: TrainConfig
     output: Path
     times: tuple[float, float] | None = None
-    base: Path | None = None
+    whole: Path | None = None
     device: str = "cpu"
 
     @property
@@ -213,30 +218,37 @@ class Part:
         return self.output.with_suffix(".pt")
 
 
-def base_config(config: TrainConfig) -> TrainConfig:
-    """The configuration of the base of segments that are trained as `config` says."""
-    return replace(config, max_layer=0, rollout="key", keep_layers=False, still=True)
+def segment_config(config: TrainConfig) -> TrainConfig:
+    """The configuration of segments whose whole is trained as `config` says. Their motion, which is known, begins at
+    the rates at which that of a whole ends."""
+    steps, seconds = config.total and math.ceil(config.total * SHARE), config.max_seconds and config.max_seconds * SHARE
+    planes, deformation = config.rates.planes[1], config.rates.deformation[1]
+    rates = replace(config.rates, planes=(planes, planes), deformation=(deformation, deformation))
+    few = replace(config, iterations=steps, max_seconds=seconds, rates=rates)
+    return replace(few, max_layer=1, rollout="top", small_pictures=0.0)
 
 
 def train_part(part: Part, dataset: Dataset, progress: Progress | None) -> dict[str, Any]:
     """Trains a part of a dataset from its checkpoint on, if there is one, to its end or its time limit, and writes its
     file, unless a signal ended it early. Returns numbers: steps done, whether `finished` and `interrupted`, psnr in dB
     by level. Raises DataError and TrainError."""
-    own, base, start = part_of(dataset, part.times), None, None
-    if part.base is not None:
-        data = part.base.read_bytes()
+    own, base, start, config = part_of(dataset, part.times), None, None, part.config
+    size = PRESETS[config.preset]
+    if part.whole is not None:
+        data = part.whole.read_bytes()
         scene = decode(data)
         if not isinstance(scene, Scene):
-            raise DataError(f"{part.base}: holds splats, expected a base that pd4dgs-train wrote")
-        base, start = (read_base(data), scene), continued(part.config, own, scene)
-    trainer = Trainer(part.config, own, part.device, start=start)
+            raise DataError(f"{part.whole}: holds splats, expected a model that pd4dgs-train wrote")
+        config, size = segment_config(config), replace(size, max_anchors=0)  # none grow: the whole has seen all times
+        base, start = (read_base(data), scene.prefix(0)), continued(config, own, scene)
+    trainer = Trainer(config, own, part.device, size, start)
     if part.checkpoint.exists():
         trainer.resume(part.checkpoint)
     trainer.run(part.checkpoint, progress=progress)
     if trainer.iteration and trainer.learner.skipped == trainer.iteration:
         raise TrainError(f"{part.output}: training failed: no step had a finite loss and gradient")
     psnr = trainer.curve[-1]["psnr"] if trainer.curve else []
-    finished = trainer.finished or bool(part.config.max_seconds and not trainer.interrupted)
+    finished = trainer.finished or bool(config.max_seconds and not trainer.interrupted)
     if finished:
         about = Metadata(quality={level: value for level, value in enumerate(psnr) if math.isfinite(value)})
         write_bytes(part.output, encoded(trainer.model.cpu(), base, about), overwrite=True)

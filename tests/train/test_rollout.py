@@ -12,7 +12,7 @@ from pd4dgs_codec.train import rollout
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.learner import Learner
 from pd4dgs_codec.train.loop import Trainer
-from pd4dgs_codec.train.rollout import LOWEST, at_rest, draw_levels, near_key, next_view, without_motion
+from pd4dgs_codec.train.rollout import LOWEST, draw_levels, near_key, next_view, without_motion
 from pd4dgs_codec.train.ssim import REACH
 
 
@@ -73,20 +73,6 @@ def test_other_rollouts_have_no_key_instant(dataset):
     assert state.key is None and state.model.global_deformation.key is None
     state.iteration = 500
     assert without_motion(state, state.views[0], 1 - state.views[0].image) is state.views[0]
-
-
-def test_a_base_does_without_what_moves_and_keeps_texture_that_it_has_not_learnt(dataset):
-    state = learner(dataset, still=True, max_layer=0)
-    shown, rng = state.views[0], np.random.default_rng(0)
-    noise = torch.from_numpy(rng.choice([-0.1, 0.1], shown.image.shape).astype(np.float32))
-    image = shown.image + noise
-    image[8:14, 10:16] += 0.3
-    weights = at_rest(shown, image).weights
-    assert (weights[8:14, 10:16] == 0).all()
-    assert weights[:, 24:].count_nonzero() > 0.8 * weights[:, 24:].numel()
-    assert without_motion(state, shown, image) is shown, "the first half learns from all pixels"
-    state.iteration = 500
-    assert torch.equal(without_motion(state, shown, image).weights, weights)
 
 
 def test_frozen_anchors_and_networks_neither_move_nor_leave(dataset, short_runs_have_phases):

@@ -29,5 +29,5 @@ class Phase:
 
 
 def long_enough(state: TrainState) -> bool:
-    """Whether the run is long enough for phases that measure pictures."""
-    return (state.schedule.iterations or 0) >= MIN_ITERATIONS
+    """Whether the run is long enough for phases that measure pictures, or continues one that was."""
+    return state.model.frozen > 0 or (state.schedule.iterations or 0) >= MIN_ITERATIONS
