@@ -25,7 +25,7 @@ from pd4dgs_codec.train.schedule import PRUNING_ROUNDS
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
 #: Training views in which an anchor is measured; each round uses others.
-VIEWS = 6
+VIEWS = 12
 #: Mask of an anchor at a level that it has left: below the threshold, so that it is neither drawn there nor coded.
 ABSENT = 1e-3
 
