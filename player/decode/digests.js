@@ -14,8 +14,8 @@ export function crc32(bytes, before = 0) {
   return ~c >>> 0;
 }
 
-/** The first 32 bits of the fractional parts of a root of the first primes: SHA-256's constants. Binary64 has 49 bits of
- * each or more, and none is near a whole number. @param {number} count @param {(n: number) => number} root */
+/** The first 32 bits of the fractional parts of a root of the first primes: SHA-256's constants. Binary64 has 49 bits
+ * of each or more, and none is near a whole number. @param {number} count @param {(n: number) => number} root */
 function fractions(count, root) {
   const primes = [2];
   for (let n = 3; primes.length < count; n += 2) if (primes.every((prime) => n % prime)) primes.push(n);

@@ -188,7 +188,8 @@ export class SceneSource {
         if (done) {
           this.close();
           // the header says that more follows, so that it is asked for; a response without a new byte is the answer
-          if (this.received > this._requested.received) throw new Cut(`ended at byte ${this.received} of ${this.total}`);
+          const came = this.received > this._requested.received;
+          if (came) throw new Cut(`ended at byte ${this.received} of ${this.total}`);
           this._ended = true;
           return [];
         }
@@ -261,7 +262,7 @@ export class SceneSource {
       const way = "open the page through a web server (pd4dgs-serve FOLDER), or drop the file onto it";
       throw new FetchError(`${this.url}: browsers do not let a page from a file read another file; ${way}`);
     }
-    // without If-Range, for which browsers would ask another origin's permission: the answer says whether it is the file
+    // without If-Range, for which browsers would ask another origin's permission: the answer tells if it is the file
     /** @type {Record<string, string>} */
     const headers = start ? { Range: `bytes=${start}-` } : {};
     const { signal } = (this._controller = new AbortController());
@@ -291,7 +292,8 @@ export class SceneSource {
     const range = /^bytes (?:(\d{1,15})-\d{1,15}|\*)\/(\d{1,15}|\*)$/.exec(headers.get("Content-Range") ?? "");
     const total = lengthOf(range?.[2]);
     if (tag !== null && this._tag !== null && tag !== this._tag) return this._restart();
-    if (total !== null && (beyond ? total < this.received : total !== (this.decoder.end ?? total))) return this._restart();
+    const other = total !== null && (beyond ? total < this.received : total !== (this.decoder.end ?? total));
+    if (other) return this._restart();
     this._tag ??= tag;
     if (beyond) {
       this._ended = true;

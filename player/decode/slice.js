@@ -114,8 +114,8 @@ function readParameters(payload, layer, { width, centres, base }, { declared: be
  */
 
 /**
- * With n rows of its own and E earlier ones, none in a later slice of its layer. Symbols of rows are the values in steps
- * (11.2), those of planes the samples (11.3).
+ * With n rows of its own and E earlier ones, none in a later slice of its layer. Symbols of rows are the values in
+ * steps (11.2), those of planes the samples (11.3).
  *
  * @typedef {object} Slice
  * @property {number} layer
