@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import cache
 from subprocess import DEVNULL, Popen
 from threading import Event, Thread
 
@@ -46,8 +47,7 @@ def _compile(learner: Learner, ready: Event) -> None:
     """Finds the gradients of one picture as in the first step, then as in the last, at the highest level. A process
     compiles one kernel at a time, so another one, without torch, meanwhile compiles those of the rasteriser."""
     with suppress(Exception):  # the run compiles for itself, or has ended: it failed to read its data
-        words = [sys.executable, "-c", "from pd4dgs_codec.draw import rasteriser; rasteriser.compile_kernels()"]
-        beside = Popen(words, stderr=DEVNULL) if _fresh() and available() > 1 else None
+        beside = _rasteriser()
         view = learner.views[0]
         image = view.image.requires_grad_()
         terms = list(image_loss(image, view.image, view.weights))
@@ -65,9 +65,13 @@ def _compile(learner: Learner, ready: Event) -> None:
     ready.set()
 
 
-def _fresh() -> bool:
-    """Whether numba had to compile the first kernel of this process: its cache is empty."""
-    return bool(initialise._nearest_squares.__wrapped__.stats.cache_misses)  # type: ignore[attr-defined]
+@cache  # once a process: what it compiles stays in numba's cache
+def _rasteriser() -> Popen[bytes] | None:
+    """Starts the process that compiles the rasteriser's kernels, if numba had to compile the first kernel of this one,
+    since its cache is empty, and if there is a core for it."""
+    fresh = initialise._nearest_squares.__wrapped__.stats.cache_misses  # type: ignore[attr-defined]
+    words = [sys.executable, "-c", "from pd4dgs_codec.draw import rasteriser; rasteriser.compile_kernels()"]
+    return Popen(words, stderr=DEVNULL) if fresh and available() > 1 else None
 
 
 def _ball() -> Dataset:
