@@ -156,7 +156,8 @@ def test_eval_adds_perceptual_distances_and_names_the_absent(cli, scene_pd4, sha
     monkeypatch.setattr("pd4dgs_codec.quality.perceptual.load_perceptual", lambda names: loaded)
     command = ("eval", scene_pd4, shared_dataset, "--level", 1)
     result = cli(*command, "--perceptual", "--json")
-    assert result.error_lines == ["no lpips: it is not here"]
+    assert "lasts 1 s" in result.error_lines[0]  # the scene 2 s
+    assert result.error_lines[1:] == ["no lpips: it is not here"]
     assert result.json["perceptual"]["absent"] == loaded.absent
     (view,), level = load(str(shared_dataset)).test, load_levels(scene_pd4, 1)[-1]
     row = result.json["levels"][1]
