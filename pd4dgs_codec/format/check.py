@@ -53,7 +53,7 @@ def check_scene(scene: AnyScene) -> None:
         expect(is_step(step), f"step of {name}: {step!r}, expected a positive normal binary32 value")
     for fill in scene.fills:
         valid = fill is None or (len(fill) in (3, 4) and all(type(c) is int and 0 <= c <= 255 for c in fill))
-        expect(valid, f"fill {fill}, expected None or three or four integers 0..255")
+        expect(valid, f"fill {fill}, expected None or 3 to 4 integers 0..255")
     expect(len(scene.fills) in (0, len(layers)), f"{len(scene.fills)} fills, expected none or one per layer {layers}")
     _check_tensors(scene)
 

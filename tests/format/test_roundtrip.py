@@ -113,7 +113,7 @@ FAULTS = {
         "local_deformation", lambda d: replace(d, networks={**d.networks, "trunk": ()})
     ),
     "2 fills, expected none or one per layer": broken("fills", lambda _: (None, None)),
-    "fill .0, 0, 256., expected None or three integers": broken("fills", lambda _: (None, (0, 0, 256), None)),
+    "fill .0, 0, 256., expected None or 3 to 4 integers": broken("fills", lambda _: (None, (0, 0, 256), None)),
     "planes.*expected six": broken(
         "local_deformation", lambda d: replace(d, planes=({k: v for k, v in d.planes[0].items() if k != "xt"},))
     ),
