@@ -1121,7 +1121,8 @@ def test_attributes_and_removal(page, server):
     player = element(page, server, attributes)
     assert player.locator("img").count() == 1
     wait_for_level(page, 1)
-    assert player.locator("img").is_hidden() and player.get_by_role("group").is_hidden()
+    player.locator("img").wait_for(state="hidden")  # it fades
+    assert player.get_by_role("group").is_hidden()
     assert page.evaluate(f"{ELEMENT}.player.canvas.tabIndex") == -1  # no key does anything
     page.wait_for_function(f"{ELEMENT}.time < 2")  # it plays, and begins anew
     names = [name for name, _ in page.evaluate("seen")]
