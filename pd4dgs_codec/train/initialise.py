@@ -20,7 +20,7 @@ from pd4dgs_codec.model.model import Model, fresh_networks
 from pd4dgs_codec.morton import MAX_VOXEL
 from pd4dgs_codec.scene import INSTANTS, SceneInfo, Steps, Widths
 from pd4dgs_codec.train import workers
-from pd4dgs_codec.train.movers import moving_starts
+from pd4dgs_codec.train.following import body_starts
 from pd4dgs_codec.train.stereo import with_points
 
 #: Voxels along the longest side of the scene's box.
@@ -92,7 +92,7 @@ def start_points(dataset: Dataset, key: float | None, moves: bool) -> tuple[Data
         dataset = with_points(dataset, key)
     if key is None or not moves:
         return dataset, torch.zeros(0, 3)
-    return dataset, workers.alike(lambda: moving_starts(dataset, key))
+    return dataset, workers.alike(lambda: body_starts(dataset, key))
 
 
 def fresh_mask_logits(n: int, level: int) -> Tensor:

@@ -36,7 +36,7 @@ class Follow(phases.Phase):
         dataset = replace(state.dataset, box=info.box, near=info.near)
         starts = state.starts
         tracks = workers.alike(
-            lambda: followed(dataset, moving_starts(dataset, key) if starts is None else starts, key)
+            lambda: followed(dataset, moving_starts(dataset, key), key)
         )
         state.starts = None
         record["bodies"] = len(tracks)
