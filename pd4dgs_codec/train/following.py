@@ -62,11 +62,13 @@ def followed(dataset: Dataset, points: Tensor, key: float) -> list[Track]:
     return [track for track in tracks if len(track.points) > NEAR]
 
 
-def body_starts(dataset: Dataset, key: float) -> Tensor:
-    """float32 [n, 3] start points of what moves at the key instant `key`: what `movers` finds, and the hulls of the
-    bodies that can be followed from there, also on the sides that no view near the key instant shows."""
+def moving_bodies(dataset: Dataset, key: float) -> tuple[Tensor, list[Track]]:
+    """Returns (float32 [n, 3] start points of what moves at the key instant `key`: what `movers` finds, and the hulls
+    of the bodies that can be followed from there, also on the sides that no view near the key instant shows; the tracks
+    of these bodies)."""
     points = moving_starts(dataset, key)
-    return torch.cat([points, *(track.points for track in followed(dataset, points, key))])
+    tracks = followed(dataset, points, key)
+    return torch.cat([points, *(track.points for track in tracks)]), tracks
 
 
 def bodies_of(points: Tensor, colour: Tensor, apart: float) -> list[Tensor]:
@@ -117,7 +119,8 @@ class _Views:
         n = len(pixels)
         local = torch.linalg.solve(self.K[:n], torch.cat([pixels, torch.ones(n, 1)], 1)[..., None])
         ray = torch.einsum("vji,vj->vi", self.turn[:n], local[..., 0])
-        return ray / ray.norm(dim=1, keepdim=True)
+        unit: Tensor = ray / ray.norm(dim=1, keepdim=True)
+        return unit
 
     def bins_at(self, pixels: Tensor) -> Tensor:
         """int64 [V, n]: the bins at pixels [V, n, 2]; BINS³ outside and where a view is not valid."""
@@ -151,7 +154,7 @@ class _Body:
         points = points.double()
         middle = points.median(0).values
         self.views, self.size = views, max(float((points - middle).norm(dim=1).median()), cell / 4)
-        self.radius, self.times = self.size, views.time.unique()
+        self.radius, self.times = self.size, views.time.unique()  # type: ignore[no-untyped-call]
         count = min(len(self.times), KNOTS)
         self.knots = middle.repeat(count, 1)
         at = (views.time - self.times[0]) / (self.times[-1] - self.times[0]) * (count - 1)
@@ -167,7 +170,8 @@ class _Body:
     @property
     def places(self) -> Tensor:
         """[V, 3]: where it is in each view."""
-        return self.rows @ self.knots
+        found: Tensor = self.rows @ self.knots
+        return found
 
     def follow(self) -> bool:
         """Finds the path in more and more views. Whether half of them see the body, the median of these within half
