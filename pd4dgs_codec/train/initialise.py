@@ -20,7 +20,7 @@ from pd4dgs_codec.model.model import Model, fresh_networks
 from pd4dgs_codec.morton import MAX_VOXEL
 from pd4dgs_codec.scene import INSTANTS, SceneInfo, Steps, Widths
 from pd4dgs_codec.train import workers
-from pd4dgs_codec.train.movers import moving_starts
+from pd4dgs_codec.train.following import Track, moving_bodies
 from pd4dgs_codec.train.stereo import with_points
 
 #: Voxels along the longest side of the scene's box.
@@ -85,14 +85,14 @@ def fresh_model(
     )
 
 
-def start_points(dataset: Dataset, key: float | None, moves: bool) -> tuple[Dataset, Tensor]:
-    """The dataset, with points found by stereo if it has neither points nor a plain background; and float32 [n, 3]
-    points of what moves at the key instant, if there is one and motion is to be learnt."""
+def start_points(dataset: Dataset, key: float | None, moves: bool) -> tuple[Dataset, Tensor, list[Track]]:
+    """The dataset, with points found by stereo if it has neither points nor a plain background; float32 [n, 3] points
+    of what moves at the key instant, and tracks of bodies, if there is one and motion is to be learnt."""
     if dataset.points is None and not on_plain_background(dataset):
         dataset = with_points(dataset, key)
     if key is None or not moves:
-        return dataset, torch.zeros(0, 3)
-    return dataset, workers.alike(lambda: moving_starts(dataset, key))
+        return dataset, torch.zeros(0, 3), []
+    return dataset, *workers.alike(lambda: moving_bodies(dataset, key))
 
 
 def fresh_mask_logits(n: int, level: int) -> Tensor:

@@ -19,6 +19,7 @@ from pd4dgs_codec.model.networks import EXACT, Noise, Rounding
 from pd4dgs_codec.quality.measure import level_psnr
 from pd4dgs_codec.scene import MASK_THRESHOLD, instant
 from pd4dgs_codec.train.config import MOST_STEPS, TrainConfig
+from pd4dgs_codec.train.following import Track
 from pd4dgs_codec.train.initialise import check_visible, fresh_model, start_points
 from pd4dgs_codec.train.optimiser import PER_ANCHOR, Optimiser
 from pd4dgs_codec.train.schedule import Schedule
@@ -152,7 +153,7 @@ class TrainState:
     iteration: steps done, skipped ones included. skipped: steps whose loss or gradient was not finite.
     share: in a timed run the share of the schedule that is done, 0..1, set by Trainer; None otherwise.
     statistics: [N] or [N, slots] per anchor, on which growing depends, see `fresh_statistics`.
-    starts: [n, 3] points of what moves, world; None once `phases.follow` has used them, or if `start` was given.
+    tracks: of what moves, until `phases.follow` has used them; none if `start` was given.
     order: training views drawn and not yet used, the next one last.
     rho: moving average of how much the masks of levels 0 and 2 differ.
     practising: a trial is running; all views and pixels train level 0, see `phases.levels`.
@@ -174,11 +175,11 @@ class TrainState:
         self.size = size or PRESETS[config.preset]
         steps = config.model_steps(self.size.steps)
         key = config.key_instant if config.rollout == "key" else None
-        self.starts: Tensor | None = None
+        self.tracks: list[Track] = []
         if start is None:
-            placed, self.starts = start_points(dataset, key, config.max_layer > 0)
+            placed, moving, self.tracks = start_points(dataset, key, config.max_layer > 0)
             shape = config.widths, steps, config.seed, config.max_layer
-            start = fresh_model(self.size, placed, *shape, key, self.starts)
+            start = fresh_model(self.size, placed, *shape, key, moving)
         check_visible(start, dataset)
         self.model = start.to(device)
         self.views = TrainingViews(dataset.train, start.info.background, device)
@@ -296,7 +297,7 @@ class TrainState:
             "share": self.share or 0.0,
             "passed": self._before,
             "rho": self.rho,
-            "starts": self.starts,
+            "tracks": [list(track) for track in self.tracks],
             "opened": self.opened,
             "guided": self.guided,
             "skipped": self.skipped,
@@ -343,7 +344,8 @@ class TrainState:
         if self.share is not None:
             self.share, self._before = float(state["share"]), int(state["passed"])
         self.rho, self.opened, self.guided = float(state["rho"]), bool(state["opened"]), bool(state["guided"])
-        self.order, self.starts = [int(index) for index in state["order"]], state["starts"]
+        self.order = [int(index) for index in state["order"]]
+        self.tracks = [Track(*parts) for parts in state["tracks"]]
 
 
 def fresh_statistics(anchors: int, slots: int) -> dict[str, Tensor]:

@@ -7,15 +7,14 @@ instant: the deformations first learn them alone, which takes no picture. Then a
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.train import phases, workers
-from pd4dgs_codec.train.following import Track, followed
-from pd4dgs_codec.train.movers import CELLS, moving_starts
+from pd4dgs_codec.train import phases
+from pd4dgs_codec.train.following import Track
+from pd4dgs_codec.train.movers import CELLS
 from pd4dgs_codec.train.optimiser import Optimiser
 from pd4dgs_codec.train.state import TrainState
 
@@ -24,7 +23,7 @@ STEPS, POINTS, STAYING = 400, 60, 400
 
 
 class Follow(phases.Phase):
-    """Follows what moves, and teaches motion its tracks, at the end of the coarse phase."""
+    """Teaches motion the tracks of what moves, at the end of the coarse phase."""
 
     def due(self, state: TrainState) -> bool:
         """At the end of the coarse phase, if there is a key instant."""
@@ -32,13 +31,7 @@ class Follow(phases.Phase):
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
         """Teaches the tracks; sets `TrainState.opened` if there are any."""
-        info, key = state.model.info, state.key or 0.0
-        dataset = replace(state.dataset, box=info.box, near=info.near)
-        starts = state.starts
-        tracks = workers.alike(
-            lambda: followed(dataset, moving_starts(dataset, key) if starts is None else starts, key)
-        )
-        state.starts = None
+        tracks, state.tracks = state.tracks, []
         record["bodies"] = len(tracks)
         if tracks:
             teach(state, tracks)
