@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -28,6 +29,8 @@ MOST_DB = 100.0
 PARTS = 16
 #: dB that a fill gains at least: for less it is not worth its bytes.
 FILL_GAIN = 0.05
+#: The same as a quotient of squared errors.
+FILL_WORTH = 10 ** (-FILL_GAIN / 10)
 #: The spreads that are tried, in units of 1/64 above 1: 1 to 3.
 SPREADS = (0, 8, 16, 24, 32, 48, 64, 96, 128)
 
@@ -201,14 +204,15 @@ def best_fill(
     of the header without a spread. before: that of the slice before, from which the search for a spread goes downhill;
     without it all of SPREADS are tried.
     """
-    background = np.array(prefix.info.background)
-    nothing, _ = _filled(prefix, 0, viewpoints, whole, background)
-    tried = dict[int, tuple[float, np.ndarray]]()
+    tried = dict[int, Filled]()
+
+    def at(i: int) -> Filled:
+        if i not in tried:
+            tried[i] = filled(prefix, SPREADS[i], viewpoints, whole)
+        return tried[i]
 
     def error(i: int) -> float:
-        if i not in tried:
-            tried[i] = _filled(prefix, SPREADS[i], viewpoints, whole)
-        return tried[i][0]
+        return at(i).error
 
     if before:
         best = SPREADS.index(before[3]) if len(before) > 3 else 0
@@ -217,22 +221,23 @@ def best_fill(
     for way in (-1, 1):
         while 0 <= best + way < len(SPREADS) and error(best + way) < error(best):
             best += way
-    found, fill = tried[best]
-    if found >= nothing * 10 ** (-FILL_GAIN / 10):
+    if tried[best].error >= at(0).plain * FILL_WORTH:
         return None
     spread = [SPREADS[best]] if SPREADS[best] else []
-    return (*fill.astype(int).tolist(), *spread)
+    return (*tried[best].color, *spread)
 
 
-def _filled(
-    prefix: AnyScene,
-    spread: int,
-    viewpoints: Sequence[Viewpoint],
-    whole: Sequence[np.ndarray],
-    color: np.ndarray | None = None,
-) -> tuple[float, np.ndarray]:
-    """Returns (the squared error of the pictures of `prefix` with this spread over a colour, the colour float64 [3] in
-    units of 1/255); without `color` it is the best one.
+class Filled(NamedTuple):
+    """Squared errors of a prefix's pictures over the background and over the fill of this color, RGB 0..255."""
+
+    plain: float
+    error: float
+    color: tuple[int, int, int]
+
+
+def filled(prefix: AnyScene, spread: int, viewpoints: Sequence[Viewpoint], whole: Sequence[np.ndarray]) -> Filled:
+    """The best colour behind the pictures of `prefix` with this spread: the background unless another gains FILL_GAIN,
+    since a colour beside it would show where the Gaussians end.
 
     A picture over the colour b is C + T b, T the transmittance that is left. Its squared error against I is least for
     b = <T, I - C> / <T, T> in each channel.
@@ -242,9 +247,15 @@ def _filled(
     for (camera, time), target in zip(viewpoints, whole, strict=True):
         picture, alpha = player.drawn(camera, time)
         parts.append(((target - picture).astype(np.float64), 1.0 - alpha.astype(np.float64)))
-    if color is None:
-        slope = np.sum([np.einsum("hw,hwc->c", left, missing) for missing, left in parts], axis=0)
-        curve = sum(float(np.square(left).sum()) for _, left in parts)
-        color = np.rint(255 * np.clip(slope / max(curve, np.finfo(float).tiny), 0, 1)) / 255
-    error = sum(float(np.square(missing - left[..., None] * color).sum()) for missing, left in parts)
-    return error, np.rint(255 * color)
+
+    def error(color: np.ndarray) -> float:
+        return sum(float(np.square(missing - left[..., None] * color / 255).sum()) for missing, left in parts)
+
+    slope = np.sum([np.einsum("hw,hwc->c", left, missing) for missing, left in parts], axis=0)
+    curve = sum(float(np.square(left).sum()) for _, left in parts)
+    best = np.rint(255 * np.clip(slope / max(curve, np.finfo(float).tiny), 0, 1))
+    background = 255 * np.array(prefix.info.background)
+    plain, least = error(background), error(best)
+    color, least = (best, least) if least < plain * FILL_WORTH else (background, plain)
+    red, green, blue = np.rint(color).astype(int).tolist()
+    return Filled(plain, least, (red, green, blue))

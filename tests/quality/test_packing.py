@@ -19,7 +19,7 @@ from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.model.sensitivity import utility, without
 from pd4dgs_codec.quality import packing, target
-from pd4dgs_codec.quality.measure import best_fill, true_psnr
+from pd4dgs_codec.quality.measure import best_fill, filled, true_psnr
 from pd4dgs_codec.quality.packing import Views, pack
 
 FAST = EncodeOptions(mode="lzma", effort=1)
@@ -187,6 +187,17 @@ def test_a_fill_brings_every_prefix_nearer_to_the_pictures_that_order_anchors(sc
     assert info(packed.data)["layers"][0]["slices"][0]["end"] <= SLICED.slices
     rows = [row for layer in packed.json()["layers"] for row in layer["slices"]]
     assert [row["fill"] for row in rows] == [prefix.fills[-1] for prefix in (*prefixes, last)]
+
+
+def test_a_fill_that_gains_nothing_over_the_background_is_the_background(scene):
+    """Its edge would show where the Gaussians end."""
+    shown = plan(scene).symbols.scene().prefix(0)
+    own = np.array(shown.info.background)
+    noise = np.random.default_rng(0).normal(size=(3, 16, 24, 3)).astype(np.float32)
+    for apart, alike in ((1, True), (40, False)):
+        targets = over(shown, own + np.where(own > 0.5, -apart, apart) / 255)
+        color = filled(shown, 8, VIEWPOINTS, np.stack(targets) + 0.1 * noise).color
+        assert (color == tuple(np.rint(255 * own))) == alike
 
 
 @pytest.mark.parametrize("spread", [0, 16, 64])
