@@ -31,7 +31,7 @@ BINS, SAMPLES, KNOTS = 12, 31, 48
 SPREAD, STIFF = 0.1, (2.5e-3, 2.5e-4, 2.5e-5)
 #: Views of the first ROUNDS rounds, rounds in which they become all, and moves of a disc in each, which has WIDE radii
 #: of the body.
-FIRST, ROUNDS, GROWS, SHIFTS, WIDE = 4, 3, 40, 4, 1.4
+FIRST, ROUNDS, GROWS, SHIFTS, WIDE = 4, 3, 40, 4, 1.1
 TINY = 1e-9  #: keeps quotients finite
 
 
@@ -58,7 +58,7 @@ def followed(dataset: Dataset, points: Tensor, key: float) -> list[Track]:
         way = body.places
         if all(float((way - other).norm(dim=1).mean()) > body.radius for other in ways):
             ways.append(way)
-            tracks.append(body.track(key))
+            tracks.append(body.track())
     return [track for track in tracks if len(track.points) > NEAR]
 
 
@@ -89,6 +89,7 @@ class _Views:
     """All views, the nearest to the key instant first. time: [V]. eye: [V, 3]. bins: [pixels], of their colours."""
 
     def __init__(self, pictures: Sequence[Photo], key: float, near: float):
+        self.key = key
         self.pictures = pictures = sorted(pictures, key=lambda picture: abs(picture.time - key))
         self.near = near
         self.time = torch.tensor([picture.time for picture in pictures], dtype=torch.float64)
@@ -156,9 +157,11 @@ class _Body:
         self.views, self.size = views, max(float((points - middle).norm(dim=1).median()), cell / 4)
         self.radius, self.times = self.size, views.time.unique()  # type: ignore[no-untyped-call]
         count = min(len(self.times), KNOTS)
-        self.knots = middle.repeat(count, 1)
-        at = (views.time - self.times[0]) / (self.times[-1] - self.times[0]) * (count - 1)
-        self.rows = (1 - (at[:, None] - torch.arange(count)).abs()).clamp(min=0)  # [V, K]
+        self.start, self.knots = middle, middle.repeat(count, 1)
+        at = torch.cat([views.time, torch.tensor([views.key])])
+        at = (at - self.times[0]) / (self.times[-1] - self.times[0]) * (count - 1)
+        rows = (1 - (at[:, None] - torch.arange(count)).abs()).clamp(min=0)
+        self.rows, self.row = rows[:-1], rows[-1]  # [V, K] of the views and [K] of the key instant
         bend = torch.eye(count).double().diff(n=2, dim=0)
         self.bend = bend.T @ bend * float(count**3)
         self.first = self.colours = _histogram(views.bins_at(views.project(points.expand(NEAR, -1, -1))[0]))
@@ -168,6 +171,12 @@ class _Body:
         self.disc = disc[disc.norm(dim=1) <= 1]
 
     @property
+    def here(self) -> Tensor:
+        """[3]: where it is at the key instant."""
+        found: Tensor = self.row @ self.knots
+        return found
+
+    @property
     def places(self) -> Tensor:
         """[V, 3]: where it is in each view."""
         found: Tensor = self.rows @ self.knots
@@ -175,7 +184,8 @@ class _Body:
 
     def follow(self) -> bool:
         """Finds the path in more and more views. Whether half of them see the body, the median of these within half
-        a radius of its path, and by SPREAD radii farther from any place at which it could stand."""
+        a radius of its path, and by SPREAD radii farther from any place at which it could stand, and whether the path
+        still passes within a radius of where the points stand: else it has left for another body of like colours."""
         counts = [min(FIRST, len(self.rows))] * ROUNDS
         while counts[-1] < len(self.rows):
             counts.append(min(counts[-1] - (-len(self.rows) // GROWS), len(self.rows)))
@@ -184,6 +194,8 @@ class _Body:
             if (seen.weight > 0).sum() < FIRST - 1:
                 return False
             self._fit(seen)
+        if (self.here - self.start).norm() > self.radius:
+            return False
         good = seen.weight > 0
         stays = torch.linalg.lstsq(seen.flat.sum(0), (seen.flat @ self.views.eye[..., None]).sum(0)).solution[:, 0]
         own, still = (
@@ -192,20 +204,17 @@ class _Body:
         )
         return own <= 0.5 and still > own + SPREAD and bool(good.double().mean() > 0.5)
 
-    def track(self, key: float) -> Track:
+    def track(self) -> Track:
         """The track, with points that views show as the body's: its hull, as it moves (visual hull: Laurentini,
         The visual hull concept for silhouette-based image understanding, 1994)."""
-        at = (key - self.times[0]) / (self.times[-1] - self.times[0]) * (len(self.knots) - 1)
-        row = (1 - (at - torch.arange(len(self.knots))).abs()).clamp(min=0)
         side = torch.linspace(-1, 1, SAMPLES // 2, dtype=torch.float64)
         ball = torch.cartesian_prod(side, side, side) * self.radius
         pixels, _ = self.views.project(self.places[:, None] + ball)
         share = self._like(self.views.bins_at(pixels)).mean(0)
         hull = ball[share > share.max() / 2]
         hull = hull[torch.randperm(len(hull), generator=torch.Generator().manual_seed(0))[:POINTS]]
-        here = row @ self.knots
         index = [int((self.views.time == time).nonzero()[0, 0]) for time in self.times]
-        return Track((here + hull).float(), self.times.float(), (self.places[index] - here).float())
+        return Track((self.here + hull).float(), self.times.float(), (self.places[index] - self.here).float())
 
     def _like(self, bins: Tensor) -> Tensor:
         """0..1: how probably pixels of these colours are the body's."""

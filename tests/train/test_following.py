@@ -9,6 +9,7 @@ from runs import trainer_of
 
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.data.synthetic import movers, parse
+from pd4dgs_codec.model.config import PRESETS
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.train.following import bodies_of, followed
 from pd4dgs_codec.train.movers import moving_starts
@@ -16,6 +17,8 @@ from pd4dgs_codec.train.phases.follow import Follow
 
 #: A room with a small body that flies through it, seen by a camera that jumps; six cameras around three bodies.
 ROOM, CAMERAS = "synthetic:random?seed=9&frames=40&size=80x80", "synthetic:random?seed=0&frames=20&size=80x80"
+
+REAL = PRESETS["tiny"]  #: before the tests' smaller one takes its place, whose planes cannot hold three bodies' ways
 
 
 def ways(source: str) -> list[tuple[np.ndarray, float]]:
@@ -62,14 +65,15 @@ def test_points_that_hang_together_are_one_body():
     assert bodies_of(points[:0], colour[:0], 1.5) == []
 
 
-def test_motion_knows_where_bodies_are_before_it_sees_a_picture():
+def test_motion_knows_where_bodies_are_before_it_sees_a_picture(monkeypatch):
     """Level 0, learnt near the key instant, shows bodies; level 2 then shows them where they are at other times, which
     it learnt from tracks alone. Bodies of this scene were lost before."""
+    monkeypatch.setitem(PRESETS, "tiny", REAL)
     dataset = load(CAMERAS)
     learner = trainer_of(dataset, 500, 50).learner
     record: dict[str, object] = {}
     Follow().apply(learner, record)
-    assert record["bodies"] in (3, 4) and learner.opened  # one of two colours may count twice
+    assert record["bodies"] == 3 and learner.opened
     views = [view for view in dataset.train if abs(view.time - 0.5) > 0.3][::12]
     truth = np.stack([view.image for view in views]) / 255.0
     drawn = [
@@ -78,4 +82,4 @@ def test_motion_knows_where_bodies_are_before_it_sees_a_picture():
     ]
     for body in movers(CAMERAS, views):
         still, moved = (np.square(image - truth)[body.shown].mean() for image in drawn)
-        assert moved < 0.7 * still
+        assert moved < 0.4 * still
