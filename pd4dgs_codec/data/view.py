@@ -108,23 +108,16 @@ class View:
 
 
 class LaterView(View):
-    """A view whose pixels are read at each access to its image or mask. read: returns both."""
+    """A view whose pixels are read at each access to its image, or to its mask if that is not given. read: both."""
 
-    def __init__(self, read: Callable[[], tuple[np.ndarray, np.ndarray | None]], **fields: Any) -> None:
-        """fields: all fields of a View but `image` and `mask`."""
-        self.read: Callable[[], tuple[np.ndarray, np.ndarray | None]]
-        for name, value in {**fields, "read": read}.items():
-            object.__setattr__(self, name, value)
+    def __init__(self, read: Callable[[], tuple[np.ndarray, np.ndarray | None]] | None = None, **fields: Any) -> None:
+        """fields: those of a View; `dataclasses.replace` gives all of them."""
+        vars(self).update(fields, read=read)
 
-    @property
-    def image(self) -> np.ndarray:
-        """uint8 [H, W, 3]."""
-        return self.read()[0]
-
-    @property
-    def mask(self) -> np.ndarray | None:
-        """bool [H, W], or None."""
-        return self.read()[1]
+    def __getattr__(self, name: str) -> Any:
+        if name not in ("image", "mask") or self.read is None:
+            raise AttributeError(name)
+        return self.read()[name == "mask"]
 
 
 def later_view(read: Callable[[], tuple[np.ndarray, np.ndarray | None]], fields: dict[str, Any]) -> View:
