@@ -64,37 +64,27 @@ HELP = {
 
 def parser() -> options.Parser:
     p = options.Parser("encode", "model.pt -o FILE.pd4", "Encode a trained scene as a layered .pd4 file.", DETAILS)
-    add = p.add_argument
-    add("input", metavar="model.pt", help="checkpoint of pd4dgs-train, or a .pd4 file to re-encode; - reads stdin")
-    add("-o", "--output", required=True, metavar="FILE.pd4", help="file to write; - writes stdout")
+    p.add("input model.pt", "checkpoint of pd4dgs-train, or a .pd4 file to re-encode; - reads stdin")
+    p.add("-o, --output FILE.pd4", "file to write; - writes stdout", required=True)
     for name, what in HELP.items():
-        add(
-            f"--{name}",
-            type=_value,
-            choices=CHOICES[name],
-            default=vars(DEFAULTS)[name],
-            help=f"{what} (default: %(default)s)",
+        p.add(
+            f"--{name}", f"{what} (default: %(default)s)", _value, choices=CHOICES[name], default=vars(DEFAULTS)[name]
         )
     what = "factor on all quantisation steps; above 1, smaller and coarser files (default: %(default)g)"
-    add("--step-scale", type=options.positive_float, default=DEFAULTS.step_scale, metavar="X", help=what)
-    add("--no-verify", dest="verify", action="store_false", help="do not decode the result to verify it")
+    p.add("--step-scale X", what, options.positive_float, default=DEFAULTS.step_scale)
+    p.add("--no-verify", "do not decode the result to verify it", dest="verify", action="store_false")
     what = "cut layers into slices: the first of at most SIZE bytes, later ones of two thirds (default: no slices)"
-    add("--slices", type=options.size, default=DEFAULTS.slices, metavar="SIZE", help=what)
-    what = "with --slices, leave every anchor in its layer, so that all levels look as without slices"
-    add("--keep-levels", action="store_true", help=what)
+    p.add("--slices SIZE", what, options.size, default=DEFAULTS.slices)
+    p.add("--keep-levels", "with --slices, leave every anchor in its layer, so that all levels look as without slices")
     what = "byte limit, met by coarser steps and fewer anchors: 300k of the file, L0=... of layers (0 with the header)"
-    add("--target-size", type=options.layer_sizes, default={}, metavar="SIZE", help=what)
-    about = p.add_argument_group("metadata", "shown by pd4dgs-info and kept when a .pd4 file is re-encoded")
-    for name, what in (("title", "title of the scene"), ("source", "origin of the scene"), ("licence", "terms of use")):
-        about.add_argument(f"--{name}", type=options.line, metavar="TEXT", help=what)
-    views = p.add_argument_group("rendered quality")
+    p.add("--target-size SIZE", what, options.layer_sizes, default={})
+    options.add_metadata(p, "shown by pd4dgs-info and kept when a .pd4 file is re-encoded")
+    views = p.group("rendered quality")
     what = "dataset, see below: training views for the sizes and slices, held-out views for the reported quality"
-    views.add_argument("--data", metavar="SOURCE", help=what)
+    views("--data SOURCE", what)
     options.add_reading(views, unset=options.READING)
-    what = "use about N views of each split, evenly spread (default: 16)"
-    views.add_argument("--views", type=options.positive_int, metavar="N", help=what)
-    p.add_common()
-    return p
+    views("--views N", "use about N views of each split, evenly spread (default: 16)", options.positive_int)
+    return p.add_common()
 
 
 def _value(text: str) -> str | int:

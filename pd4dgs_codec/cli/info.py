@@ -29,15 +29,13 @@ SHOWN = 12  #: segments that are listed
 
 def parser() -> options.Parser:
     p = options.Parser("info", "FILE", "Show the header and layers of a .pd4 file.", DETAILS)
-    options.add_file(p, "FILE", ".pd4 file or URL, or a folder of segments; - reads stdin")
-    p.add_argument("--check", action="store_true", help="decode the whole file and check every checksum and rule")
-    p.add_argument("--bytes", action="store_true", help="show the bytes of each part of each layer")
-    what = "show SHA-256 of the integers and float32 tensors of each layer"
-    p.add_argument("--hashes", action="store_true", help=what)
+    options.add_file(p.add, "FILE", ".pd4 file or URL, or a folder of segments; - reads stdin")
+    p.add("--check", "decode the whole file and check every checksum and rule")
+    p.add("--bytes", "show the bytes of each part of each layer")
+    p.add("--hashes", "show SHA-256 of the integers and float32 tensors of each layer")
     what = "link rates in bits per second for the time to the first frame (default: 2M,10M,50M)"
-    p.add_argument("--at", type=options.rates, default="2M,10M,50M", metavar="RATES", help=what)
-    p.add_common()
-    return p
+    p.add("--at RATES", what, options.rates, default="2M,10M,50M")
+    return p.add_common()
 
 
 def _info(args: argparse.Namespace, console: Console) -> int:

@@ -60,16 +60,12 @@ COMPARED_SIDE = 480
 def parser() -> options.Parser:
     summary = "Make a folder for web servers, with a player page, DASH and HLS."
     p = options.Parser("package", "scene.pd4 -o DIR", summary, DETAILS)
-    add = p.add_argument
-    add("input", metavar="scene.pd4", help=".pd4 file (- reads stdin), or a folder of segments or of packages")
-    what = "output folder, created if missing"
-    add("-o", "--output", required=True, type=options.named, metavar="DIR", help=what)
-    add("--immutable", action="store_true", help="put checksums into file names, for long-lived caches")
-    add("--no-video", action="store_true", help="make no 2D video")
-    what = "frame rate of the 2D video (default: 20)"
-    add("--fps", type=options.fps, metavar="F", help=what)
-    p.add_common()
-    return p
+    p.add("input scene.pd4", ".pd4 file (- reads stdin), or a folder of segments or of packages")
+    p.add("-o, --output DIR", "output folder, created if missing", options.named, required=True)
+    p.add("--immutable", "put checksums into file names, for long-lived caches")
+    p.add("--no-video", "make no 2D video")
+    p.add("--fps F", "frame rate of the 2D video (default: 20)", options.fps)
+    return p.add_common()
 
 
 def check_usage(args: argparse.Namespace) -> None:

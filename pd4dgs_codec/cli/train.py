@@ -65,33 +65,29 @@ VIEW_PORT = 8080
 def parser() -> options.Parser:
     """Returns the parser. Options that are stored in a checkpoint default to None, so that conflicts are noticed."""
     p = options.Parser("train", "SOURCE -o FILE.pt", "Train a layered dynamic Gaussian scene from images.", DETAILS)
-    add = p.add_argument
-    add("source", metavar="SOURCE", help="dataset to train on, see below")
-    add("-o", "--output", required=True, type=options.named, metavar="FILE.pt", help="checkpoint to write")
-    options.add_reading(p, unset=options.READING)
-    options.add_background(p, "the dataset's; white for images with alpha")
+    p.add("source SOURCE", "dataset to train on, see below")
+    p.add("-o, --output FILE.pt", "checkpoint to write", options.named, required=True)
+    options.add_reading(p.add, unset=options.READING)
+    options.add_background(p.add, "the dataset's; white for images with alpha")
     what = "0 (small files) to 100 (high quality), see below (default: 50)"
-    add("--quality", type=options.checked(float, lambda q: 0 <= q <= 100, "0 to 100"), metavar="Q", help=what)
+    p.add("--quality Q", what, options.checked(float, lambda q: 0 <= q <= 100, "0 to 100"))
     _add_fields(p)
-    add("--device", choices=("auto", "cpu", "cuda"), default="auto", help="device to train on (default: auto)")
-    what = "continue from this checkpoint with its stored settings"
-    add("--resume", type=options.named, metavar="FILE.pt", help=what)
-    add("--log", type=options.named, metavar="FILE.jsonl", help="log to write, one JSON object per step")
+    p.add("--device", "device to train on (default: auto)", choices=("auto", "cpu", "cuda"), default="auto")
+    p.add("--resume FILE.pt", "continue from this checkpoint with its stored settings", options.named)
+    p.add("--log FILE.jsonl", "log to write, one JSON object per step", options.named)
     what = f"show the training in the browser at this port (default: {VIEW_PORT}; needs viser)"
-    add("--view", type=options.port, nargs="?", const=VIEW_PORT, metavar="PORT", help=what)
+    p.add("--view PORT", what, options.port, nargs="?", const=VIEW_PORT)
     what = f"turn off a part of the method, see below (repeatable): {', '.join(ABLATIONS)}"
-    add("--without", action="append", choices=tuple(ABLATIONS), metavar="PART", default=[], help=what)
-    parts = p.add_argument_group("segments", "a long capture as a folder of files, see below").add_argument
-    parts("--segments", type=options.duration, metavar="T", help="write segments of about this length, such as 10s")
-    what = "seconds that neighbouring segments share (default: 0s)"
-    parts("--overlap", type=options.duration, metavar="T", help=what)
+    p.add("--without PART", what, action="append", choices=tuple(ABLATIONS), default=[])
+    parts = p.group("segments", "a long capture as a folder of files, see below")
+    parts("--segments T", "write segments of about this length, such as 10s", options.duration)
+    parts("--overlap T", "seconds that neighbouring segments share (default: 0s)", options.duration)
     what = "train only the whole (whole) or segment N, from 0 on, into -o FILE.pd4"
-    parts("--part", type=options.checked(_part, lambda _: True, "whole or a number"), metavar="N", help=what)
-    parts("--whole", type=options.named, metavar="FILE.pd4", help="with --part N, the trained whole")
+    parts("--part N", what, options.checked(_part, lambda _: True, "whole or a number"))
+    parts("--whole FILE.pd4", "with --part N, the trained whole", options.named)
     what = "write a manifest of whole and segments for pd4dgs-batch, and train nothing"
-    parts("--manifest", type=options.named, metavar="FILE.jsonl", help=what)
-    p.add_common()
-    return p
+    parts("--manifest FILE.jsonl", what, options.named)
+    return p.add_common()
 
 
 def _part(text: str) -> int | str:
@@ -106,15 +102,15 @@ def _add_fields(p: options.Parser) -> None:
             continue
         name = f"--{field.name.replace('_', '-')}"
         if field.type == "bool":
-            p.add_argument(name, action="store_const", const=True, help=about.help)
+            p.add(name, about.help, action="store_const", const=True)
             continue
         kind = {"int": int, "float": float}.get(str(field.type).split(" ")[0], str)
         at = " at quality 50" if about.dial else ""
         what = about.help if field.default is None else f"{about.help} (default: {field.default}{at})"
-        settings: dict[str, Any] = {"type": kind, "choices": about.choices}
-        if not about.choices:
-            settings = {"type": options.checked(kind, about.contains, about.range), "metavar": about.metavar}
-        p.add_argument(name, help=what, **settings)
+        if about.choices:
+            p.add(name, what, kind, choices=about.choices)
+        else:
+            p.add(f"{name} {about.metavar}", what, options.checked(kind, about.contains, about.range))
 
 
 def _train(args: argparse.Namespace, console: Console) -> int:
