@@ -181,7 +181,7 @@ def _train(args: argparse.Namespace) -> Outcome:
 # -- player ------------------------------------------------------------------------------------------------------------
 
 PLAYER = """\
-Plays a file in Node and reports the CPU time of each step of a picture: medians over times of the highest level, while
+Plays a file in Node and reports the CPU time of each step of an image: medians over times of the highest level, while
 the camera moves. Steps run in workers, except those of the page. The GPU's work is not measured.
 
 examples:
@@ -191,7 +191,7 @@ examples:
 
 def _player_options(p: options.Parser) -> None:
     p.add("input FILE", ".pd4 file; - reads stdin")
-    p.add("--pictures N", "number of pictures (default: 40)", options.positive_int, default=40)
+    p.add("--pictures N", "number of images (default: 40)", options.positive_int, default=40)
 
 
 def _player(args: argparse.Namespace) -> Outcome:

@@ -30,8 +30,8 @@ Fitting takes a minute or more, and longer with --slices.
 --slices 50k lets the first frame appear after 50 kB and improve with each further slice. The anchors that matter most
 in renderings come first; without target sizes others pass to a higher layer, so that motion need not wait for them.
 This lowers the levels below the highest, as the report shows; --keep-levels leaves them as trained. Ordering the
-anchors takes up to some minutes. A slice also holds the colour that best fills what is still open behind it,
-and a factor by which its Gaussians stand for those to come.
+anchors takes up to some minutes. A slice also holds the colour that best stands in for the Gaussians of later
+slices, and a factor by which its own Gaussians are enlarged until those arrive.
 
 Sizes and slices are measured on renderings by cameras of --data, else by training cameras in the checkpoint, else by
 the file's own camera.
@@ -134,7 +134,7 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
         views=views,
         keep_levels=args.keep_levels,
         metadata=metadata,
-        progress=lambda what: progress_bar(None, "pictures", what),
+        progress=lambda what: progress_bar(None, "images", what),
     )
     result = {"input": args.input, "output": args.output, **packed.json()}
     common.write_bytes(args.output, packed.data, args.overwrite)
@@ -222,7 +222,7 @@ def _slice_lines(result: dict[str, Any]) -> list[str]:
         for layer, own in zip(result["layers"], sizes, strict=True)
     ]
     if over := [row["layer"] for row, own in zip(result["layers"], sizes, strict=True) if own[0] > about["size"]]:
-        what = "networks, planes and tracks stay whole"
+        what = "networks, planes and tracks are not cut"
         lines.append(f"first slices of layers {over} exceed {about['size']:,} bytes: {what}")
     seen = f" on {about['pictures']} views: {about['cameras']}" if about["pictures"] else ""
     seen = ": the file has no camera" if about["order"].startswith("gate") else seen

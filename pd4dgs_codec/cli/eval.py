@@ -52,7 +52,7 @@ def _evaluate(args: argparse.Namespace, console: Console) -> int:
     perceptual = load_perceptual(distances) if distances else None
     for name, why in (perceptual.absent if perceptual else {}).items():
         say(f"no {name}: {why}")
-    with progress_bar(None, "pictures", "evaluating") as step:
+    with progress_bar(None, "images", "evaluating") as step:
         result = evaluate(levels, dataset, protocol=args.protocol, perceptual=perceptual, step=step)
     result = {"input": args.input, "downscale": args.downscale, "holdout": args.holdout, **result}
     console.result(result, _text(result), on_stdout=True)

@@ -123,7 +123,7 @@ def _check_folder(path: str, overwrite: bool) -> None:
 def _player(args: argparse.Namespace) -> Drawer:
     from pd4dgs_codec.draw.player import drawer
     from pd4dgs_codec.format.decoder import decode
-    from pd4dgs_codec.quality.timeline import Timeline
+    from pd4dgs_codec.quality.levels import Timeline
     from pd4dgs_codec.segments import base_beside, is_folder
 
     if is_folder(args.input):

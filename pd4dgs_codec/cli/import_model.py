@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 DETAILS = """\
 SOURCE is found by its content:
   a PLY, compressed PLY, SPZ, SOG or .splat file, or a checkpoint of gsplat: a static scene
-  a folder of PLY, SPZ, SOG or .splat files, one per frame; whether rows keep their Gaussians is found out, and
-    Gaussians without a counterpart in the frames beside get a window in time
+  a folder of PLY, SPZ, SOG or .splat files, one per frame; whether rows keep their Gaussians is detected, and
+    Gaussians without a counterpart in the neighbouring frames get a window in time
   a run of 4DGaussians, Deformable-3DGS or SC-GS, or one of its point_cloud/iteration_N
-  a run of 4DGS or one of its chkpnt*.pth, whose duration --seconds gives if it is not found right
+  a run of 4DGS or one of its chkpnt*.pth, whose duration --seconds sets if it is detected wrongly
   a PLY file of SpacetimeGaussians (lite), a .splatv or .4dgs file
   module:function, a Python function from time 0..1 to Gaussians
 Its Gaussians and their motion are packed as they are, without training. pd4dgs-train teacher:SOURCE learns a neural
@@ -27,8 +27,8 @@ scene from its renderings instead: fewer bytes at low quality, in minutes. Code 
 --psnr D asks for D dB against the source's renderings; --quality Q means 32 + Q / 5 dB. Quality is measured from the
 cameras of a cameras.json beside the source, else from cameras on a dome around it.
 
---segments 2s makes a folder: a file for every two seconds or so, and one for the Gaussians that stand still over all of
-them. Memory does not grow with the length. Called again after an interruption, the command goes on.
+--segments 2s makes a folder: a file for every two seconds or so, and one for the Gaussians that are static in all of
+them. Memory does not grow with the length. After an interruption, the same command resumes.
 
 -o model.pt imports a run of Scaffold-GS as a checkpoint: layer 0 without loss, which pd4dgs-encode packs.
 
@@ -150,7 +150,7 @@ def _segments(args: argparse.Namespace, console: Console) -> int:
         "still": made.still,
     }
     text = f"{args.output}: {len(made.index.segments)} segments, {made.kept} of them kept, {number(made.psnr)} dB; "
-    text += f"{sizes[0]:,} bytes of what stands still, {sizes[1] / seconds:,.0f} a second of the rest"
+    text += f"{sizes[0]:,} bytes of static Gaussians, {sizes[1] / seconds:,.0f} a second of the others"
     console.result(result, text)
     return OK
 

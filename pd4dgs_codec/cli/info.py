@@ -82,7 +82,7 @@ def _segments(args: argparse.Namespace, console: Console) -> int:
     sizes = [sum(file.bytes for file in files) for files in (index.bases, index.segments)]
     result = {"input": args.input, **index.json(), "time_range": [low, high], "bytes": sum(sizes)}
     if args.check:
-        from pd4dgs_codec.quality.timeline import Timeline
+        from pd4dgs_codec.quality.levels import Timeline
 
         timeline = Timeline(folder)
         for segment in index.segments:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 DETAILS = f"""\
 Renders the file's own camera over its time range, or with --data the views of a dataset at their times.
-The suffix of -o decides the kind: .gif and .mp4 are films, .png, .jpg, .webp and .bmp pictures.
+The suffix of -o decides the kind: .gif and .mp4 are videos, .png, .jpg, .webp and .bmp images.
 
 {options.SOURCES}
 
@@ -53,14 +53,14 @@ def parser() -> options.Parser:
     p.add("--data SOURCE", "take cameras, times and ground truth from this dataset")
     p.add("--split", "views of the dataset (default: test)", choices=("test", "train"))
     options.add_reading(p.add, unset=("holdout",))
-    p.add("--time T", "render a single picture at time T, as 0..1 of the file's time range", options.share)
-    what = f"number of evenly spaced frames (default: {FRAMES}, or one image of a scene that stands still); with "
+    p.add("--time T", "render a single image at time T, as 0..1 of the file's time range", options.share)
+    what = f"number of evenly spaced frames (default: {FRAMES}, or one image of a static scene); with "
     what += "--data, of evenly spread views (default: all)"
     p.add("--frames N", what, options.positive_int)
     what = "swing the file's camera by DEG degrees about its look-at point (default: 0)"
     p.add("--orbit DEG", what, options.finite_float)
-    p.add("--fps F", f"frame rate of a film (default: {FPS:g})", options.fps)
-    what = f"length of a film, such as 4s, in place of --frames (default: {FRAMES} frames)"
+    p.add("--fps F", f"frame rate of a video (default: {FPS:g})", options.fps)
+    what = f"length of a video, such as 4s, in place of --frames (default: {FRAMES} frames)"
     p.add("--duration S", what, options.duration)
     what = "show all levels side by side, with --data beside the ground truth; a.png gets a row per frame"
     p.add("--side-by-side", what)
@@ -121,7 +121,7 @@ def _check_usage(args: argparse.Namespace) -> str:
             raise UsageError(f"found --{one} and --{other}, expected one of them")
     options.conditional(args, args.data, "needs --data SOURCE", split="test", holdout=options.READING["holdout"])
     options.conditional(args, kind in VIDEOS, "needs a .gif or .mp4 as -o", fps=FPS, duration=None)
-    options.conditional(args, kind not in VIDEOS, "needs a picture such as a.png as -o", time=None)
+    options.conditional(args, kind not in VIDEOS, "needs an image such as a.png as -o", time=None)
     if kind == ".gif" and args.fps > MAX_GIF_FPS:
         raise UsageError(f"found --fps {args.fps:g}, expected at most {MAX_GIF_FPS:g} for a .gif")
     if kind not in VIDEOS and "%" in args.output:

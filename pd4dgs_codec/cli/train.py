@@ -42,10 +42,10 @@ masks; noise, the simulated quantisation; whitening, the transform of the featur
 
 --segments 10s writes a folder, -o DIR, for a long SOURCE: a base, which holds what all times share, and a file for each
 ten seconds that continues it. pd4dgs-info, -render, -eval, -export, -package and -view take the folder as one scene.
-First a whole is trained, of all times, by --iterations and --max-seconds; its layer 0 is the base. Segments start from
-it and train for an eighteenth of its steps each, as many at a time as -j has threads. The same command goes on where it
-was interrupted. --manifest writes the lines by which pd4dgs-batch trains whole and segments, each by --part; the same
-command without --manifest then adds the index.
+First one model of all times, the whole, is trained by --iterations and --max-seconds; its layer 0 is the base. Segments
+start from it and train for an eighteenth of its steps each, as many at a time as -j has threads. The same command
+resumes after an interruption. --manifest writes the lines by which pd4dgs-batch trains whole and segments, each by
+--part; the same command without --manifest then adds the index.
 
 torchrun starts several workers for one scene: they share the V views of a step and average their gradients, and the
 first worker writes the files. Their number must divide V and may change when a run is resumed.
@@ -82,9 +82,9 @@ def parser() -> options.Parser:
     parts = p.group("segments", "a long capture as a folder of files, see below")
     parts("--segments T", "write segments of about this length, such as 10s", options.duration)
     parts("--overlap T", "seconds that neighbouring segments share (default: 0s)", options.duration)
-    what = "train only the whole (whole) or segment N, from 0 on, into -o FILE.pd4"
+    what = "train only the model of all times (whole) or segment N, from 0 on, into -o FILE.pd4"
     parts("--part N", what, options.checked(_part, lambda _: True, "whole or a number"))
-    parts("--whole FILE.pd4", "with --part N, the trained whole", options.named)
+    parts("--whole FILE.pd4", "with --part N, the trained model of all times", options.named)
     what = "write a manifest of whole and segments for pd4dgs-batch, and train nothing"
     parts("--manifest FILE.jsonl", what, options.named)
     return p.add_common()
@@ -190,7 +190,7 @@ def _train_segments(args: argparse.Namespace, console: Console) -> int:
 def _segments_text(result: dict[str, Any]) -> str:
     sizes = f"{result['base_bytes']:,} bytes of the base, {result['bytes'] - result['base_bytes']:,} of segments"
     text = f"{result['output']}: {result['segments']} segments, {result['kept']} of them kept; {sizes}"
-    return text if result["finished"] else f"{text}\nnot finished; to go on: the same command"
+    return text if result["finished"] else f"{text}\nnot finished; to continue: the same command"
 
 
 main = command(parser, _train)
@@ -400,11 +400,11 @@ def _text(result: dict[str, Any]) -> str:
     lines = [f"{result['output']}: {steps}, {result['anchors']} anchors"]
     if result["spent"]:
         parts = ", ".join(f"{name} {seconds:.1f}" for name, seconds in result["spent"].items())
-        lines.append(f"seconds that were not steps: {sum(result['spent'].values()):.0f}, of {parts}")
+        lines.append(f"seconds outside training steps: {sum(result['spent'].values()):.0f}, of {parts}")
     if result["phases_not_reached"]:
         lines.append(f"phases not reached: {', '.join(result['phases_not_reached'])}")
     if result["resume"]:
-        lines.append(f"not finished; to go on: {result['resume']}")
+        lines.append(f"not finished; to continue: {result['resume']}")
     if result["skipped"]:
         lines.append(f"{result['skipped']} steps skipped for non-finite gradients")
     for row in result["left_out"]:

@@ -269,7 +269,7 @@ def _library_page(scenes: list[dict[str, Any]]) -> str:
     for scene in scenes:
         poster = f'<img loading="lazy" alt="" src="{html.escape(scene["poster"])}">' if scene["poster"] else None
         first = ", ".join(f"{seconds:.1f} s at {rate}bps" for rate, seconds in scene["first_frame_seconds"].items())
-        about = html.escape(f"{scene['bytes'] / 1e6:.2f} MB; first picture after {first}")
+        about = html.escape(f"{scene['bytes'] / 1e6:.2f} MB; first image after {first}")
         link = f'<a href="{html.escape(scene["page"])}">{poster or "<div class=none></div>"}'
         cards.append(f"{link}<br>{html.escape(scene['name'])}<br><small>{about}</small></a>")
     title, head = f"{len(scenes)} scenes", f'<!doctype html><html lang="en">{CHARSET}'
