@@ -307,7 +307,6 @@ def _misplaced(args: argparse.Namespace, console: Console) -> int:
 
 
 def _report(execute: Callable[[argparse.Namespace], Outcome], args: argparse.Namespace, console: Console) -> int:
-    """Checks the outputs, makes the report and writes it."""
     from pd4dgs_codec.io import finite, whole_file
 
     console.json = args.json == STDIO

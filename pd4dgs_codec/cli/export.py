@@ -157,7 +157,6 @@ def _compared(args: argparse.Namespace, player: Drawer) -> Sequence[View]:
 
 
 def _write_still(args: argparse.Namespace, player: Drawer, eyes: Eyes | None) -> dict[str, Any]:
-    """Writes the Gaussians of one time."""
     import numpy as np
 
     from pd4dgs_codec.interchange.export import UNTURNED, exported, upright
@@ -196,7 +195,6 @@ def frame_times(info: SceneInfo, fps: float) -> list[float]:
 
 
 def _write_sequence(args: argparse.Namespace, player: Drawer, eyes: Eyes | None) -> dict[str, Any]:
-    """Writes frames over the whole time range."""
     from pd4dgs_codec.interchange.export import exported
     from pd4dgs_codec.interchange.splats import fourdgs_bytes
 

@@ -76,7 +76,6 @@ def parser() -> options.Parser:
 
 
 def _direction(text: str) -> tuple[float, ...]:
-    """Reads three numbers that are not all 0."""
 
     def numbers(text: str) -> tuple[float, ...]:
         return tuple(map(float, text.split(",")))
@@ -120,7 +119,6 @@ def _checkpoint(args: argparse.Namespace, console: Console) -> int:
 
 
 def _pack(args: argparse.Namespace, console: Console) -> int:
-    """Packs explicit Gaussians."""
     from pd4dgs_codec.interchange.imported import import_model
 
     made = import_model(args.input, most_bytes=args.target_size, slices=args.slices, **_asked(args))
@@ -131,7 +129,6 @@ def _pack(args: argparse.Namespace, console: Console) -> int:
 
 
 def _segments(args: argparse.Namespace, console: Console) -> int:
-    """Packs explicit Gaussians as a folder of segments."""
     from pd4dgs_codec.interchange.segmented import import_segments
 
     made = import_segments(args.input, args.output, length=args.segments, overwrite=args.overwrite, **_asked(args))

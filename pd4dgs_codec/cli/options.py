@@ -13,6 +13,7 @@ from functools import partial
 from typing import Any, NoReturn, TypeVar
 
 from pd4dgs_codec.cli.common import UsageError, tell
+from pd4dgs_codec.data.dataset import FOLDERS, color
 
 T = TypeVar("T")
 Add = Callable[..., None]  #: `Parser.add`, of the parser or of a group
@@ -20,9 +21,9 @@ Add = Callable[..., None]  #: `Parser.add`, of the parser or of a group
 EXIT_CODES = "exit codes: 0 success, 1 invalid data or I/O error, 2 usage error"
 #: Defaults of the options of `add_reading`.
 READING = {"downscale": 1, "holdout": 8}
-#: Stands for the list of sources in the details of a command; `Parser.format_help` fills it in.
-SOURCES = "<the list of sources>"
-SCENES = """\
+#: The list of sources in the details of a command.
+SOURCES = "\n  ".join(["SOURCE is one of", *FOLDERS])
+SOURCES += """
   synthetic:static   nothing moves
   synthetic:global   large objects move slowly
   synthetic:local    large objects move slowly, and small parts of them on their own
@@ -57,15 +58,6 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise UsageError(message)
-
-    def format_help(self) -> str:
-        """The help text, with the list of sources if the details name it."""
-        text = super().format_help()
-        if SOURCES in text:
-            from pd4dgs_codec.data.dataset import FOLDERS
-
-            text = text.replace(SOURCES, "\n".join(["SOURCE is one of", *(f"  {line}" for line in FOLDERS), SCENES]))
-        return text
 
     def print_help(self, file: object = None) -> NoReturn:
         """Prints the help on stdout and exits: 0, or 1 if stdout cannot be written."""
@@ -222,6 +214,7 @@ named = checked(str, lambda text: text not in ("", "-"), "the name of a file or 
 line = checked(str, str.isprintable, "one line of printable text")
 host = checked(str, bool, "a host name or an IP address")
 finite_float = checked(float, math.isfinite, "a number")
+background = checked(color, lambda _: True, "black, white or R,G,B in 0..1")
 
 
 def ending(suffix: str, *others: str) -> Callable[[str], str]:
@@ -232,13 +225,6 @@ def ending(suffix: str, *others: str) -> Callable[[str], str]:
 def listed(kind: Callable[[str], T]) -> Callable[[str], tuple[T, ...]]:
     """Makes the type of comma-separated values of a kind, without repetitions, in the order given."""
     return lambda text: tuple(dict.fromkeys(kind(part) for part in text.split(",")))
-
-
-def background(text: str) -> tuple[float, float, float]:
-    """Reads a colour as RGB in 0..1, see `dataset.color`."""
-    from pd4dgs_codec.data.dataset import color
-
-    return checked(color, lambda value: True, "black, white or R,G,B in 0..1")(text)
 
 
 def rate(text: str) -> float:

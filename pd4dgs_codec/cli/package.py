@@ -30,10 +30,9 @@ are index.json (byte ranges and SHA-256 of the slices), scene.mp4 with scene.mpd
 AdaptationSet of its own, which names the slice before it) and scene.m3u8 (HLS, with index.json as session data).
 
 DASH clients can fetch the slices, but need a .pd4 decoder to show them. DASH and HLS players without one (dash.js,
-Shaka Player, hls.js) show a 2D video, fallback.mp4, of the scene from its own camera. The video and the
-page's preview image need numba (the extra [train]) and a file with a camera, the video ffmpeg as well; otherwise they
-are left out. The preview image, at most 3 kB, is part of the page and is shown until the player has rendered a better
-one.
+Shaka Player, hls.js) show a 2D video, fallback.mp4, of the scene from its own camera. The video and the page's preview
+image need numba (the extra [train]) and a file with a camera, the video ffmpeg as well; otherwise they are left out.
+The preview image, at most 3 kB, is part of the page and is shown until the player has rendered a better one.
 
 --immutable puts a checksum into the names of the files that others refer to, so that a CDN may cache them forever.
 index.json lists the Cache-Control header of each file. For a folder of packages, pd4dgs-package writes library.json and
@@ -133,7 +132,6 @@ def _library(args: argparse.Namespace, console: Console) -> int:
 
 
 def _write(args: argparse.Namespace, files: Iterable[tuple[str, bytes]]) -> list[dict[str, Any]]:
-    """Writes all files or none; returns their names and sizes."""
     sizes = write_files(args.output, files, args.overwrite)
     return [{"name": name, "bytes": size} for name, size in sizes.items()]
 

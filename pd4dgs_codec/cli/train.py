@@ -164,7 +164,6 @@ def _train(args: argparse.Namespace, console: Console) -> int:
 
 
 def _train_segments(args: argparse.Namespace, console: Console) -> int:
-    """Trains a folder of segments, or one part of it, or writes a manifest of its parts."""
     from pd4dgs_codec.cli import train_segments as segmented
 
     config = _fresh_config(args)
@@ -321,7 +320,6 @@ def _progress(args: argparse.Namespace, trainer: Trainer) -> TrainingProgress:
 
 
 def _announce(trainer: Trainer, console: Console) -> None:
-    """Prints preset, device and time limit of the run, and what was read."""
     from pd4dgs_codec.train import workers
 
     config, dataset = trainer.config, trainer.dataset

@@ -58,7 +58,6 @@ class Capture:
 
 
 def name_of(k: int) -> str:
-    """The file of a segment."""
     return f"{k:05d}.pd4"
 
 

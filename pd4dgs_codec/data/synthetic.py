@@ -173,7 +173,6 @@ class Take:
         return time * (self.seconds / SECONDS)
 
     def bodies(self) -> list[Body]:
-        """All bodies of the scene."""
         if self.name == RANDOM:
             return random_scene(self.seed).bodies
         return Dancer(self.seed).bodies() if self.name == DANCER else bodies(self.name, self.seed)
