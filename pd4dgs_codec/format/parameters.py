@@ -138,20 +138,18 @@ def _check_declared(cells: int, total: Declared, where: str) -> None:
 
 
 def _unpack_tables(fields: Fields, where: str) -> Tables:
-    tables = Tables(kind=unpack_kind(fields.get(KIND), f"{where} kind") if KIND in fields else ())
+    found: dict[str, Any] = {}
+    if KIND in fields:
+        found["kind"] = unpack_kind(fields.get(KIND), f"{where} kind")
     if LAYER_ROWS in fields:
-        tables = replace(tables, rows=unpack_rows(fields.get(LAYER_ROWS), f"{where}: layer rows"))
-    if GRIDS in fields:
-        grids = as_long(fields.get(GRIDS), f"{where} grids", registry.MAX_GRIDS + 1, 2)
-        tables = replace(tables, grid_step=as_step(grids[0], f"{where} grids"))
-        tables = replace(tables, grids=_ascending([_unpack_grid(row, where) for row in grids[1:]], f"{where} grids"))
-    if CHAINS in fields:
-        chains = as_long(fields.get(CHAINS), f"{where} chains", registry.MAX_CHAINS + 1, 2)
-        tables = replace(tables, chain_step=as_step(chains[0], f"{where} chains"))
-        tables = replace(
-            tables, chains=_ascending([_unpack_chain(row, where) for row in chains[1:]], f"{where} chains")
-        )
-    return tables
+        found["rows"] = unpack_rows(fields.get(LAYER_ROWS), f"{where}: layer rows")
+    grids, chains = ("grid", GRIDS, registry.MAX_GRIDS), ("chain", CHAINS, registry.MAX_CHAINS)
+    for (name, key, most), unpack in ((grids, _unpack_grid), (chains, _unpack_chain)):
+        if key in fields:
+            step, *rows = as_long(fields.get(key), f"{where} {name}s", most + 1, 2)
+            found[f"{name}_step"] = as_step(step, f"{where} {name}s")
+            found[f"{name}s"] = _ascending([unpack(row, where) for row in rows], f"{where} {name}s")
+    return Tables(**found)
 
 
 def _unpack_grid(row: object, where: str) -> Grid:
@@ -174,14 +172,11 @@ def _unpack_chain(row: object, where: str) -> Chain:
     return Chain(number, tuple(widths))
 
 
-def _ascending(tensors: list[Any], where: str) -> tuple[Any, ...]:
-    _check_ascending([tensor.id for tensor in tensors], where)
-    return tuple(tensors)
-
-
-def _check_ascending(ids: Sequence[int], where: str) -> None:
+def _ascending(tensors: Sequence[Any], where: str) -> tuple[Any, ...]:
+    ids = [tensor.id for tensor in tensors]
     if any(a >= b for a, b in pairwise(ids)):
-        raise Malformed(f"{where}: ids {list(ids)}, expected them to ascend")
+        raise Malformed(f"{where}: ids {ids}, expected them to ascend")
+    return tuple(tensors)
 
 
 def pack_rows(tensors: Iterable[Rows]) -> list[list[object]]:
@@ -198,10 +193,10 @@ def unpack_rows(value: object, where: str) -> tuple[Rows, ...]:
         as_integer(channels, registry.MAX_CHANNELS, f"{where} {number}: channels", 1)
         as_registered(predictor, ROW_PREDICTORS, f"{where} {number}: predictor")
         tensors.append(Rows(number, channels, as_step(step, f"{where} {number}"), predictor))
-    _check_ascending([tensor.id for tensor in tensors], where)
-    if (width := RowTable(tuple(tensors)).channels) > registry.MAX_ROWS_WIDTH:
-        raise LimitExceeded(f"{where} of {width} channels, limit {registry.MAX_ROWS_WIDTH}")
-    return tuple(tensors)
+    table = RowTable(_ascending(tensors, where))
+    if table.channels > registry.MAX_ROWS_WIDTH:
+        raise LimitExceeded(f"{where} of {table.channels} channels, limit {registry.MAX_ROWS_WIDTH}")
+    return table.tensors
 
 
 def unpack_kind(value: object, where: str) -> Kind:
