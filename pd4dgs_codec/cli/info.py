@@ -94,15 +94,10 @@ def _segments(args: argparse.Namespace, console: Console) -> int:
     }
     head = f"{args.input}: {len(index.segments):,} segments, {low:g} to {high:g} s, {sum(sizes):,} bytes: "
     lines = [head + f"{sizes[0]:,} of what segments share, {sizes[1] / (high - low):,.0f} a second"]
-    rows = [
-        (
-            s.file,
-            *(f"{t:.6g}" for t in s.time_range),
-            "-" if s.base is None else index.bases[s.base].file,
-            number(s.bytes, 0),
-        )
-        for s in index.segments
-    ]
+    rows = []
+    for s in index.segments:
+        base = "-" if s.base is None else index.bases[s.base].file
+        rows.append((s.file, *(f"{t:.6g}" for t in s.time_range), base, number(s.bytes, 0)))
     lines.append(table(("segment", "from s", "to s", "base", "bytes"), rows if console.verbose else rows[:SHOWN]))
     lines += [f"and {len(rows) - SHOWN:,} more (-v lists all)"] if len(rows) > SHOWN and not console.verbose else []
     lines += ["checked: every segment decodes"] if args.check else []

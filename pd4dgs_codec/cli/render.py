@@ -78,13 +78,8 @@ def _render(args: argparse.Namespace, console: Console) -> int:
         from pd4dgs_codec.quality.frames import check_mp4
 
         check_mp4()
-    levels = load_levels(
-        common.named_input(args.input),
-        args.level,
-        max_bytes=args.max_bytes,
-        last_only=not args.side_by_side,
-        background=args.background,
-    )
+    file, last = common.named_input(args.input), not args.side_by_side
+    levels = load_levels(file, args.level, max_bytes=args.max_bytes, last_only=last, background=args.background)
     found = ", ".join(f"{row.level} ({row.anchors} anchors)" for row in levels)
     console.detail(f"{common.shown_name(args.input)}: levels {found}")
     frames = _frames(args, kind, levels[-1])

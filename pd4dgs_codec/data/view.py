@@ -556,10 +556,8 @@ def fitted(frame: UnreadView, size: tuple[int, int]) -> UnreadView:
     x, y = size[0] / lens.width, size[1] / lens.height
     if abs(x - 1) < RESIZED or not same_shape((lens.width, lens.height), size):
         return frame
-    note(
-        "lens scaled to the size of the picture",
-        f"{frame.image.name} of {size[0]}x{size[1]}, not as the camera {lens.width}x{lens.height}",
-    )
+    found = f"{frame.image.name} of {size[0]}x{size[1]}, not as the camera {lens.width}x{lens.height}"
+    note("lens scaled to the size of the picture", found)
     focal, middle = (lens.fx * x, lens.fy * y), (lens.cx * x, lens.cy * y)
     return replace(frame, lens=Lens(*size, *focal, *middle, lens.skew * x, lens.radial, lens.tangential, lens.fisheye))
 

@@ -86,10 +86,9 @@ class Timeline(Drawer):
     @property
     def bytes(self) -> int:
         """What a receiver of all segments up to this level has."""
-        ends = [
-            max(end for layer, end in self._ends(file).items() if layer <= self.level) for file in self.index.segments
-        ]
-        return sum(base.bytes for base in self.index.bases) + sum(ends)
+        ends = map(self._ends, self.index.segments)
+        own = sum(max(end for layer, end in each.items() if layer <= self.level) for each in ends)
+        return own + sum(base.bytes for base in self.index.bases)
 
     def _ends(self, file: File) -> dict[int, int]:
         """The end of each layer, by the header."""
