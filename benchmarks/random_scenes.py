@@ -20,10 +20,10 @@ from typing import Any
 
 import numpy as np
 from common import ROOT, Row, number, say, table
+from moving_bodies import movers
 from PIL import Image
 
 from pd4dgs_codec.data.dataset import load
-from pd4dgs_codec.data.synthetic import movers
 from pd4dgs_codec.data.view import Dataset, View, thinned
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.quality.evaluate import evaluate

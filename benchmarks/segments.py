@@ -31,7 +31,7 @@ from pd4dgs_codec.interchange.splats import picture, ply_bytes, sphere
 from pd4dgs_codec.interchange.teacher import Options, cameras_of
 from pd4dgs_codec.kinds.splats import SH_C0, Splats, unit
 from pd4dgs_codec.quality.image import mpsnr
-from pd4dgs_codec.quality.timeline import Timeline
+from pd4dgs_codec.quality.levels import Timeline
 from pd4dgs_codec.scene import Camera
 from pd4dgs_codec.segments import INDEX, read_index
 from pd4dgs_codec.web.page import page

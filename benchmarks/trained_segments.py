@@ -20,7 +20,7 @@ from pd4dgs_codec.cli.train_segments import Capture
 from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.draw.player import Drawer, drawer
 from pd4dgs_codec.quality.image import mpsnr
-from pd4dgs_codec.quality.timeline import Timeline
+from pd4dgs_codec.quality.levels import Timeline
 from pd4dgs_codec.segments import read_index
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.segmented import Cuts, Part, segment_config, train_part

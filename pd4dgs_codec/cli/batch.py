@@ -53,37 +53,29 @@ examples:
 
 def parser() -> options.Parser:
     p = options.Parser("batch", "MANIFEST --op OP -o URI", "Run a command on many scenes.", DETAILS)
-    add = p.add_argument
-    add("input", metavar="MANIFEST", help="file of JSON lines, see below")
-    add("-o", "--output", required=True, type=options.named, metavar="URI", help="output folder or URI")
-    add("--op", required=True, choices=OPS, help="command to run on each scene (pd4dgs-OP)")
-    add("--on", choices=ENGINES, default="local", help="where to run the command (default: local)")
+    p.add("input MANIFEST", "file of JSON lines, see below")
+    p.add("-o, --output URI", "output folder or URI", options.named, required=True)
+    p.add("--op", "command to run on each scene (pd4dgs-OP)", required=True, choices=OPS)
+    p.add("--on", "where to run the command (default: local)", choices=ENGINES, default="local")
     what = "scenes at a time (default: one per core; ray: as many as fit; 0: one after another in this process)"
-    add("--workers", type=options.count, metavar="N", help=what)
-    what = "threads per scene (default: 1; local: an equal share of -j)"
-    add("--cpus", type=options.positive_int, metavar="N", help=what)
-    add("--gpus", type=options.non_negative_float, metavar="N", help="GPUs per scene (default: 0)")
-    what = "retries of a failed scene (default: %(default)s)"
-    add("--retries", type=options.count, default=2, metavar="N", help=what)
-    what = "time limit of each try, such as 90s (default: none)"
-    add("--timeout", type=options.duration, metavar="T", help=what)
-    what = "folder for the logs of failed scenes (default: %(default)s)"
-    add("--logs", default="batch-logs", metavar="DIR", help=what)
-    what = "address of the Ray cluster (default: RAY_ADDRESS, else a new local cluster)"
-    add("--address", metavar="A", help=what)
+    p.add("--workers N", what, options.count)
+    p.add("--cpus N", "threads per scene (default: 1; local: an equal share of -j)", options.positive_int)
+    p.add("--gpus N", "GPUs per scene (default: 0)", options.non_negative_float)
+    p.add("--retries N", "retries of a failed scene (default: %(default)s)", options.count, default=2)
+    p.add("--timeout T", "time limit of each try, such as 90s (default: none)", options.duration)
+    p.add("--logs DIR", "folder for the logs of failed scenes (default: %(default)s)", default="batch-logs")
+    p.add("--address A", "address of the Ray cluster (default: RAY_ADDRESS, else a new local cluster)")
     what = "parameter of submitit, such as slurm_partition=gpu; cluster=local runs on this machine"
-    add("--slurm", type=PARAMETER, action="append", metavar="KEY=VALUE", help=what)
-    p.add_common()
-    return p
+    p.add("--slurm KEY=VALUE", what, PARAMETER, action="append")
+    return p.add_common()
 
 
 def scan_parser() -> options.Parser:
     p = options.Parser("batch scan", "FOLDER", "Write a manifest of the sources in a folder.", SCAN_DETAILS)
-    p.add_argument("input", metavar="FOLDER", help="folder or URI of the sources")
-    p.add_argument("--op", choices=OPS, help="command of the manifest (default: chosen by the sources found)")
-    p.add_argument("-o", "--output", default=STDIO, metavar="FILE", help="manifest to write (default: stdout)")
-    p.add_common()
-    return p
+    p.add("input FOLDER", "folder or URI of the sources")
+    p.add("--op", "command of the manifest (default: chosen by the sources found)", choices=OPS)
+    p.add("-o, --output FILE", "manifest to write (default: stdout)", default=STDIO)
+    return p.add_common()
 
 
 def main(argv: Sequence[str] | None = None) -> int:

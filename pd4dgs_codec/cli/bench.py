@@ -36,11 +36,9 @@ CHECKPOINT = "needs a checkpoint, not a .pd4 file"
 
 def _add_views(p: options.Parser, views: int) -> None:
     """Adds the options that choose the images to render. views: their default number."""
-    add = p.add_argument
-    what = "use the held-out cameras of this dataset (default: the file's own camera over time)"
-    add("--data", metavar="SOURCE", help=what)
-    options.add_reading(p, unset=options.READING)
-    add("--views", type=options.positive_int, metavar="N", help=f"number of images (default: {views})")
+    p.add("--data SOURCE", "use the held-out cameras of this dataset (default: the file's own camera over time)")
+    options.add_reading(p.add, unset=options.READING)
+    p.add("--views N", f"number of images (default: {views})", options.positive_int)
 
 
 def _complete_views(args: argparse.Namespace, views: int, rendered: bool = True) -> None:
@@ -84,13 +82,12 @@ def _codec_options(p: options.Parser) -> None:
     mode = options.checked(str, MODES.__contains__, f"one of {', '.join(MODES)}")
     effort = options.checked(int, lambda value: 1 <= value <= 9, "an integer from 1 to 9")
     scales, modes, efforts = map(options.listed, (options.positive_float, mode, effort))
-    add = p.add_argument
-    add("input", metavar="FILE", help="checkpoint of pd4dgs-train or .pd4 file; - reads stdin")
-    add("--step-scales", type=scales, metavar="X,...", help="factors on all quantisation steps (default: 0.5,1,2,4)")
-    add("--modes", type=modes, metavar="M,...", help="entropy coders (default: ans,lzma)")
-    add("--efforts", type=efforts, metavar="N,...", help="compression efforts, 1 to 9 (default: 1,5,9)")
-    add("--repeats", type=options.positive_int, metavar="N", help="repetitions of each measurement (default: 5)")
-    add("--quick", action="store_true", help="only --step-scales 1,2 --efforts 1 --repeats 1")
+    p.add("input FILE", "checkpoint of pd4dgs-train or .pd4 file; - reads stdin")
+    p.add("--step-scales X,...", "factors on all quantisation steps (default: 0.5,1,2,4)", scales)
+    p.add("--modes M,...", "entropy coders (default: ans,lzma)", modes)
+    p.add("--efforts N,...", "compression efforts, 1 to 9 (default: 1,5,9)", efforts)
+    p.add("--repeats N", "repetitions of each measurement (default: 5)", options.positive_int)
+    p.add("--quick", "only --step-scales 1,2 --efforts 1 --repeats 1")
     _add_views(p, 6)
 
 
@@ -129,12 +126,10 @@ examples:
 
 
 def _render_options(p: options.Parser) -> None:
-    add = p.add_argument
-    add("input", metavar="FILE", help=".pd4 file or .pt checkpoint; - reads a .pd4 from stdin")
+    p.add("input FILE", ".pd4 file or .pt checkpoint; - reads a .pd4 from stdin")
     what = "rasterisers to measure: oracle float64, kernels, gsplat (default: all)"
-    add("--only", type=options.listed(str), metavar="NAME,...", help=what)
-    what = "repetitions per image (default: 15)"
-    add("--repeats", type=options.positive_int, default=15, metavar="N", help=what)
+    p.add("--only NAME,...", what, options.listed(str))
+    p.add("--repeats N", "repetitions per image (default: 15)", options.positive_int, default=15)
     _add_views(p, 2)
 
 
@@ -173,7 +168,7 @@ examples:
 
 
 def _train_options(p: options.Parser) -> None:
-    p.add_argument("inputs", nargs="+", metavar="FILE", help="checkpoints of pd4dgs-train")
+    p.add("inputs FILE", "checkpoints of pd4dgs-train", nargs="+")
 
 
 def _train(args: argparse.Namespace) -> Outcome:
@@ -186,7 +181,7 @@ def _train(args: argparse.Namespace) -> Outcome:
 # -- player ------------------------------------------------------------------------------------------------------------
 
 PLAYER = """\
-Plays a file in Node and reports the CPU time of each step of a picture: medians over times of the highest level, while
+Plays a file in Node and reports the CPU time of each step of an image: medians over times of the highest level, while
 the camera moves. Steps run in workers, except those of the page. The GPU's work is not measured.
 
 examples:
@@ -195,9 +190,8 @@ examples:
 
 
 def _player_options(p: options.Parser) -> None:
-    p.add_argument("input", metavar="FILE", help=".pd4 file; - reads stdin")
-    what = "number of pictures (default: 40)"
-    p.add_argument("--pictures", type=options.positive_int, default=40, metavar="N", help=what)
+    p.add("input FILE", ".pd4 file; - reads stdin")
+    p.add("--pictures N", "number of images (default: 40)", options.positive_int, default=40)
 
 
 def _player(args: argparse.Namespace) -> Outcome:
@@ -222,11 +216,9 @@ examples:
 
 
 def _latency_options(p: options.Parser) -> None:
-    add = p.add_argument
-    add("inputs", nargs="+", metavar="FILE", help=".pd4 files with a camera")
-    what = "link rates in bits per second (default: 2M,10M,50M)"
-    add("--rates", type=options.rates, default="2M,10M,50M", metavar="R", help=what)
-    add("--runs", type=options.positive_int, default=9, metavar="N", help="runs per median (default: 9)")
+    p.add("inputs FILE", ".pd4 files with a camera", nargs="+")
+    p.add("--rates R", "link rates in bits per second (default: 2M,10M,50M)", options.rates, default="2M,10M,50M")
+    p.add("--runs N", "runs per median (default: 9)", options.positive_int, default=9)
 
 
 def _latency(args: argparse.Namespace) -> Outcome:
@@ -292,17 +284,15 @@ def parser(name: str | None = None) -> options.Parser:
         report.add_options(p)
         if report.plot:
             what = "plot error against cost on log axes, with the Pareto front"
-            p.add_argument("-o", "--plot", type=options.ending(".png"), metavar="FILE.png", help=what)
-        p.add_common(json_file=True)
-        return p
+            p.add("-o, --plot FILE.png", what, options.ending(".png"))
+        return p.add_common(json_file=True)
     lines = [f"  {name:<11} {report.summary}" for name, report in REPORTS.items()]
     examples = [f"  pd4dgs-bench {name} --help" for name in REPORTS]
     details = "\n".join(["REPORT is one of", *lines, "", "examples:", *examples])
     summary = "Measure error against run time, and latency."
     p = options.Parser("bench", "REPORT", summary, details)
-    p.add_argument("report", metavar="REPORT", choices=tuple(REPORTS), help="report to make, see below")
-    p.add_common()
-    return p
+    p.add("report REPORT", "report to make, see below", choices=tuple(REPORTS))
+    return p.add_common()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -317,7 +307,6 @@ def _misplaced(args: argparse.Namespace, console: Console) -> int:
 
 
 def _report(execute: Callable[[argparse.Namespace], Outcome], args: argparse.Namespace, console: Console) -> int:
-    """Checks the outputs, makes the report and writes it."""
     from pd4dgs_codec.io import finite, whole_file
 
     console.json = args.json == STDIO

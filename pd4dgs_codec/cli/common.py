@@ -120,12 +120,11 @@ def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     """Formats rows as right-aligned columns under their heads; the first column is left-aligned."""
     cells = [list(head), *([str(cell) for cell in row] for row in rows)]
     widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
-    return "\n".join(
-        "  ".join(
-            cell.rjust(w) if i else cell.ljust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in cells
-    )
+    lines = []
+    for first, *others in cells:
+        columns = [first.ljust(widths[0]), *(cell.rjust(w) for cell, w in zip(others, widths[1:], strict=True))]
+        lines.append("  ".join(columns).rstrip())
+    return "\n".join(lines)
 
 
 def number(value: float | None, digits: int = 2) -> str:

@@ -34,14 +34,12 @@ exit code 3: truncated input, decoded as far as possible (--allow-partial)"""
 
 def parser() -> options.Parser:
     p = options.Parser("decode", "[scene.pd4] [-o FILE]", "Decode a .pd4 file or its first layers.", DETAILS)
-    add = p.add_argument
-    add("input", nargs="?", default=STDIO, metavar="scene.pd4", help=".pd4 file or URL; - reads stdin (default: -)")
-    add("-o", "--output", metavar="FILE", help="FILE.npz or FILE.pt; - writes .npz to stdout (default: check only)")
-    options.add_prefix(p, "decode")
-    add("--symbols", action="store_true", help="add quantised integers (NAME_q) and steps (NAME_step) to the .npz")
-    add("--allow-partial", action="store_true", help="decode the complete slices of a truncated file, with exit code 3")
-    p.add_common()
-    return p
+    p.add("input scene.pd4", ".pd4 file or URL; - reads stdin (default: -)", nargs="?", default=STDIO)
+    p.add("-o, --output FILE", "FILE.npz or FILE.pt; - writes .npz to stdout (default: check only)")
+    options.add_prefix(p.add, "decode")
+    p.add("--symbols", "add quantised integers (NAME_q) and steps (NAME_step) to the .npz")
+    p.add("--allow-partial", "decode the complete slices of a truncated file, with exit code 3")
+    return p.add_common()
 
 
 def _decode(args: argparse.Namespace, console: Console) -> int:

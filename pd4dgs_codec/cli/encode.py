@@ -30,8 +30,8 @@ Fitting takes a minute or more, and longer with --slices.
 --slices 50k lets the first frame appear after 50 kB and improve with each further slice. The anchors that matter most
 in renderings come first; without target sizes others pass to a higher layer, so that motion need not wait for them.
 This lowers the levels below the highest, as the report shows; --keep-levels leaves them as trained. Ordering the
-anchors takes up to some minutes. A slice also holds the colour that best fills what is still open behind it,
-and a factor by which its Gaussians stand for those to come.
+anchors takes up to some minutes. A slice also holds the colour that best stands in for the Gaussians of later
+slices, and a factor by which its own Gaussians are enlarged until those arrive.
 
 Sizes and slices are measured on renderings by cameras of --data, else by training cameras in the checkpoint, else by
 the file's own camera.
@@ -64,37 +64,27 @@ HELP = {
 
 def parser() -> options.Parser:
     p = options.Parser("encode", "model.pt -o FILE.pd4", "Encode a trained scene as a layered .pd4 file.", DETAILS)
-    add = p.add_argument
-    add("input", metavar="model.pt", help="checkpoint of pd4dgs-train, or a .pd4 file to re-encode; - reads stdin")
-    add("-o", "--output", required=True, metavar="FILE.pd4", help="file to write; - writes stdout")
+    p.add("input model.pt", "checkpoint of pd4dgs-train, or a .pd4 file to re-encode; - reads stdin")
+    p.add("-o, --output FILE.pd4", "file to write; - writes stdout", required=True)
     for name, what in HELP.items():
-        add(
-            f"--{name}",
-            type=_value,
-            choices=CHOICES[name],
-            default=vars(DEFAULTS)[name],
-            help=f"{what} (default: %(default)s)",
+        p.add(
+            f"--{name}", f"{what} (default: %(default)s)", _value, choices=CHOICES[name], default=vars(DEFAULTS)[name]
         )
     what = "factor on all quantisation steps; above 1, smaller and coarser files (default: %(default)g)"
-    add("--step-scale", type=options.positive_float, default=DEFAULTS.step_scale, metavar="X", help=what)
-    add("--no-verify", dest="verify", action="store_false", help="do not decode the result to verify it")
+    p.add("--step-scale X", what, options.positive_float, default=DEFAULTS.step_scale)
+    p.add("--no-verify", "do not decode the result to verify it", dest="verify", action="store_false")
     what = "cut layers into slices: the first of at most SIZE bytes, later ones of two thirds (default: no slices)"
-    add("--slices", type=options.size, default=DEFAULTS.slices, metavar="SIZE", help=what)
-    what = "with --slices, leave every anchor in its layer, so that all levels look as without slices"
-    add("--keep-levels", action="store_true", help=what)
+    p.add("--slices SIZE", what, options.size, default=DEFAULTS.slices)
+    p.add("--keep-levels", "with --slices, leave every anchor in its layer, so that all levels look as without slices")
     what = "byte limit, met by coarser steps and fewer anchors: 300k of the file, L0=... of layers (0 with the header)"
-    add("--target-size", type=options.layer_sizes, default={}, metavar="SIZE", help=what)
-    about = p.add_argument_group("metadata", "shown by pd4dgs-info and kept when a .pd4 file is re-encoded")
-    for name, what in (("title", "title of the scene"), ("source", "origin of the scene"), ("licence", "terms of use")):
-        about.add_argument(f"--{name}", type=options.line, metavar="TEXT", help=what)
-    views = p.add_argument_group("rendered quality")
+    p.add("--target-size SIZE", what, options.layer_sizes, default={})
+    options.add_metadata(p, "shown by pd4dgs-info and kept when a .pd4 file is re-encoded")
+    views = p.group("rendered quality")
     what = "dataset, see below: training views for the sizes and slices, held-out views for the reported quality"
-    views.add_argument("--data", metavar="SOURCE", help=what)
+    views("--data SOURCE", what)
     options.add_reading(views, unset=options.READING)
-    what = "use about N views of each split, evenly spread (default: 16)"
-    views.add_argument("--views", type=options.positive_int, metavar="N", help=what)
-    p.add_common()
-    return p
+    views("--views N", "use about N views of each split, evenly spread (default: 16)", options.positive_int)
+    return p.add_common()
 
 
 def _value(text: str) -> str | int:
@@ -144,7 +134,7 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
         views=views,
         keep_levels=args.keep_levels,
         metadata=metadata,
-        progress=lambda what: progress_bar(None, "pictures", what),
+        progress=lambda what: progress_bar(None, "images", what),
     )
     result = {"input": args.input, "output": args.output, **packed.json()}
     common.write_bytes(args.output, packed.data, args.overwrite)
@@ -232,7 +222,7 @@ def _slice_lines(result: dict[str, Any]) -> list[str]:
         for layer, own in zip(result["layers"], sizes, strict=True)
     ]
     if over := [row["layer"] for row, own in zip(result["layers"], sizes, strict=True) if own[0] > about["size"]]:
-        what = "networks, planes and tracks stay whole"
+        what = "networks, planes and tracks are not cut"
         lines.append(f"first slices of layers {over} exceed {about['size']:,} bytes: {what}")
     seen = f" on {about['pictures']} views: {about['cameras']}" if about["pictures"] else ""
     seen = ": the file has no camera" if about["order"].startswith("gate") else seen

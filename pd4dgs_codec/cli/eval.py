@@ -26,16 +26,15 @@ examples:
 
 def parser() -> options.Parser:
     p = options.Parser("eval", "FILE SOURCE", "Measure quality, bytes and time of each level on a dataset.", DETAILS)
-    p.add_argument("input", metavar="FILE", help=".pd4 file or .pt checkpoint; - reads a .pd4 from stdin")
-    p.add_argument("source", metavar="SOURCE", help="dataset to compare with, see below")
-    options.add_prefix(p, "measure")
-    options.add_reading(p)
+    p.add("input FILE", ".pd4 file or .pt checkpoint; - reads a .pd4 from stdin")
+    p.add("source SOURCE", "dataset to compare with, see below")
+    options.add_prefix(p.add, "measure")
+    options.add_reading(p.add)
     what = "metrics of DyCheck or of 3D Gaussian Splatting, see below (default: dycheck)"
-    p.add_argument("--protocol", choices=("dycheck", "3dgs"), default="dycheck", help=what)
-    options.add_background(p, "the file's")
-    p.add_argument("--perceptual", action="store_true", help="also measure perceptual distances (slow)")
-    p.add_common()
-    return p
+    p.add("--protocol", what, choices=("dycheck", "3dgs"), default="dycheck")
+    options.add_background(p.add, "the file's")
+    p.add("--perceptual", "also measure perceptual distances (slow)")
+    return p.add_common()
 
 
 def _evaluate(args: argparse.Namespace, console: Console) -> int:
@@ -53,7 +52,7 @@ def _evaluate(args: argparse.Namespace, console: Console) -> int:
     perceptual = load_perceptual(distances) if distances else None
     for name, why in (perceptual.absent if perceptual else {}).items():
         say(f"no {name}: {why}")
-    with progress_bar(None, "pictures", "evaluating") as step:
+    with progress_bar(None, "images", "evaluating") as step:
         result = evaluate(levels, dataset, protocol=args.protocol, perceptual=perceptual, step=step)
     result = {"input": args.input, "downscale": args.downscale, "holdout": args.holdout, **result}
     console.result(result, _text(result), on_stdout=True)

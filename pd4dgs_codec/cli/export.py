@@ -54,25 +54,19 @@ SCALE = options.checked(float, lambda x: 1e-6 <= x <= 1e6, "a number from 1e-6 t
 
 def parser() -> options.Parser:
     p = options.Parser("export", "FILE -o OUT", "Export a scene as Gaussians for other viewers.", DETAILS)
-    p.add_argument("input", metavar="FILE", help=".pd4 file or a folder of segments; - reads stdin")
-    what = "output file; a folder for ply-seq"
-    p.add_argument("-o", "--output", required=True, type=options.named, metavar="OUT", help=what)
-    p.add_argument("--to", choices=KINDS, help="file format, see below (default: by the suffix of OUT)")
-    what = "time of ply, spz and glb, as 0..1 of the file's time range (default: 0)"
-    p.add_argument("--time", type=options.share, metavar="T", help=what)
-    what = f"frame rate of ply-seq and 4dgs (default: {FPS:g})"
-    p.add_argument("--fps", type=options.fps, metavar="F", help=what)
-    options.add_level(p, "export")
-    what = "degree of the spherical harmonics (default: 3)"
-    p.add_argument("--sh", type=int, choices=(0, 1, 2, 3), default=3, help=what)
+    p.add("input FILE", ".pd4 file or a folder of segments; - reads stdin")
+    p.add("-o, --output OUT", "output file; a folder for ply-seq", options.named, required=True)
+    p.add("--to", "file format, see below (default: by the suffix of OUT)", choices=KINDS)
+    p.add("--time T", "time of ply, spz and glb, as 0..1 of the file's time range (default: 0)", options.share)
+    p.add("--fps F", f"frame rate of ply-seq and 4dgs (default: {FPS:g})", options.fps)
+    options.add_level(p.add, "export")
+    p.add("--sh", "degree of the spherical harmonics (default: 3)", int, choices=(0, 1, 2, 3), default=3)
     what = "factor on all lengths; enlarge small scenes for the fixed-point positions of SPZ (default: 1)"
-    p.add_argument("--scale", type=SCALE, default=1.0, metavar="X", help=what)
-    p.add_argument("--data", metavar="SOURCE", help="use the training cameras of this dataset as viewpoints")
-    what = "measure PSNR before and after export on the held-out views of this dataset"
-    p.add_argument("--compare", metavar="SOURCE", help=what)
-    options.add_reading(p, unset=options.READING)
-    p.add_common()
-    return p
+    p.add("--scale X", what, SCALE, default=1.0)
+    p.add("--data SOURCE", "use the training cameras of this dataset as viewpoints")
+    p.add("--compare SOURCE", "measure PSNR before and after export on the held-out views of this dataset")
+    options.add_reading(p.add, unset=options.READING)
+    return p.add_common()
 
 
 def _export(args: argparse.Namespace, console: Console) -> int:
@@ -129,7 +123,7 @@ def _check_folder(path: str, overwrite: bool) -> None:
 def _player(args: argparse.Namespace) -> Drawer:
     from pd4dgs_codec.draw.player import drawer
     from pd4dgs_codec.format.decoder import decode
-    from pd4dgs_codec.quality.timeline import Timeline
+    from pd4dgs_codec.quality.levels import Timeline
     from pd4dgs_codec.segments import base_beside, is_folder
 
     if is_folder(args.input):
@@ -163,7 +157,6 @@ def _compared(args: argparse.Namespace, player: Drawer) -> Sequence[View]:
 
 
 def _write_still(args: argparse.Namespace, player: Drawer, eyes: Eyes | None) -> dict[str, Any]:
-    """Writes the Gaussians of one time."""
     import numpy as np
 
     from pd4dgs_codec.interchange.export import UNTURNED, exported, upright
@@ -202,7 +195,6 @@ def frame_times(info: SceneInfo, fps: float) -> list[float]:
 
 
 def _write_sequence(args: argparse.Namespace, player: Drawer, eyes: Eyes | None) -> dict[str, Any]:
-    """Writes frames over the whole time range."""
     from pd4dgs_codec.interchange.export import exported
     from pd4dgs_codec.interchange.splats import fourdgs_bytes
 

@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 DETAILS = """\
 SOURCE is found by its content:
   a PLY, compressed PLY, SPZ, SOG or .splat file, or a checkpoint of gsplat: a static scene
-  a folder of PLY, SPZ, SOG or .splat files, one per frame; whether rows keep their Gaussians is found out, and
-    Gaussians without a counterpart in the frames beside get a window in time
+  a folder of PLY, SPZ, SOG or .splat files, one per frame; whether rows keep their Gaussians is detected, and
+    Gaussians without a counterpart in the neighbouring frames get a window in time
   a run of 4DGaussians, Deformable-3DGS or SC-GS, or one of its point_cloud/iteration_N
-  a run of 4DGS or one of its chkpnt*.pth, whose duration --seconds gives if it is not found right
+  a run of 4DGS or one of its chkpnt*.pth, whose duration --seconds sets if it is detected wrongly
   a PLY file of SpacetimeGaussians (lite), a .splatv or .4dgs file
   module:function, a Python function from time 0..1 to Gaussians
 Its Gaussians and their motion are packed as they are, without training. pd4dgs-train teacher:SOURCE learns a neural
@@ -27,8 +27,8 @@ scene from its renderings instead: fewer bytes at low quality, in minutes. Code 
 --psnr D asks for D dB against the source's renderings; --quality Q means 32 + Q / 5 dB. Quality is measured from the
 cameras of a cameras.json beside the source, else from cameras on a dome around it.
 
---segments 2s makes a folder: a file for every two seconds or so, and one for the Gaussians that stand still over all of
-them. Memory does not grow with the length. Called again after an interruption, the command goes on.
+--segments 2s makes a folder: a file for every two seconds or so, and one for the Gaussians that are static in all of
+them. Memory does not grow with the length. After an interruption, the same command resumes.
 
 -o model.pt imports a run of Scaffold-GS as a checkpoint: layer 0 without loss, which pd4dgs-encode packs.
 
@@ -52,42 +52,30 @@ SCAFFOLD = ("appearance", "voxel_size")
 
 def parser() -> options.Parser:
     p = options.Parser("import", "SOURCE -o FILE.pd4", "Pack a model of another program.", DETAILS)
-    add = p.add_argument
-    add("input", metavar="SOURCE", help="file, folder or module:function, see below")
-    what = "file to write; a checkpoint if it ends in .pt"
-    add("-o", "--output", required=True, type=options.named, metavar="FILE.pd4", help=what)
-    goal = p.add_mutually_exclusive_group()
-    add = goal.add_argument
+    p.add("input SOURCE", "file, folder or module:function, see below")
+    p.add("-o, --output FILE.pd4", "file to write; a checkpoint if it ends in .pt", options.named, required=True)
+    goal = p.exclusive()
     what = f"0 (small files) to 100 (default: {QUALITY:g})"
-    add("--quality", type=options.checked(float, lambda q: 0 <= q <= 100, "0 to 100"), metavar="Q", help=what)
-    add("--target-size", type=options.size, metavar="SIZE", help="most bytes of the file, such as 400k")
+    goal("--quality Q", what, options.checked(float, lambda q: 0 <= q <= 100, "0 to 100"))
+    goal("--target-size SIZE", "most bytes of the file, such as 400k", options.size)
     db = options.checked(float, lambda d: 10 <= d <= 80, "10 to 80")
-    add("--psnr", type=db, metavar="D", help="dB against the source's renderings")
-    add = p.add_argument
-    add("--slices", type=options.size, metavar="SIZE", help="cut layers into slices, the first of at most SIZE bytes")
-    what = "write a folder of segments of about this length, such as 2s"
-    add("--segments", type=options.duration, metavar="T", help=what)
-    rate = p.add_mutually_exclusive_group()
-    rate.add_argument("--fps", type=options.fps, metavar="F", help="frames per second of a folder (default: 30)")
-    what = "duration, from the first instant to the last"
-    rate.add_argument("--seconds", type=options.positive_float, metavar="S", help=what)
-    options.add_background(p, "that of the run, else black")
-    what = "up direction (default: of the cameras, else 0,-1,0)"
-    add("--up", type=_direction, metavar="X,Y,Z", help=what)
-    about = p.add_argument_group("metadata", "shown by pd4dgs-info")
-    for name, what in (("title", "title of the scene"), ("source", "origin of the scene"), ("licence", "terms of use")):
-        about.add_argument(f"--{name}", type=options.line, metavar="TEXT", help=what)
-    scaffold = p.add_argument_group("Scaffold-GS, with -o model.pt")
-    what = "appearance embedding to use, if colours depend on one"
-    scaffold.add_argument("--appearance", type=options.count, metavar="I", help=what)
+    goal("--psnr D", "dB against the source's renderings", db)
+    p.add("--slices SIZE", "cut layers into slices, the first of at most SIZE bytes", options.size)
+    p.add("--segments T", "write a folder of segments of about this length, such as 2s", options.duration)
+    rate = p.exclusive()
+    rate("--fps F", "frames per second of a folder (default: 30)", options.fps)
+    rate("--seconds S", "duration, from the first instant to the last", options.positive_float)
+    options.add_background(p.add, "that of the run, else black")
+    p.add("--up X,Y,Z", "up direction (default: of the cameras, else 0,-1,0)", _direction)
+    options.add_metadata(p, "shown by pd4dgs-info")
+    scaffold = p.group("Scaffold-GS, with -o model.pt")
+    scaffold("--appearance I", "appearance embedding to use, if colours depend on one", options.count)
     what = "voxel size of the anchor grid in scene units (default: from cfg_args or the anchors)"
-    scaffold.add_argument("--voxel-size", type=options.positive_float, metavar="V", help=what)
-    p.add_common()
-    return p
+    scaffold("--voxel-size V", what, options.positive_float)
+    return p.add_common()
 
 
 def _direction(text: str) -> tuple[float, ...]:
-    """Reads three numbers that are not all 0."""
 
     def numbers(text: str) -> tuple[float, ...]:
         return tuple(map(float, text.split(",")))
@@ -131,7 +119,6 @@ def _checkpoint(args: argparse.Namespace, console: Console) -> int:
 
 
 def _pack(args: argparse.Namespace, console: Console) -> int:
-    """Packs explicit Gaussians."""
     from pd4dgs_codec.interchange.imported import import_model
 
     made = import_model(args.input, most_bytes=args.target_size, slices=args.slices, **_asked(args))
@@ -142,7 +129,6 @@ def _pack(args: argparse.Namespace, console: Console) -> int:
 
 
 def _segments(args: argparse.Namespace, console: Console) -> int:
-    """Packs explicit Gaussians as a folder of segments."""
     from pd4dgs_codec.interchange.segmented import import_segments
 
     made = import_segments(args.input, args.output, length=args.segments, overwrite=args.overwrite, **_asked(args))
@@ -161,7 +147,7 @@ def _segments(args: argparse.Namespace, console: Console) -> int:
         "still": made.still,
     }
     text = f"{args.output}: {len(made.index.segments)} segments, {made.kept} of them kept, {number(made.psnr)} dB; "
-    text += f"{sizes[0]:,} bytes of what stands still, {sizes[1] / seconds:,.0f} a second of the rest"
+    text += f"{sizes[0]:,} bytes of static Gaussians, {sizes[1] / seconds:,.0f} a second of the others"
     console.result(result, text)
     return OK
 

@@ -29,15 +29,13 @@ SHOWN = 12  #: segments that are listed
 
 def parser() -> options.Parser:
     p = options.Parser("info", "FILE", "Show the header and layers of a .pd4 file.", DETAILS)
-    options.add_file(p, "FILE", ".pd4 file or URL, or a folder of segments; - reads stdin")
-    p.add_argument("--check", action="store_true", help="decode the whole file and check every checksum and rule")
-    p.add_argument("--bytes", action="store_true", help="show the bytes of each part of each layer")
-    what = "show SHA-256 of the integers and float32 tensors of each layer"
-    p.add_argument("--hashes", action="store_true", help=what)
+    options.add_file(p.add, "FILE", ".pd4 file or URL, or a folder of segments; - reads stdin")
+    p.add("--check", "decode the whole file and check every checksum and rule")
+    p.add("--bytes", "show the bytes of each part of each layer")
+    p.add("--hashes", "show SHA-256 of the integers and float32 tensors of each layer")
     what = "link rates in bits per second for the time to the first frame (default: 2M,10M,50M)"
-    p.add_argument("--at", type=options.rates, default="2M,10M,50M", metavar="RATES", help=what)
-    p.add_common()
-    return p
+    p.add("--at RATES", what, options.rates, default="2M,10M,50M")
+    return p.add_common()
 
 
 def _info(args: argparse.Namespace, console: Console) -> int:
@@ -84,7 +82,7 @@ def _segments(args: argparse.Namespace, console: Console) -> int:
     sizes = [sum(file.bytes for file in files) for files in (index.bases, index.segments)]
     result = {"input": args.input, **index.json(), "time_range": [low, high], "bytes": sum(sizes)}
     if args.check:
-        from pd4dgs_codec.quality.timeline import Timeline
+        from pd4dgs_codec.quality.levels import Timeline
 
         timeline = Timeline(folder)
         for segment in index.segments:
@@ -96,15 +94,10 @@ def _segments(args: argparse.Namespace, console: Console) -> int:
     }
     head = f"{args.input}: {len(index.segments):,} segments, {low:g} to {high:g} s, {sum(sizes):,} bytes: "
     lines = [head + f"{sizes[0]:,} of what segments share, {sizes[1] / (high - low):,.0f} a second"]
-    rows = [
-        (
-            s.file,
-            *(f"{t:.6g}" for t in s.time_range),
-            "-" if s.base is None else index.bases[s.base].file,
-            number(s.bytes, 0),
-        )
-        for s in index.segments
-    ]
+    rows = []
+    for s in index.segments:
+        base = "-" if s.base is None else index.bases[s.base].file
+        rows.append((s.file, *(f"{t:.6g}" for t in s.time_range), base, number(s.bytes, 0)))
     lines.append(table(("segment", "from s", "to s", "base", "bytes"), rows if console.verbose else rows[:SHOWN]))
     lines += [f"and {len(rows) - SHOWN:,} more (-v lists all)"] if len(rows) > SHOWN and not console.verbose else []
     lines += ["checked: every segment decodes"] if args.check else []

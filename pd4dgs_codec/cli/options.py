@@ -3,22 +3,27 @@
 A type returns the value, or raises an error of one line with the text found and the expected form.
 """
 
+from __future__ import annotations
+
 import argparse
 import contextlib
 import math
 from collections.abc import Callable, Iterable
+from functools import partial
 from typing import Any, NoReturn, TypeVar
 
 from pd4dgs_codec.cli.common import UsageError, tell
+from pd4dgs_codec.data.dataset import FOLDERS, color
 
 T = TypeVar("T")
+Add = Callable[..., None]  #: `Parser.add`, of the parser or of a group
 
 EXIT_CODES = "exit codes: 0 success, 1 invalid data or I/O error, 2 usage error"
 #: Defaults of the options of `add_reading`.
 READING = {"downscale": 1, "holdout": 8}
-#: Stands for the list of sources in the details of a command; `Parser.format_help` fills it in.
-SOURCES = "<the list of sources>"
-SCENES = """\
+#: The list of sources in the details of a command.
+SOURCES = "\n  ".join(["SOURCE is one of", *FOLDERS])
+SOURCES += """
   synthetic:static   nothing moves
   synthetic:global   large objects move slowly
   synthetic:local    large objects move slowly, and small parts of them on their own
@@ -54,42 +59,55 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise UsageError(message)
 
-    def format_help(self) -> str:
-        """The help text, with the list of sources if the details name it."""
-        text = super().format_help()
-        if SOURCES in text:
-            from pd4dgs_codec.data.dataset import FOLDERS
-
-            text = text.replace(SOURCES, "\n".join(["SOURCE is one of", *(f"  {line}" for line in FOLDERS), SCENES]))
-        return text
-
     def print_help(self, file: object = None) -> NoReturn:
         """Prints the help on stdout and exits: 0, or 1 if stdout cannot be written."""
         self.exit(tell(self.prog, self.format_help().rstrip("\n")))
 
-    def add_common(self, *, json_file: bool = False) -> None:
-        """Adds the options of every command. json_file: --json may name a file; args.json is then its name or "-"."""
-        group = self.add_argument_group("common options")
-        add = group.add_argument
-        add("-h", "--help", action="help", help="show this help and exit")
-        add("--version", action=_Version, nargs=0, help="show the version and exit")
+    def add(self, form: str, about: str, kind: Any = None, *, to: Any = None, **more: Any) -> None:
+        """Adds an option, or an argument, to the parser or to a group of it.
+
+        form: its names and what stands for its value, as in the help: "-o, --output FILE". about: the help. kind: the
+        type of the value. more: for `add_argument`. An option without value, choices or action is a flag.
+        """
+        words = form.split()
+        names = [word.rstrip(",") for word in words if word[0] == "-"] or words[:1]
+        more |= {"metavar": words[-1]} if len(words) > len(names) else {}
+        if names[0][0] == "-" and not {"metavar", "choices", "action"} & more.keys():
+            more["action"] = "store_true"
+        (to or self).add_argument(*names, help=about, **more, **({"type": kind} if kind else {}))
+
+    def group(self, title: str, about: str | None = None) -> Add:
+        """Returns `add` for a new group of options."""
+        return partial(self.add, to=self.add_argument_group(title, about))
+
+    def exclusive(self) -> Add:
+        """Returns `add` for options of which one can be given."""
+        return partial(self.add, to=self.add_mutually_exclusive_group())
+
+    def add_common(self, *, json_file: bool = False) -> Parser:
+        """Adds the options of every command, and returns the parser. json_file: --json may name a file; args.json is
+        then its name or "-"."""
+        add = self.group("common options")
+        add("-h, --help", "show this help and exit", action="help")
+        add("--version", "show the version and exit", action=_Version, nargs=0)
         if json_file:
             what = "write the result as one JSON object to this file (default: to stdout, in place of the text)"
-            add("--json", nargs="?", const="-", type=ending(".json", "-"), metavar="FILE.json", help=what)
+            add("--json FILE.json", what, ending(".json", "-"), nargs="?", const="-")
         else:
-            add("--json", action="store_true", help="print the result as one JSON object on stdout")
-        add("-v", "--verbose", action="store_true", help="print more messages")
-        add("-j", "--threads", type=positive_int, metavar="N", help="CPU threads (default: all cores)")
-        add("-f", "--overwrite", action="store_true", help="overwrite existing outputs")
+            add("--json", "print the result as one JSON object on stdout")
+        add("-v, --verbose", "print more messages")
+        add("-j, --threads N", "CPU threads (default: all cores)", positive_int)
+        add("-f, --overwrite", "overwrite existing outputs")
+        return self
 
 
-def add_reading(options: argparse._ActionsContainer, *, unset: Iterable[str] = ()) -> None:
+def add_reading(add: Add, *, unset: Iterable[str] = ()) -> None:
     """Adds --downscale and --holdout for reading a dataset. unset: names that are None unless given."""
-    add, default = options.add_argument, READING | dict.fromkeys(unset)
+    default = READING | dict.fromkeys(unset)
     what = f"downscale images by K (default: {READING['downscale']})"
-    add("--downscale", type=positive_int, default=default["downscale"], metavar="K", help=what)
+    add("--downscale K", what, positive_int, default=default["downscale"])
     what = f"without split files, hold out frames with i %% K == K/2 (default: {READING['holdout']}; 0: none)"
-    add("--holdout", type=count, default=default["holdout"], metavar="K", help=what)
+    add("--holdout K", what, count, default=default["holdout"])
 
 
 def conditional(args: argparse.Namespace, condition: object, otherwise: str, **defaults: Any) -> None:
@@ -108,17 +126,24 @@ def given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
     return {name: value for name in names if (value := getattr(args, name)) is not None}
 
 
-def add_background(options: argparse._ActionsContainer, default: str) -> None:
+def add_metadata(p: Parser, about: str) -> None:
+    """Adds --title, --source and --licence. about: what becomes of them."""
+    add = p.group("metadata", about)
+    add("--title TEXT", "title of the scene", line)
+    add("--source TEXT", "origin of the scene", line)
+    add("--licence TEXT", "terms of use", line)
+
+
+def add_background(add: Add, default: str) -> None:
     """Adds --background. default: the default in words."""
     what = f"colour behind the scene and images with alpha: black, white or R,G,B in 0..1 (default: {default})"
-    options.add_argument("--background", type=background, metavar="COLOR", help=what)
+    add("--background COLOR", what, background)
 
 
-def add_file(options: argparse._ActionsContainer, metavar: str, what: str) -> None:
+def add_file(add: Add, metavar: str, what: str) -> None:
     """Adds the input, and --sample in its place; see `choose_file`."""
-    options.add_argument("input", nargs="?", metavar=metavar, help=what)
-    what = f"the scene that comes with the package, in place of {metavar}"
-    options.add_argument("--sample", action="store_true", help=what)
+    add(f"input {metavar}", what, nargs="?")
+    add("--sample", f"the scene that comes with the package, in place of {metavar}")
 
 
 def choose_file(args: argparse.Namespace, metavar: str) -> None:
@@ -133,18 +158,16 @@ def choose_file(args: argparse.Namespace, metavar: str) -> None:
         args.input = str(sample())
 
 
-def add_level(options: argparse._ActionsContainer, verb: str) -> None:
+def add_level(add: Add, verb: str) -> None:
     """Adds --level, also known as --max-layer."""
-    what = f"highest level to {verb} (default: the highest of the file)"
-    options.add_argument("--level", type=int, choices=(0, 1, 2), help=what)
-    options.add_argument("--max-layer", dest="level", type=int, choices=(0, 1, 2), help=argparse.SUPPRESS)
+    add("--level", f"highest level to {verb} (default: the highest of the file)", int, choices=(0, 1, 2))
+    add("--max-layer", argparse.SUPPRESS, int, dest="level", choices=(0, 1, 2))
 
 
-def add_prefix(options: argparse._ActionsContainer, verb: str) -> None:
+def add_prefix(add: Add, verb: str) -> None:
     """Adds --level and --max-bytes, which limit what the command decodes, renders, ...: the `verb`."""
-    add_level(options, verb)
-    what = f"{verb} only the slices within the first SIZE bytes, such as 50k"
-    options.add_argument("--max-bytes", type=size, metavar="SIZE", help=what)
+    add_level(add, verb)
+    add("--max-bytes SIZE", f"{verb} only the slices within the first SIZE bytes, such as 50k", size)
 
 
 class _Version(argparse.Action):
@@ -191,6 +214,7 @@ named = checked(str, lambda text: text not in ("", "-"), "the name of a file or 
 line = checked(str, str.isprintable, "one line of printable text")
 host = checked(str, bool, "a host name or an IP address")
 finite_float = checked(float, math.isfinite, "a number")
+background = checked(color, lambda _: True, "black, white or R,G,B in 0..1")
 
 
 def ending(suffix: str, *others: str) -> Callable[[str], str]:
@@ -201,13 +225,6 @@ def ending(suffix: str, *others: str) -> Callable[[str], str]:
 def listed(kind: Callable[[str], T]) -> Callable[[str], tuple[T, ...]]:
     """Makes the type of comma-separated values of a kind, without repetitions, in the order given."""
     return lambda text: tuple(dict.fromkeys(kind(part) for part in text.split(",")))
-
-
-def background(text: str) -> tuple[float, float, float]:
-    """Reads a colour as RGB in 0..1, see `dataset.color`."""
-    from pd4dgs_codec.data.dataset import color
-
-    return checked(color, lambda value: True, "black, white or R,G,B in 0..1")(text)
 
 
 def rate(text: str) -> float:

@@ -30,16 +30,16 @@ are index.json (byte ranges and SHA-256 of the slices), scene.mp4 with scene.mpd
 AdaptationSet of its own, which names the slice before it) and scene.m3u8 (HLS, with index.json as session data).
 
 DASH clients can fetch the slices, but need a .pd4 decoder to show them. DASH and HLS players without one (dash.js,
-Shaka Player, hls.js) show a 2D video, fallback.mp4, of the scene from its own camera. Video and page's picture need
-numba (the extra [train]) and a file with a camera, the video ffmpeg as well; otherwise they are left out. The picture,
-at most 3 kB, lies in the page and is shown until the player has drawn a better one.
+Shaka Player, hls.js) show a 2D video, fallback.mp4, of the scene from its own camera. The video and the page's preview
+image need numba (the extra [train]) and a file with a camera, the video ffmpeg as well; otherwise they are left out.
+The preview image, at most 3 kB, is part of the page and is shown until the player has rendered a better one.
 
 --immutable puts a checksum into the names of the files that others refer to, so that a CDN may cache them forever.
 index.json lists the Cache-Control header of each file. For a folder of packages, pd4dgs-package writes library.json and
 index.html beside them, with the poster, size and time to the first frame of each.
 
 Of a folder of segments, DASH gets a period for each, which share the AdaptationSets of their base, and the HLS playlist
-of the 2D video a discontinuity between two. The page fetches the segment at hand and the next one.
+of the 2D video a discontinuity between two. The page fetches the current segment and the next one.
 
 examples:
   pd4dgs-package scene.pd4 -o out/scene
@@ -60,16 +60,12 @@ COMPARED_SIDE = 480
 def parser() -> options.Parser:
     summary = "Make a folder for web servers, with a player page, DASH and HLS."
     p = options.Parser("package", "scene.pd4 -o DIR", summary, DETAILS)
-    add = p.add_argument
-    add("input", metavar="scene.pd4", help=".pd4 file (- reads stdin), or a folder of segments or of packages")
-    what = "output folder, created if missing"
-    add("-o", "--output", required=True, type=options.named, metavar="DIR", help=what)
-    add("--immutable", action="store_true", help="put checksums into file names, for long-lived caches")
-    add("--no-video", action="store_true", help="make no 2D video")
-    what = "frame rate of the 2D video (default: 20)"
-    add("--fps", type=options.fps, metavar="F", help=what)
-    p.add_common()
-    return p
+    p.add("input scene.pd4", ".pd4 file (- reads stdin), or a folder of segments or of packages")
+    p.add("-o, --output DIR", "output folder, created if missing", options.named, required=True)
+    p.add("--immutable", "put checksums into file names, for long-lived caches")
+    p.add("--no-video", "make no 2D video")
+    p.add("--fps F", "frame rate of the 2D video (default: 20)", options.fps)
+    return p.add_common()
 
 
 def check_usage(args: argparse.Namespace) -> None:
@@ -104,7 +100,7 @@ def _package(args: argparse.Namespace, console: Console) -> int:
         return None if "2D video" in missing else made("2D video", lambda: _render(scene, share, args.fps))
 
     def draw(scene: AnyScene, prefixes: Iterator[tuple[int, AnyScene]]) -> Still | None:
-        return made("picture in the page", lambda: _still(scene, prefixes))
+        return made("preview image in the page", lambda: _still(scene, prefixes))
 
     if whole:
         contents: Iterable[tuple[str, bytes]] = package(
@@ -136,7 +132,6 @@ def _library(args: argparse.Namespace, console: Console) -> int:
 
 
 def _write(args: argparse.Namespace, files: Iterable[tuple[str, bytes]]) -> list[dict[str, Any]]:
-    """Writes all files or none; returns their names and sizes."""
     sizes = write_files(args.output, files, args.overwrite)
     return [{"name": name, "bytes": size} for name, size in sizes.items()]
 

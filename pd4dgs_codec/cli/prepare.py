@@ -28,16 +28,13 @@ examples:
 
 def parser() -> options.Parser:
     p = options.Parser("prepare", "INPUT -o FOLDER", "Estimate the camera poses of a video.", DETAILS)
-    add = p.add_argument
-    add("input", type=options.named, metavar="INPUT", help="video or folder of frames")
-    add("-o", "--output", required=True, type=options.named, metavar="FOLDER", help="output folder")
-    add("--frames", type=FRAMES, default=120, metavar="N", help="use at most N frames (default: 120; 0: all)")
-    what = "frame rate of a folder of frames (default: 30)"
-    add("--fps", type=options.fps, metavar="F", help=what)
-    add("--downscale", type=options.positive_int, default=1, metavar="K", help="downscale images by K (default: 1)")
-    add("--camera", choices=CAMERAS, default=CAMERAS[0], help=f"COLMAP camera model (default: {CAMERAS[0]})")
-    p.add_common()
-    return p
+    p.add("input INPUT", "video or folder of frames", options.named)
+    p.add("-o, --output FOLDER", "output folder", options.named, required=True)
+    p.add("--frames N", "use at most N frames (default: 120; 0: all)", FRAMES, default=120)
+    p.add("--fps F", "frame rate of a folder of frames (default: 30)", options.fps)
+    p.add("--downscale K", "downscale images by K (default: 1)", options.positive_int, default=1)
+    p.add("--camera", f"COLMAP camera model (default: {CAMERAS[0]})", choices=CAMERAS, default=CAMERAS[0])
+    return p.add_common()
 
 
 def check_usage(args: argparse.Namespace) -> None:

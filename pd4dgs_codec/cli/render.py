@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 DETAILS = f"""\
 Renders the file's own camera over its time range, or with --data the views of a dataset at their times.
-The suffix of -o decides the kind: .gif and .mp4 are films, .png, .jpg, .webp and .bmp pictures.
+The suffix of -o decides the kind: .gif and .mp4 are videos, .png, .jpg, .webp and .bmp images.
 
 {options.SOURCES}
 
@@ -46,29 +46,25 @@ MAX_GIF_FPS = 50  #: browsers slow down pictures that are shown for a shorter ti
 
 def parser() -> options.Parser:
     p = options.Parser("render", "FILE -o OUT", "Render a .pd4 file or a checkpoint to images or a video.", DETAILS)
-    p.add_argument("input", metavar="FILE", help=".pd4 file or .pt checkpoint; - reads a .pd4 from stdin")
-    what = "images such as out/%%04d.png, or a .gif or .mp4 video"
-    p.add_argument("-o", "--output", required=True, metavar="OUT", help=what)
-    options.add_prefix(p, "render")
-    options.add_background(p, "the file's")
-    p.add_argument("--data", metavar="SOURCE", help="take cameras, times and ground truth from this dataset")
-    p.add_argument("--split", choices=("test", "train"), help="views of the dataset (default: test)")
-    options.add_reading(p, unset=("holdout",))
-    what = "render a single picture at time T, as 0..1 of the file's time range"
-    p.add_argument("--time", type=options.share, metavar="T", help=what)
-    what = f"number of evenly spaced frames (default: {FRAMES}, or one image of a scene that stands still); with "
+    p.add("input FILE", ".pd4 file or .pt checkpoint; - reads a .pd4 from stdin")
+    p.add("-o, --output OUT", "images such as out/%%04d.png, or a .gif or .mp4 video", required=True)
+    options.add_prefix(p.add, "render")
+    options.add_background(p.add, "the file's")
+    p.add("--data SOURCE", "take cameras, times and ground truth from this dataset")
+    p.add("--split", "views of the dataset (default: test)", choices=("test", "train"))
+    options.add_reading(p.add, unset=("holdout",))
+    p.add("--time T", "render a single image at time T, as 0..1 of the file's time range", options.share)
+    what = f"number of evenly spaced frames (default: {FRAMES}, or one image of a static scene); with "
     what += "--data, of evenly spread views (default: all)"
-    p.add_argument("--frames", type=options.positive_int, metavar="N", help=what)
+    p.add("--frames N", what, options.positive_int)
     what = "swing the file's camera by DEG degrees about its look-at point (default: 0)"
-    p.add_argument("--orbit", type=options.finite_float, metavar="DEG", help=what)
-    what = f"frame rate of a film (default: {FPS:g})"
-    p.add_argument("--fps", type=options.fps, metavar="F", help=what)
-    what = f"length of a film, such as 4s, in place of --frames (default: {FRAMES} frames)"
-    p.add_argument("--duration", type=options.duration, metavar="S", help=what)
+    p.add("--orbit DEG", what, options.finite_float)
+    p.add("--fps F", f"frame rate of a video (default: {FPS:g})", options.fps)
+    what = f"length of a video, such as 4s, in place of --frames (default: {FRAMES} frames)"
+    p.add("--duration S", what, options.duration)
     what = "show all levels side by side, with --data beside the ground truth; a.png gets a row per frame"
-    p.add_argument("--side-by-side", action="store_true", help=what)
-    p.add_common()
-    return p
+    p.add("--side-by-side", what)
+    return p.add_common()
 
 
 def _render(args: argparse.Namespace, console: Console) -> int:
@@ -82,13 +78,8 @@ def _render(args: argparse.Namespace, console: Console) -> int:
         from pd4dgs_codec.quality.frames import check_mp4
 
         check_mp4()
-    levels = load_levels(
-        common.named_input(args.input),
-        args.level,
-        max_bytes=args.max_bytes,
-        last_only=not args.side_by_side,
-        background=args.background,
-    )
+    file, last = common.named_input(args.input), not args.side_by_side
+    levels = load_levels(file, args.level, max_bytes=args.max_bytes, last_only=last, background=args.background)
     found = ", ".join(f"{row.level} ({row.anchors} anchors)" for row in levels)
     console.detail(f"{common.shown_name(args.input)}: levels {found}")
     frames = _frames(args, kind, levels[-1])
@@ -125,7 +116,7 @@ def _check_usage(args: argparse.Namespace) -> str:
             raise UsageError(f"found --{one} and --{other}, expected one of them")
     options.conditional(args, args.data, "needs --data SOURCE", split="test", holdout=options.READING["holdout"])
     options.conditional(args, kind in VIDEOS, "needs a .gif or .mp4 as -o", fps=FPS, duration=None)
-    options.conditional(args, kind not in VIDEOS, "needs a picture such as a.png as -o", time=None)
+    options.conditional(args, kind not in VIDEOS, "needs an image such as a.png as -o", time=None)
     if kind == ".gif" and args.fps > MAX_GIF_FPS:
         raise UsageError(f"found --fps {args.fps:g}, expected at most {MAX_GIF_FPS:g} for a .gif")
     if kind not in VIDEOS and "%" in args.output:

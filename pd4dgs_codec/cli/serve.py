@@ -33,22 +33,17 @@ examples:
 
 def parser() -> options.Parser:
     p = options.Parser("serve", "DIR", "Serve a folder over HTTP, with an optional rate limit.", DETAILS)
-    p.add_argument("input", metavar="DIR", help="folder to serve")
-    what = "address to listen on (default: 127.0.0.1)"
-    p.add_argument("--host", type=options.host, default="127.0.0.1", metavar="H", help=what)
-    what = "port to listen on (default: 8000; 0: any free port)"
-    p.add_argument("--port", type=options.port, default=8000, metavar="N", help=what)
-    add_link(p)
-    p.add_common()
-    return p
+    p.add("input DIR", "folder to serve")
+    p.add("--host H", "address to listen on (default: 127.0.0.1)", options.host, default="127.0.0.1")
+    p.add("--port N", "port to listen on (default: 8000; 0: any free port)", options.port, default=8000)
+    add_link(p.add)
+    return p.add_common()
 
 
-def add_link(p: options.Parser) -> None:
+def add_link(add: options.Add) -> None:
     """Adds --rate and --latency of the simulated link."""
-    what = "link rate in bits per second, such as 2M (default: unlimited)"
-    p.add_argument("--rate", type=options.rate, metavar="BPS", help=what)
-    what = "round-trip time, such as 50ms (default: 0)"
-    p.add_argument("--latency", type=options.duration, metavar="T", help=what)
+    add("--rate BPS", "link rate in bits per second, such as 2M (default: unlimited)", options.rate)
+    add("--latency T", "round-trip time, such as 50ms (default: 0)", options.duration)
 
 
 def _serve(args: argparse.Namespace, console: Console) -> int:

@@ -42,10 +42,10 @@ masks; noise, the simulated quantisation; whitening, the transform of the featur
 
 --segments 10s writes a folder, -o DIR, for a long SOURCE: a base, which holds what all times share, and a file for each
 ten seconds that continues it. pd4dgs-info, -render, -eval, -export, -package and -view take the folder as one scene.
-First a whole is trained, of all times, by --iterations and --max-seconds; its layer 0 is the base. Segments start from
-it and train for an eighteenth of its steps each, as many at a time as -j has threads. The same command goes on where it
-was interrupted. --manifest writes the lines by which pd4dgs-batch trains whole and segments, each by --part; the same
-command without --manifest then adds the index.
+First one model of all times, the whole, is trained by --iterations and --max-seconds; its layer 0 is the base. Segments
+start from it and train for an eighteenth of its steps each, as many at a time as -j has threads. The same command
+resumes after an interruption. --manifest writes the lines by which pd4dgs-batch trains whole and segments, each by
+--part; the same command without --manifest then adds the index.
 
 torchrun starts several workers for one scene: they share the V views of a step and average their gradients, and the
 first worker writes the files. Their number must divide V and may change when a run is resumed.
@@ -65,33 +65,29 @@ VIEW_PORT = 8080
 def parser() -> options.Parser:
     """Returns the parser. Options that are stored in a checkpoint default to None, so that conflicts are noticed."""
     p = options.Parser("train", "SOURCE -o FILE.pt", "Train a layered dynamic Gaussian scene from images.", DETAILS)
-    add = p.add_argument
-    add("source", metavar="SOURCE", help="dataset to train on, see below")
-    add("-o", "--output", required=True, type=options.named, metavar="FILE.pt", help="checkpoint to write")
-    options.add_reading(p, unset=options.READING)
-    options.add_background(p, "the dataset's; white for images with alpha")
+    p.add("source SOURCE", "dataset to train on, see below")
+    p.add("-o, --output FILE.pt", "checkpoint to write", options.named, required=True)
+    options.add_reading(p.add, unset=options.READING)
+    options.add_background(p.add, "the dataset's; white for images with alpha")
     what = "0 (small files) to 100 (high quality), see below (default: 50)"
-    add("--quality", type=options.checked(float, lambda q: 0 <= q <= 100, "0 to 100"), metavar="Q", help=what)
+    p.add("--quality Q", what, options.checked(float, lambda q: 0 <= q <= 100, "0 to 100"))
     _add_fields(p)
-    add("--device", choices=("auto", "cpu", "cuda"), default="auto", help="device to train on (default: auto)")
-    what = "continue from this checkpoint with its stored settings"
-    add("--resume", type=options.named, metavar="FILE.pt", help=what)
-    add("--log", type=options.named, metavar="FILE.jsonl", help="log to write, one JSON object per step")
+    p.add("--device", "device to train on (default: auto)", choices=("auto", "cpu", "cuda"), default="auto")
+    p.add("--resume FILE.pt", "continue from this checkpoint with its stored settings", options.named)
+    p.add("--log FILE.jsonl", "log to write, one JSON object per step", options.named)
     what = f"show the training in the browser at this port (default: {VIEW_PORT}; needs viser)"
-    add("--view", type=options.port, nargs="?", const=VIEW_PORT, metavar="PORT", help=what)
+    p.add("--view PORT", what, options.port, nargs="?", const=VIEW_PORT)
     what = f"turn off a part of the method, see below (repeatable): {', '.join(ABLATIONS)}"
-    add("--without", action="append", choices=tuple(ABLATIONS), metavar="PART", default=[], help=what)
-    parts = p.add_argument_group("segments", "a long capture as a folder of files, see below").add_argument
-    parts("--segments", type=options.duration, metavar="T", help="write segments of about this length, such as 10s")
-    what = "seconds that neighbouring segments share (default: 0s)"
-    parts("--overlap", type=options.duration, metavar="T", help=what)
-    what = "train only the whole (whole) or segment N, from 0 on, into -o FILE.pd4"
-    parts("--part", type=options.checked(_part, lambda _: True, "whole or a number"), metavar="N", help=what)
-    parts("--whole", type=options.named, metavar="FILE.pd4", help="with --part N, the trained whole")
+    p.add("--without PART", what, action="append", choices=tuple(ABLATIONS), default=[])
+    parts = p.group("segments", "a long capture as a folder of files, see below")
+    parts("--segments T", "write segments of about this length, such as 10s", options.duration)
+    parts("--overlap T", "seconds that neighbouring segments share (default: 0s)", options.duration)
+    what = "train only the model of all times (whole) or segment N, from 0 on, into -o FILE.pd4"
+    parts("--part N", what, options.checked(_part, lambda _: True, "whole or a number"))
+    parts("--whole FILE.pd4", "with --part N, the trained model of all times", options.named)
     what = "write a manifest of whole and segments for pd4dgs-batch, and train nothing"
-    parts("--manifest", type=options.named, metavar="FILE.jsonl", help=what)
-    p.add_common()
-    return p
+    parts("--manifest FILE.jsonl", what, options.named)
+    return p.add_common()
 
 
 def _part(text: str) -> int | str:
@@ -106,15 +102,15 @@ def _add_fields(p: options.Parser) -> None:
             continue
         name = f"--{field.name.replace('_', '-')}"
         if field.type == "bool":
-            p.add_argument(name, action="store_const", const=True, help=about.help)
+            p.add(name, about.help, action="store_const", const=True)
             continue
         kind = {"int": int, "float": float}.get(str(field.type).split(" ")[0], str)
         at = " at quality 50" if about.dial else ""
         what = about.help if field.default is None else f"{about.help} (default: {field.default}{at})"
-        settings: dict[str, Any] = {"type": kind, "choices": about.choices}
-        if not about.choices:
-            settings = {"type": options.checked(kind, about.contains, about.range), "metavar": about.metavar}
-        p.add_argument(name, help=what, **settings)
+        if about.choices:
+            p.add(name, what, kind, choices=about.choices)
+        else:
+            p.add(f"{name} {about.metavar}", what, options.checked(kind, about.contains, about.range))
 
 
 def _train(args: argparse.Namespace, console: Console) -> int:
@@ -168,7 +164,6 @@ def _train(args: argparse.Namespace, console: Console) -> int:
 
 
 def _train_segments(args: argparse.Namespace, console: Console) -> int:
-    """Trains a folder of segments, or one part of it, or writes a manifest of its parts."""
     from pd4dgs_codec.cli import train_segments as segmented
 
     config = _fresh_config(args)
@@ -194,7 +189,7 @@ def _train_segments(args: argparse.Namespace, console: Console) -> int:
 def _segments_text(result: dict[str, Any]) -> str:
     sizes = f"{result['base_bytes']:,} bytes of the base, {result['bytes'] - result['base_bytes']:,} of segments"
     text = f"{result['output']}: {result['segments']} segments, {result['kept']} of them kept; {sizes}"
-    return text if result["finished"] else f"{text}\nnot finished; to go on: the same command"
+    return text if result["finished"] else f"{text}\nnot finished; to continue: the same command"
 
 
 main = command(parser, _train)
@@ -325,7 +320,6 @@ def _progress(args: argparse.Namespace, trainer: Trainer) -> TrainingProgress:
 
 
 def _announce(trainer: Trainer, console: Console) -> None:
-    """Prints preset, device and time limit of the run, and what was read."""
     from pd4dgs_codec.train import workers
 
     config, dataset = trainer.config, trainer.dataset
@@ -404,11 +398,11 @@ def _text(result: dict[str, Any]) -> str:
     lines = [f"{result['output']}: {steps}, {result['anchors']} anchors"]
     if result["spent"]:
         parts = ", ".join(f"{name} {seconds:.1f}" for name, seconds in result["spent"].items())
-        lines.append(f"seconds that were not steps: {sum(result['spent'].values()):.0f}, of {parts}")
+        lines.append(f"seconds outside training steps: {sum(result['spent'].values()):.0f}, of {parts}")
     if result["phases_not_reached"]:
         lines.append(f"phases not reached: {', '.join(result['phases_not_reached'])}")
     if result["resume"]:
-        lines.append(f"not finished; to go on: {result['resume']}")
+        lines.append(f"not finished; to continue: {result['resume']}")
     if result["skipped"]:
         lines.append(f"{result['skipped']} steps skipped for non-finite gradients")
     for row in result["left_out"]:

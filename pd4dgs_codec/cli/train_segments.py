@@ -58,7 +58,6 @@ class Capture:
 
 
 def name_of(k: int) -> str:
-    """The file of a segment."""
     return f"{k:05d}.pd4"
 
 
@@ -72,7 +71,7 @@ def train_one(
     dataset, cuts = capture.read()
     if k is None:
         part = Part(capture.config, output, device=capture.device)
-        say(f"the whole, {cuts.whole_views} views of all times")
+        say(f"the model of all times, {cuts.whole_views} views")
     elif k >= len(cuts.ranges):
         raise DataError(f"found segment {k}, expected 0 to {len(cuts.ranges) - 1}")
     else:
@@ -80,7 +79,7 @@ def train_one(
         part = Part(capture.config, output, (start, stop), whole, capture.device)
         say(f"segment {k}, {start:.4g} to {stop:.4g} s, {cuts.views[k]} views")
     result = train_part(part, dataset, TrainingProgress() if told else None)
-    what = "the whole" if k is None else f"segment {k}"
+    what = "the model of all times" if k is None else f"segment {k}"
     levels = ", ".join(map(number, result["psnr"]))
     say(f"{what}: {result['iterations']} steps, {result['anchors']:,} anchors, {levels} dB")
     return result
@@ -120,8 +119,8 @@ def train_folder(capture: Capture, output: str, overwrite: bool) -> dict[str, An
     shown = ", ".join(map(str, cuts.views[:12])) + ", ..." * (len(ranges) > 12)
     start, stop = dataset.time_range
     say(f"{len(ranges)} segments from {start:.4g} to {stop:.4g} s, with {shown} training views of them; "
-        f"{cuts.whole_views} of all times for the whole, whose steps and time limit are those asked for; segments have "
-        f"one in {1 / SHARE:.0f} of them each")  # fmt: skip
+        f"{cuts.whole_views} for the model of all times, which trains for the given steps and time limit; each segment "
+        f"trains for 1/{1 / SHARE:.0f} of them")  # fmt: skip
     for remark in dataset.remarks():
         say(f"note: {remark}")
     del dataset

@@ -33,15 +33,12 @@ SCENE = "scene.pd4"
 
 def parser() -> options.Parser:
     p = options.Parser("view", "SCENE", "Show a scene in the browser.", DETAILS)
-    options.add_file(p, "SCENE", ".pd4 file, its URL, a folder of .pd4 files, or .pt checkpoint; - reads stdin")
-    what = "write one HTML file instead of starting a server"
-    p.add_argument("-o", "--output", type=options.named, metavar="FILE", help=what)
-    what = "port to listen on (default: any free port)"
-    p.add_argument("--port", type=options.port, metavar="N", help=what)
-    p.add_argument("--no-browser", action="store_true", help="do not open the browser")
-    add_link(p)
-    p.add_common()
-    return p
+    options.add_file(p.add, "SCENE", ".pd4 file, its URL, a folder of .pd4 files, or .pt checkpoint; - reads stdin")
+    p.add("-o, --output FILE", "write one HTML file instead of starting a server", options.named)
+    p.add("--port N", "port to listen on (default: any free port)", options.port)
+    p.add("--no-browser", "do not open the browser")
+    add_link(p.add)
+    return p.add_common()
 
 
 def _view(args: argparse.Namespace, console: Console) -> int:

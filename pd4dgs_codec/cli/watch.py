@@ -108,7 +108,6 @@ class WatchedProgress(TrainingProgress):
         self._shown = {key: shown for key, shown in self._shown.items() if key in clients}
 
     def close(self) -> None:
-        """Removes the bar and closes the page."""
         super().close()
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()

@@ -392,7 +392,6 @@ class Thing:
     turn: Callable[[float], np.ndarray] = lambda t: np.eye(3)
 
     def pose(self, t: float) -> Pose:
-        """A and c at an instant."""
         at = self.at(t) if callable(self.at) else self.at
         return self.turn(t) @ np.diag(self.size), np.asarray(at, float)
 

@@ -213,7 +213,6 @@ class _Binary:
         self.path, self.data, self.at = path, read_file(path), 0
 
     def cameras(self) -> Iterator[tuple[int, Lens]]:
-        """Yields the number and the lens of each camera."""
         for _ in range(self._take("Q")[0]):
             key, model, width, height = self._take("iiQQ")
             where = f"{self.path}: camera {key}"
@@ -223,7 +222,6 @@ class _Binary:
             yield key, _lens(name, width, height, list(self._take(f"{len(keys)}d")), where)
 
     def images(self) -> Iterator[Image]:
-        """Yields the registered pictures."""
         for _ in range(self._take("Q")[0]):
             _, *pose, camera = self._take("i7di")
             end = self.data.find(b"\0", self.at)
@@ -235,7 +233,6 @@ class _Binary:
             yield name, camera, pose
 
     def points(self) -> Iterator[tuple[float, ...]]:
-        """Yields rows x y z."""
         for _ in range(self._take("Q")[0]):
             _, x, y, z, *_, track = self._take("Q3d3BdQ")
             self._skip(8 * track)

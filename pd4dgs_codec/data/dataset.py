@@ -162,10 +162,8 @@ def _read(source: str | Path, downscale: int, holdout: int, background: Color | 
 def _without_blind_views(dataset: Dataset, source: str | Path) -> Dataset:
     """The dataset without views that have no valid pixel: they train nothing, and any picture would match them."""
 
-    LaterView = resolve_name("pd4dgs_codec.data.view:LaterView")
-
     def sees(view: View) -> bool:
-        return isinstance(view, LaterView) or view.mask is None or bool(view.mask.any())
+        return "mask" not in vars(view) or view.mask is None or bool(view.mask.any())  # not of a `LaterView`
 
     train, test = (tuple(filter(sees, views)) for views in (dataset.train, dataset.test))
     left_out = tuple(view.name for view in (*dataset.train, *dataset.test) if not sees(view))

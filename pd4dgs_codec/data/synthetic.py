@@ -173,7 +173,6 @@ class Take:
         return time * (self.seconds / SECONDS)
 
     def bodies(self) -> list[Body]:
-        """All bodies of the scene."""
         if self.name == RANDOM:
             return random_scene(self.seed).bodies
         return Dancer(self.seed).bodies() if self.name == DANCER else bodies(self.name, self.seed)
@@ -230,17 +229,17 @@ def _value(key: str, text: str) -> Any:
     raise ValueError(text)
 
 
-def _grid(lens: Lens, scale: int = 1, dtype: DTypeLike = np.float64) -> tuple[np.ndarray, np.ndarray]:
+def grid(lens: Lens, scale: int = 1, dtype: DTypeLike = np.float64) -> tuple[np.ndarray, np.ndarray]:
     """x [scale * W] and y [scale * H] at depth 1 of the pixel centres of an image `scale` times as fine."""
     x = ((np.arange(lens.width * scale) + 0.5) / scale - lens.cx) / lens.fx
     return x.astype(dtype), (((np.arange(lens.height * scale) + 0.5) / scale - lens.cy) / lens.fy).astype(dtype)
 
 
-def _render(bodies: list[Body], viewmat: np.ndarray, t: float, lens: Lens, background: Sequence[float]) -> np.ndarray:
+def render(bodies: list[Body], viewmat: np.ndarray, t: float, lens: Lens, background: Sequence[float]) -> np.ndarray:
     """uint8 [H, W, 3]: the mean of SUPERSAMPLING² rays per pixel."""
     placed = place(bodies, t)
     eye = Eye(placed, viewmat)
-    xs, ys = _grid(lens, SUPERSAMPLING, np.float32)
+    xs, ys = grid(lens, SUPERSAMPLING, np.float32)
     depth, index = eye.first_hits(xs, ys)
     color = np.tile(np.asarray(background, np.float32)[:, None, None], (1, *depth.shape))
     for i in range(len(placed)):
@@ -254,7 +253,7 @@ def _render(bodies: list[Body], viewmat: np.ndarray, t: float, lens: Lens, backg
 
 def _surface(bodies: list[Body], viewmat: np.ndarray, t: float, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     """(body index [n], material point [3, n]) of the surface behind each pixel centre; for the sky, the direction."""
-    eye, (xs, ys) = Eye(place(bodies, t), viewmat), _grid(lens)
+    eye, (xs, ys) = Eye(place(bodies, t), viewmat), grid(lens)
     depth, index = (a.ravel() for a in eye.first_hits(xs, ys))
     x, y = (a.ravel() for a in np.meshgrid(xs, ys))
     point = viewmat[:3, :3].T @ np.stack([x, y, np.ones_like(x)])
@@ -309,7 +308,7 @@ def _initial_points(
     points = []
     for viewmat in viewmats:
         eye = Eye(placed, viewmat)
-        xs, ys = _grid(lens)
+        xs, ys = grid(lens)
         depth, index = eye.first_hits(xs, ys)
         row, col = rng.integers(len(ys), size=per_view), rng.integers(len(xs), size=per_view)
         for i in range(len(placed)):
@@ -334,7 +333,7 @@ def _dataset(take: Take, later: bool = False) -> Dataset:  # `later`: as LATER, 
 
     def view(viewmat: np.ndarray, camera: int, i: int, *, masked: bool = False) -> View:
         def pixels() -> tuple[np.ndarray, np.ndarray | None]:
-            image = _render(scene, viewmat, moments[i], lens, stage.background)
+            image = render(scene, viewmat, moments[i], lens, stage.background)
             return image, _covisible(scene, eyes, viewmat, moments[i], lens) if masked else None
 
         fields = {"viewmat": viewmat.astype(np.float32), "K": lens.matrix(), "width": lens.width, "height": lens.height}
@@ -360,40 +359,3 @@ def read_synthetic(source: str, downscale: int = 1) -> Dataset:
     K = take.lens.matrix(downscale)
     train, test = (tuple(replace(shrunk_view(v, downscale), K=K) for v in views) for views in (full.train, full.test))
     return replace(full, train=train, test=test)
-
-
-@dataclass(frozen=True, eq=False)
-class Mover:
-    """A body that moves, as V views of a scene show it.
-
-    shown: bool [V, H, W], valid pixels whose centre shows it. without: uint8 [V, H, W, 3], the pictures without it.
-    radius: of a disc with as many pixels as it has on average where it is shown; 0 if it never is. step: what its
-    centre moves at most between neighbouring instants, in its own sizes (the mean one of its three).
-    """
-
-    shown: np.ndarray
-    without: np.ndarray
-    radius: float
-    step: float
-
-
-def movers(source: str, views: Sequence[View]) -> list[Mover]:
-    """All bodies of a synthetic scene that move, in some of its views."""
-    take = parse(source)
-    scene, lens = take.bodies(), take.lens
-    cameras = [(view.viewmat.astype(np.float64), take.clock(view.time)) for view in views]
-    hits = [Eye(place(scene, t), viewmat).first_hits(*_grid(lens))[1] for viewmat, t in cameras]
-    valid = [True if view.mask is None else view.mask for view in views]
-    found = []
-    for k, body in enumerate(scene):
-        A, c = (np.stack(parts) for parts in zip(*map(body.pose, map(take.clock, take.times)), strict=True))
-        if np.ptp(A, axis=0).max() + np.ptp(c, axis=0).max() == 0:
-            continue
-        others = scene[:k] + scene[k + 1 :]
-        shown = np.stack([(index == k) & mask for index, mask in zip(hits, valid, strict=True)])
-        without = np.stack([_render(others, viewmat, t, lens, take.stage.background) for viewmat, t in cameras])
-        areas, size = shown.sum(axis=(1, 2)), 2 * np.cbrt(abs(np.linalg.det(A)))
-        radius = float(np.sqrt(areas[areas > 0].mean() / np.pi)) if areas.any() else 0.0
-        step = float((np.linalg.norm(np.diff(c, axis=0), axis=1) / size[1:]).max())
-        found.append(Mover(shown, without, radius, step))
-    return found

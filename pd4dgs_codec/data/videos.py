@@ -19,13 +19,14 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
 from pd4dgs_codec.data.files import check_downscale, check_pixels, check_regular, shrink_image
-from pd4dgs_codec.data.view import Dataset, Origin, UnreadView, View, geometry, rectify, without_first_camera
+from pd4dgs_codec.data.view import Dataset, LaterView, Origin, UnreadView, View, geometry, rectify, without_first_camera
 from pd4dgs_codec.errors import DamageWarning, DataError, one_line
 from pd4dgs_codec.io import PREFIX, lock, temporary_folder
 
@@ -175,22 +176,6 @@ class StoredFrames:
         return np.add.accumulate(steps, axis=1, dtype=np.uint8)
 
 
-class StoredView(View):
-    """A view whose picture is read from the cache at each access."""
-
-    def __init__(self, frames: StoredFrames, index: int, **fields: Any) -> None:
-        """fields: all fields of a View but `image`, `width` and `height`."""
-        height, width, _ = frames.shape
-        for name, value in {**fields, "width": width, "height": height, "_frames": frames, "_index": index}.items():
-            object.__setattr__(self, name, value)
-
-    @property
-    def image(self) -> np.ndarray:
-        """uint8 [H, W, 3]."""
-        frames: StoredFrames = self._frames  # type: ignore[attr-defined]
-        return frames.read(self._index)  # type: ignore[attr-defined]
-
-
 def stored_frames(path: Path, how: str, treat: Callable[[np.ndarray], np.ndarray]) -> StoredFrames:
     """The frames of a video after `treat`, decoded now unless the cache has them.
 
@@ -326,7 +311,7 @@ def synchronised_dataset(
     source: of the points. The first camera is held out, unless holdout is 0. depth: near and far, if known.
     """
     cameras, shape = geometry(cameras, points, depth)
-    views: list[StoredView] = []
+    views: list[View] = []
     count, fps = 0, 0.0
     for i, camera in enumerate(cameras):
         frames, mask = _frames_of(camera, downscale)
@@ -335,10 +320,12 @@ def synchronised_dataset(
             found = f"{len(frames)} frames at {frames.fps:g} per second and {first} {count} at {fps:g}"
             raise DataError(f"{camera.image}: has {found}, expected synchronised videos")
         count, fps = len(frames), frames.fps
-        fixed = {"viewmat": camera.viewmat.astype(np.float32), "K": camera.lens.matrix(downscale)}
+        fixed: dict[str, Any] = {"viewmat": camera.viewmat.astype(np.float32), "mask": mask, "camera_id": i}
+        fixed |= {"K": camera.lens.matrix(downscale), "height": frames.shape[0], "width": frames.shape[1]}
         for k in range(count):
             time, name = k / max(count - 1, 1), f"{camera.image.stem}_{k:04d}"
-            views.append(StoredView(frames, k, time=time, name=name, camera_id=i, mask=mask, **fixed))
+            read = partial(lambda frames, k, mask: (frames.read(k), mask), frames, k, mask)
+            views.append(LaterView(read, time=time, name=name, **fixed))
     train, test = without_first_camera(folder, views, holdout)
     return Dataset(
         name=folder.resolve().name,

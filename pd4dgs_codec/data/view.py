@@ -108,23 +108,16 @@ class View:
 
 
 class LaterView(View):
-    """A view whose pixels are read at each access to its image or mask. read: returns both."""
+    """A view whose pixels are read at each access to its image, or to its mask if that is not given. read: both."""
 
-    def __init__(self, read: Callable[[], tuple[np.ndarray, np.ndarray | None]], **fields: Any) -> None:
-        """fields: all fields of a View but `image` and `mask`."""
-        self.read: Callable[[], tuple[np.ndarray, np.ndarray | None]]
-        for name, value in {**fields, "read": read}.items():
-            object.__setattr__(self, name, value)
+    def __init__(self, read: Callable[[], tuple[np.ndarray, np.ndarray | None]] | None = None, **fields: Any) -> None:
+        """fields: those of a View; `dataclasses.replace` gives all of them."""
+        vars(self).update(fields, read=read)
 
-    @property
-    def image(self) -> np.ndarray:
-        """uint8 [H, W, 3]."""
-        return self.read()[0]
-
-    @property
-    def mask(self) -> np.ndarray | None:
-        """bool [H, W], or None."""
-        return self.read()[1]
+    def __getattr__(self, name: str) -> Any:
+        if name not in ("image", "mask") or self.read is None:
+            raise AttributeError(name)
+        return self.read()[name == "mask"]
 
 
 def later_view(read: Callable[[], tuple[np.ndarray, np.ndarray | None]], fields: dict[str, Any]) -> View:
@@ -563,10 +556,8 @@ def fitted(frame: UnreadView, size: tuple[int, int]) -> UnreadView:
     x, y = size[0] / lens.width, size[1] / lens.height
     if abs(x - 1) < RESIZED or not same_shape((lens.width, lens.height), size):
         return frame
-    note(
-        "lens scaled to the size of the picture",
-        f"{frame.image.name} of {size[0]}x{size[1]}, not as the camera {lens.width}x{lens.height}",
-    )
+    found = f"{frame.image.name} of {size[0]}x{size[1]}, not as the camera {lens.width}x{lens.height}"
+    note("lens scaled to the size of the picture", found)
     focal, middle = (lens.fx * x, lens.fy * y), (lens.cx * x, lens.cy * y)
     return replace(frame, lens=Lens(*size, *focal, *middle, lens.skew * x, lens.radial, lens.tangential, lens.fisheye))
 

@@ -261,7 +261,6 @@ def _filled(
 
 
 def _container(symbols: SceneSymbols, mode: str, written: list[list[_Slice]]) -> bytes:
-    """Returns the file of these slices."""
     parts = [
         (layer.layer, slice_flags(number, len(slices)), part.payload)
         for layer, slices in zip(symbols.layers, written, strict=True)

@@ -197,13 +197,9 @@ def _unpack_base(header: Fields) -> Reference | None:
 def _unpack_chunks(value: object) -> tuple[tuple[int, int], ...]:
     chunks = []
     for i, row in enumerate(as_long(value, "header: chunks", MAX_CHUNKS)):
-        kind, length = as_list(row, f"header: chunk {i}", 2)
-        chunks.append(
-            (
-                as_integer(kind, 0xFFFF, f"header: type of chunk {i}"),
-                as_integer(length, MAX_PAYLOAD, f"header: length of chunk {i}"),
-            )
-        )
+        found, size = as_list(row, f"header: chunk {i}", 2)
+        kind = as_integer(found, 0xFFFF, f"header: type of chunk {i}")
+        chunks.append((kind, as_integer(size, MAX_PAYLOAD, f"header: length of chunk {i}")))
     layers = layers_of(chunks)
     if chunks[0][0] != 0 or layers != sorted(layers):
         raise Malformed(f"header: layer chunks {layers}, expected layer 0 first and the layers ascending")

@@ -6,6 +6,7 @@ The content is a canonical msgpack map in one zstd frame that declares its size.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -91,44 +92,29 @@ def _check_size(what: str, size: int, limit: int, error: type[EncodeError] | typ
 
 def _unpack(content: bytes) -> Metadata:
     fields = Fields(canonical.unpack(content), "metadata", set(range(TITLE, SLICES + 1)))
-    return Metadata(
-        **{name: _text(fields, key, name) for name, key in TEXTS.items()},
-        quality=_quality(fields),
-        still=_still(fields),
-        slices=_slices(fields),
-    )
+    found: dict[str, Any] = {name: _text(fields.get(key), name) for name, key in TEXTS.items() if key in fields}
+    for name, key, read in (("quality", QUALITY, _quality), ("still", STILL, _still)):
+        found |= {name: read(fields.get(key))} if key in fields else {}
+    if SLICES in fields:
+        as_integer(len(fields.sequence(SLICES)), MAX_CHUNKS, "metadata: slices", low=1)
+        found["slices"] = fields.reals(SLICES, len(fields.sequence(SLICES)))
+    return Metadata(**found)
 
 
-def _text(fields: Fields, key: int, name: str) -> str:
-    if key not in fields:
-        return ""
-    text = fields.get(key)
+def _text(text: object, name: str) -> str:
     if not isinstance(text, str) or not text or not text.isprintable():
         raise Malformed(f"metadata: {name}, expected one line of printable text")
     as_integer(len(text.encode()), MAX_TEXT, f"metadata: bytes of the {name}")
     return text
 
 
-def _quality(fields: Fields) -> dict[int, float]:
-    if QUALITY not in fields:
-        return {}
-    levels = fields.get(QUALITY)
+def _quality(levels: object) -> dict[int, float]:
     if not isinstance(levels, dict) or not levels or not all(isinstance(db, float) for db in levels.values()):
         raise Malformed("metadata: quality, expected dB as float 32 by level")
     return {as_integer(level, MAX_LEVEL, "metadata: level"): db for level, db in levels.items()}
 
 
-def _slices(fields: Fields) -> tuple[float, ...]:
-    if SLICES not in fields:
-        return ()
-    as_integer(len(fields.sequence(SLICES)), MAX_CHUNKS, "metadata: slices", low=1)
-    return fields.reals(SLICES, len(fields.sequence(SLICES)))
-
-
-def _still(fields: Fields) -> bytes:
-    if STILL not in fields:
-        return b""
-    still = fields.get(STILL)
+def _still(still: object) -> bytes:
     if not isinstance(still, bytes) or not still.startswith(STILL_SIGNATURES):
         raise Malformed("metadata: the still picture, expected a PNG, JPEG or WebP file")
     as_integer(len(still), MAX_STILL, "metadata: bytes of the still picture")

@@ -12,26 +12,8 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.errors import LimitExceeded, Malformed
-from pd4dgs_codec.format import canonical
+from pd4dgs_codec.format import canonical, registry
 from pd4dgs_codec.format.canonical import Fields, as_integer, as_list, as_long, as_registered
-from pd4dgs_codec.format.registry import (
-    MAX_ANCHORS,
-    MAX_AXES,
-    MAX_CELLS,
-    MAX_CHAIN_LAYERS,
-    MAX_CHAINS,
-    MAX_CHANNELS,
-    MAX_GRIDS,
-    MAX_ID,
-    MAX_KIND,
-    MAX_KIND_LENGTH,
-    MAX_PARAMETERS,
-    MAX_PAYLOAD,
-    MAX_ROWS,
-    MAX_ROWS_WIDTH,
-    MAX_SIDE,
-    MAX_WIDTH,
-)
 from pd4dgs_codec.tensors.planes import PREDICTORS
 from pd4dgs_codec.tensors.quantise import ROW_PREDICTORS, Rows, RowTable, is_step
 from pd4dgs_codec.tensors.tables import Chain, Fill, Grid, Kind, Tables
@@ -111,8 +93,8 @@ def read_parameters(
     if len(payload) < 4:
         raise Malformed(f"{where}: payload of {len(payload)} bytes, expected at least 4")
     (length,) = struct.unpack_from("<I", payload)
-    if length > MAX_PARAMETERS:
-        raise LimitExceeded(f"{where}: parameters of {length} bytes, limit {MAX_PARAMETERS}")
+    if length > registry.MAX_PARAMETERS:
+        raise LimitExceeded(f"{where}: parameters of {length} bytes, limit {registry.MAX_PARAMETERS}")
     start = 4 + length
     if start > len(payload):
         raise Malformed(f"{where}: parameters of {length} bytes, expected at most {len(payload) - 4}")
@@ -122,7 +104,8 @@ def read_parameters(
     if misplaced:
         place = "a file with a base, expected none" if based else "a later slice, expected it in the first one only"
         raise Malformed(f"{where}: key {misplaced[0]} in {place}")
-    rows, codes = fields.integer(OWN_ROWS, MAX_ANCHORS - before.rows), fields.integer(CODES, MAX_PAYLOAD)
+    rows = fields.integer(OWN_ROWS, registry.MAX_ANCHORS - before.rows)
+    codes = fields.integer(CODES, registry.MAX_PAYLOAD)
     if codes > len(payload) - start:
         raise Malformed(f"{where}: codes of {codes} bytes, expected at most {len(payload) - start}")
     fill = _unpack_fill(fields, f"{where} fill") if FILL in fields else None
@@ -142,8 +125,8 @@ def _unpack_fill(fields: Fields, where: str) -> Fill:
 
 def _check_declared(cells: int, total: Declared, where: str) -> None:
     """Raises LimitExceeded if the slices so far are too short for what they declare (clause 6.5)."""
-    if cells > MAX_CELLS:
-        raise LimitExceeded(f"{where}: planes of {cells} cells, limit {MAX_CELLS}")
+    if cells > registry.MAX_CELLS:
+        raise LimitExceeded(f"{where}: planes of {cells} cells, limit {registry.MAX_CELLS}")
     for what, found, free, per_byte in (
         ("anchors", total.rows, FREE_ROWS, ROWS_PER_BYTE),
         ("symbols", total.symbols, FREE_SYMBOLS, SYMBOLS_PER_BYTE),
@@ -155,28 +138,26 @@ def _check_declared(cells: int, total: Declared, where: str) -> None:
 
 
 def _unpack_tables(fields: Fields, where: str) -> Tables:
-    tables = Tables(kind=unpack_kind(fields.get(KIND), f"{where} kind") if KIND in fields else ())
+    found: dict[str, Any] = {}
+    if KIND in fields:
+        found["kind"] = unpack_kind(fields.get(KIND), f"{where} kind")
     if LAYER_ROWS in fields:
-        tables = replace(tables, rows=unpack_rows(fields.get(LAYER_ROWS), f"{where}: layer rows"))
-    if GRIDS in fields:
-        grids = as_long(fields.get(GRIDS), f"{where} grids", MAX_GRIDS + 1, 2)
-        tables = replace(tables, grid_step=as_step(grids[0], f"{where} grids"))
-        tables = replace(tables, grids=_ascending([_unpack_grid(row, where) for row in grids[1:]], f"{where} grids"))
-    if CHAINS in fields:
-        chains = as_long(fields.get(CHAINS), f"{where} chains", MAX_CHAINS + 1, 2)
-        tables = replace(tables, chain_step=as_step(chains[0], f"{where} chains"))
-        tables = replace(
-            tables, chains=_ascending([_unpack_chain(row, where) for row in chains[1:]], f"{where} chains")
-        )
-    return tables
+        found["rows"] = unpack_rows(fields.get(LAYER_ROWS), f"{where}: layer rows")
+    grids, chains = ("grid", GRIDS, registry.MAX_GRIDS), ("chain", CHAINS, registry.MAX_CHAINS)
+    for (name, key, most), unpack in ((grids, _unpack_grid), (chains, _unpack_chain)):
+        if key in fields:
+            step, *rows = as_long(fields.get(key), f"{where} {name}s", most + 1, 2)
+            found[f"{name}_step"] = as_step(step, f"{where} {name}s")
+            found[f"{name}s"] = _ascending([unpack(row, where) for row in rows], f"{where} {name}s")
+    return Tables(**found)
 
 
 def _unpack_grid(row: object, where: str) -> Grid:
     number, channels, sides, predictors = as_list(row, f"{where} grid", 4)
-    where = f"{where} grid {as_integer(number, MAX_ID, f'{where} grid id')}"
-    as_integer(channels, MAX_CHANNELS, f"{where} channels", 1)
-    for side in as_long(sides, f"{where} sides", MAX_AXES):
-        as_integer(side, MAX_SIDE, f"{where} side", 1)
+    where = f"{where} grid {as_integer(number, registry.MAX_ID, f'{where} grid id')}"
+    as_integer(channels, registry.MAX_CHANNELS, f"{where} channels", 1)
+    for side in as_long(sides, f"{where} sides", registry.MAX_AXES):
+        as_integer(side, registry.MAX_SIDE, f"{where} side", 1)
     grid = Grid(number, channels, tuple(sides))
     for predictor in as_list(predictors, f"{where} predictors", len(grid.planes)):
         as_registered(predictor, PREDICTORS, f"{where} predictor")
@@ -184,21 +165,18 @@ def _unpack_grid(row: object, where: str) -> Grid:
 
 
 def _unpack_chain(row: object, where: str) -> Chain:
-    number, *widths = as_long(row, f"{where} chain", MAX_CHAIN_LAYERS + 2, 3)
-    where = f"{where} chain {as_integer(number, MAX_ID, f'{where} chain id')}"
+    number, *widths = as_long(row, f"{where} chain", registry.MAX_CHAIN_LAYERS + 2, 3)
+    where = f"{where} chain {as_integer(number, registry.MAX_ID, f'{where} chain id')}"
     for width in widths:
-        as_integer(width, MAX_WIDTH, f"{where} width", 1)
+        as_integer(width, registry.MAX_WIDTH, f"{where} width", 1)
     return Chain(number, tuple(widths))
 
 
-def _ascending(tensors: list[Any], where: str) -> tuple[Any, ...]:
-    _check_ascending([tensor.id for tensor in tensors], where)
-    return tuple(tensors)
-
-
-def _check_ascending(ids: Sequence[int], where: str) -> None:
+def _ascending(tensors: Sequence[Any], where: str) -> tuple[Any, ...]:
+    ids = [tensor.id for tensor in tensors]
     if any(a >= b for a, b in pairwise(ids)):
-        raise Malformed(f"{where}: ids {list(ids)}, expected them to ascend")
+        raise Malformed(f"{where}: ids {ids}, expected them to ascend")
+    return tuple(tensors)
 
 
 def pack_rows(tensors: Iterable[Rows]) -> list[list[object]]:
@@ -209,21 +187,21 @@ def pack_rows(tensors: Iterable[Rows]) -> list[list[object]]:
 def unpack_rows(value: object, where: str) -> tuple[Rows, ...]:
     """Returns the tensors of rows of these records. Raises subclasses of DecodeError."""
     tensors = []
-    for row in as_long(value, where, MAX_ROWS):
+    for row in as_long(value, where, registry.MAX_ROWS):
         number, channels, step, predictor = as_list(row, where, 4)
-        as_integer(number, MAX_ID, f"{where}: id")
-        as_integer(channels, MAX_CHANNELS, f"{where} {number}: channels", 1)
+        as_integer(number, registry.MAX_ID, f"{where}: id")
+        as_integer(channels, registry.MAX_CHANNELS, f"{where} {number}: channels", 1)
         as_registered(predictor, ROW_PREDICTORS, f"{where} {number}: predictor")
         tensors.append(Rows(number, channels, as_step(step, f"{where} {number}"), predictor))
-    _check_ascending([tensor.id for tensor in tensors], where)
-    if (width := RowTable(tuple(tensors)).channels) > MAX_ROWS_WIDTH:
-        raise LimitExceeded(f"{where} of {width} channels, limit {MAX_ROWS_WIDTH}")
-    return tuple(tensors)
+    table = RowTable(_ascending(tensors, where))
+    if table.channels > registry.MAX_ROWS_WIDTH:
+        raise LimitExceeded(f"{where} of {table.channels} channels, limit {registry.MAX_ROWS_WIDTH}")
+    return table.tensors
 
 
 def unpack_kind(value: object, where: str) -> Kind:
     """Returns the integers of a kind. Raises Malformed or LimitExceeded for anything else."""
-    return tuple(as_integer(part, MAX_KIND, where) for part in as_long(value, where, MAX_KIND_LENGTH))
+    return tuple(as_integer(part, registry.MAX_KIND, where) for part in as_long(value, where, registry.MAX_KIND_LENGTH))
 
 
 def as_step(value: object, where: str) -> float:

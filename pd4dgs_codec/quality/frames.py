@@ -180,7 +180,7 @@ def write_gif(frames: Iterator[np.ndarray], path: Path, fps: float) -> None:
     try:
         indexed[0].save(path, format="GIF", save_all=True, append_images=indexed[1:], **options)
     except (OverflowError, struct.error):  # of Pillow by version; it joins equal pictures
-        what = f"a still picture lasts too long for a .gif at {fps:g} frames per second; expected a higher rate"
+        what = f"a static image lasts too long for a .gif at {fps:g} frames per second; expected a higher rate"
         raise DataError(what) from None
 
 

@@ -334,7 +334,6 @@ class _Layer:
         return self.size(setting, self.options.effort)
 
     def loss(self, setting: Setting) -> float:
-        """Returns the loss of the decoded scene at a setting."""
         key = frozenset(setting.items())
         if key not in self._losses:
             self._losses[key] = self.fitter.loss(self._planned(setting).symbols.scene())
@@ -347,7 +346,6 @@ class _Layer:
         return round(setting.get(ANCHORS, 0.0) * len(self.own))
 
     def describe(self, setting: Setting, target: int) -> Fit:
-        """Returns the report of the chosen setting."""
         moved, steps = self._moved(setting), self._planned(setting).scene.all_steps
         factors = {k: 2.0**v for k, v in setting.items() if k != ANCHORS}
         return Fit(

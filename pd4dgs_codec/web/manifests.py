@@ -149,7 +149,7 @@ def _duration(seconds: float) -> str:
     return f"PT{seconds:.3f}".rstrip("0").rstrip(".") + "S"
 
 
-def hls(index: str, video: Track | None = None, playlist: str = "") -> bytes:
+def hls(index: str, video: Track | None, playlist: str) -> bytes:
     """Returns the multivariant HLS playlist. index: name of the JSON index. playlist: media playlist of `video`."""
     lines = ["#EXTM3U", "#EXT-X-VERSION:7", f'#EXT-X-SESSION-DATA:DATA-ID="{SESSION_DATA_ID}",URI="{index}"']
     if video is not None:

@@ -8,8 +8,9 @@ import hashlib
 import html
 import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -17,24 +18,12 @@ from urllib.parse import quote
 from pd4dgs_codec.errors import DeliveryError, printable
 from pd4dgs_codec.format.decoder import decode, every_prefix
 from pd4dgs_codec.format.info import info
-from pd4dgs_codec.format.reader import Base, read_base
+from pd4dgs_codec.format.reader import read_base
 from pd4dgs_codec.kinds import AnyScene
 from pd4dgs_codec.segments import INDEX as SEGMENTS_INDEX
 from pd4dgs_codec.segments import File, Index, Segment, read_file, read_index
-from pd4dgs_codec.web import PAGE
+from pd4dgs_codec.web import PAGE, manifests
 from pd4dgs_codec.web.headers import cache_control
-from pd4dgs_codec.web.manifests import (
-    MAX_SECONDS,
-    Period,
-    Track,
-    Video,
-    dash,
-    fragment,
-    hls,
-    hls_video,
-    initialisation,
-    ticks,
-)
 from pd4dgs_codec.web.page import CHARSET, Still, page, with_policy
 
 SCENE, SEGMENTS, MPD, PLAYLIST, INDEX = "scene.pd4", "scene.mp4", "scene.mpd", "scene.m3u8", "index.json"
@@ -43,7 +32,7 @@ VIDEO, VIDEO_PLAYLIST, POSTER = "fallback.mp4", "fallback.m3u8", "poster.jpg"
 RATES = {"2M": 2e6, "10M": 1e7, "50M": 5e7}
 STILL_SECONDS = 1.0  #: presentation time of a static scene
 #: What renders a share of a scene's time, from its start on.
-Render = Callable[[AnyScene, float], Video | None]
+Render = Callable[[AnyScene, float], manifests.Video | None]
 #: What draws a page's still: of the scene, and of (bytes, scene) of what a client has of it before and at the end.
 Draw = Callable[[AnyScene, Iterator[tuple[int, AnyScene]]], Still | None]
 
@@ -70,8 +59,8 @@ def package(
     scene = decode(data)
     about = info(data)
     seconds = presentation_seconds(*about["time_range"])
-    if seconds > MAX_SECONDS:
-        raise DeliveryError(f"found a scene of {seconds:g} s, expected at most {MAX_SECONDS:,} s for DASH")
+    if seconds > manifests.MAX_SECONDS:
+        raise DeliveryError(f"found a scene of {seconds:g} s, expected at most {manifests.MAX_SECONDS:,} s for DASH")
     segments, slices = _segments(data, about, seconds)
     video = render(scene, 1.0)
     media = {SCENE: data, SEGMENTS: segments}
@@ -81,30 +70,14 @@ def package(
     files = {names[name]: content for name, content in media.items()}
     for row in slices:
         row["dash"]["file"] = names[SEGMENTS]
-    track = None if video is None else Track.of(names[VIDEO], video)
-    files[MPD] = dash([Period(slices, seconds, track)])
-    if track is not None:
-        files[VIDEO_PLAYLIST] = hls_video([track])
-    files[PLAYLIST] = hls(INDEX, track, VIDEO_PLAYLIST)
+    track = None if video is None else manifests.Track.of(names[VIDEO], video)
+    files |= _manifests([manifests.Period(slices, seconds, track)])
     ends = (row["range"][1] for row in slices)
     files[PAGE] = page(names[SCENE], data, draw(scene, zip(ends, every_prefix(data), strict=True))).encode()
-    index = {
-        "file": names[SCENE],
-        "format_version": about["format_version"],
-        "bytes": len(data),
-        "sha256": hashlib.sha256(data).hexdigest(),
-        "time_range": about["time_range"],
-        "seconds": seconds,
-        "layers": slices,
-        "dash": MPD,
-        "hls": PLAYLIST,
-        "video": video and {"file": names[VIDEO], "width": video.width, "height": video.height, "fps": video.fps},
-        "poster": names.get(POSTER),
-        "first_frame_seconds": {name: 8 * slices[0]["range"][1] / rate for name, rate in RATES.items()},
-        "cache_control": {name: cache_control(name) for name in (*files, INDEX)},
-    }
-    files[INDEX] = _json(index)
-    return files
+    index = _index(names[SCENE], data, about, len(data), seconds, slices, names.get(POSTER))
+    index["video"] = video and {"file": names[VIDEO], "width": video.width, "height": video.height, "fps": video.fps}
+    index["cache_control"] = {name: cache_control(name) for name in (*files, INDEX)}
+    return files | {INDEX: _json(index)}
 
 
 def package_segments(
@@ -122,8 +95,8 @@ def package_segments(
     """
     place, index = read_index(folder)
     rows: dict[str, list[dict[str, Any]]] = {"bases": [], "segments": []}
-    periods, tracks, begun, poster = list[Period](), list[Track](), None, b""
-    held: tuple[int, Base] | None = None
+    periods, tracks, begun, poster = list[manifests.Period](), list[manifests.Track](), None, b""
+    base_of = lru_cache(1)(lambda k: read_base(read_file(place, index.bases[k])))
 
     def media(file: File, data: bytes, seconds: float) -> Iterator[tuple[str, bytes]]:
         """Yields a file and its MP4, and appends its row of the index."""
@@ -141,24 +114,21 @@ def package_segments(
         yield from media(base, read_file(place, base), STILL_SECONDS)
     for number, segment in enumerate(index.segments):
         data, (start, end) = read_file(place, segment), segment.time_range
-        if segment.base is not None and (held is None or held[0] != segment.base):
-            held = segment.base, read_base(read_file(place, index.bases[segment.base]))
-        scene = decode(data, base=held and held[1])
+        scene = decode(data, base=None if segment.base is None else base_of(segment.base))
         yield from media(segment, data, end - start)
         until = index.segments[number + 1].time_range[0] if number + 1 < len(index.segments) else end
         if (video := render(scene, (until - start) / (end - start))) is not None:
             name = f"fallback-{number:05d}.mp4"
             name = addressed(name, video.data) if immutable else name
             yield name, video.data
-            tracks.append(Track.of(name, video))
+            tracks.append(manifests.Track.of(name, video))
             poster = poster or video.poster
         begun = scene if number == 0 else begun
         shared = [] if segment.base is None else rows["bases"][segment.base]["layers"]
         shared = [row for row in shared if row["layer"] == 0]
-        periods.append(Period(rows["segments"][-1]["layers"], until - start, tracks[-1] if video else None, shared))
-    files = {MPD: dash(periods), PLAYLIST: hls(INDEX, tracks[0] if tracks else None, VIDEO_PLAYLIST)}
-    files |= {VIDEO_PLAYLIST: hls_video(tracks)} if tracks else {}
-    files |= {POSTER: poster} if poster else {}
+        layers = rows["segments"][-1]["layers"]
+        periods.append(manifests.Period(layers, until - start, tracks[-1] if video else None, shared))
+    files = _manifests(periods) | ({POSTER: poster} if poster else {})
     bases = [replace(file, file=row["file"]) for file, row in zip(index.bases, rows["bases"], strict=True)]
     parts = [replace(file, file=row["file"]) for file, row in zip(index.segments, rows["segments"], strict=True)]
     content = Index(tuple(bases), tuple(parts)).packed()
@@ -166,24 +136,38 @@ def package_segments(
     first = read_file(place, shown)
     prefixes = [(len(content) + shown.bytes, decode(first))] if index.segments[0].base is not None else []
     files[PAGE] = page(SEGMENTS_INDEX, first, draw(begun, iter(prefixes)) if begun else None).encode()
-    low, high = index.time_range
-    about = {
-        "file": SEGMENTS_INDEX,
-        "format_version": info(first)["format_version"],
-        "bytes": sum(file.bytes for file in index.files),
+    (low, high), size = index.time_range, sum(file.bytes for file in index.files)
+    header = info(first) | {"time_range": [low, high]}
+    layers = periods[0].base or periods[0].slices
+    about = _index(SEGMENTS_INDEX, content, header, size, high - low, layers, POSTER if poster else None)
+    yield from (files | {SEGMENTS_INDEX: content, INDEX: _json(about | rows)}).items()
+
+
+def _manifests(periods: Sequence[manifests.Period]) -> dict[str, bytes]:
+    """Returns the manifests of DASH and HLS by name."""
+    videos = [period.video for period in periods if period.video]
+    files = {MPD: manifests.dash(periods), PLAYLIST: manifests.hls(INDEX, next(iter(videos), None), VIDEO_PLAYLIST)}
+    return files | ({VIDEO_PLAYLIST: manifests.hls_video(videos)} if videos else {})
+
+
+def _index(
+    file: str, content: bytes, about: dict[str, Any], size: int, seconds: float, layers: Any, poster: str | None
+) -> dict[str, Any]:
+    """Returns what the indices of files and of segments share. content: of the file that players fetch first. about:
+    its `info`. size: bytes of all. layers: slices of the first file."""
+    return {
+        "file": file,
+        "format_version": about["format_version"],
+        "bytes": size,
         "sha256": hashlib.sha256(content).hexdigest(),
-        "time_range": [low, high],
-        "seconds": high - low,
-        "layers": periods[0].base or periods[0].slices,
+        "time_range": about["time_range"],
+        "seconds": seconds,
+        "layers": layers,
         "dash": MPD,
         "hls": PLAYLIST,
-        "poster": POSTER if poster else None,
-        **rows,
+        "poster": poster,
+        "first_frame_seconds": {name: 8 * layers[0]["range"][1] / rate for name, rate in RATES.items()},
     }
-    end = about["layers"][0]["range"][1]
-    about["first_frame_seconds"] = {name: 8 * end / rate for name, rate in RATES.items()}
-    files |= {SEGMENTS_INDEX: content, INDEX: _json(about)}
-    yield from files.items()
 
 
 def addressed(name: str, content: bytes) -> str:
@@ -198,11 +182,11 @@ def _segments(data: bytes, about: dict[str, Any], seconds: float) -> tuple[bytes
     Byte ranges are [first, one past the last]; sha256: of the `.pd4` bytes.
     """
     rows = [(row["layer"], i, part["end"]) for row in about["layers"] for i, part in enumerate(row["slices"])]
-    content = bytearray(initialisation(len(rows), ticks(seconds)))
+    content = bytearray(manifests.initialisation(len(rows), manifests.ticks(seconds)))
     init, start, slices = len(content), 0, list[dict[str, Any]]()
     for number, (layer, place, end) in enumerate(rows, 1):
         part = data[start : len(data) if number == len(rows) else end]
-        piece = fragment(number, number, part, ticks(seconds))
+        piece = manifests.fragment(number, number, part, manifests.ticks(seconds))
         row = {"layer": layer, "slice": place, "range": [start, start + len(part)]}
         row["sha256"] = hashlib.sha256(part).hexdigest()
         row["depends_on"] = sorted({before for before, *_ in rows[: number - 1]})
@@ -285,7 +269,7 @@ def _library_page(scenes: list[dict[str, Any]]) -> str:
     for scene in scenes:
         poster = f'<img loading="lazy" alt="" src="{html.escape(scene["poster"])}">' if scene["poster"] else None
         first = ", ".join(f"{seconds:.1f} s at {rate}bps" for rate, seconds in scene["first_frame_seconds"].items())
-        about = html.escape(f"{scene['bytes'] / 1e6:.2f} MB; first picture after {first}")
+        about = html.escape(f"{scene['bytes'] / 1e6:.2f} MB; first image after {first}")
         link = f'<a href="{html.escape(scene["page"])}">{poster or "<div class=none></div>"}'
         cards.append(f"{link}<br>{html.escape(scene['name'])}<br><small>{about}</small></a>")
     title, head = f"{len(scenes)} scenes", f'<!doctype html><html lang="en">{CHARSET}'

@@ -109,7 +109,7 @@ CASES = [
             ("png", "time 0", "orbit 3"), ("png", "time 0", "frames 2"), ("gif", "duration 2s", "frames 2"),
         )
     ),
-    (2, "render s.pd4 -o a.gif --time 0.5", "--time needs a picture such as a.png as -o"),
+    (2, "render s.pd4 -o a.gif --time 0.5", "--time needs an image such as a.png as -o"),
     (2, "render s.pd4 -o a.png --duration 2", "--duration needs a .gif or .mp4 as -o"),
     (2, "render SCENE -o a.gif --duration 1e9", "found 20,000,000,000 frames, expected at most 100,000"),
     (2, "render SCENE -o b.png --frames 2", "--time 0.5"),

@@ -14,8 +14,7 @@ from pd4dgs_codec.draw.player import drawer
 from pd4dgs_codec.interchange import splats
 from pd4dgs_codec.interchange.splats import picture, read_splats
 from pd4dgs_codec.quality.image import mpsnr, to_uint8
-from pd4dgs_codec.quality.levels import load_levels
-from pd4dgs_codec.quality.timeline import Timeline
+from pd4dgs_codec.quality.levels import Timeline, load_levels
 from pd4dgs_codec.segments import INDEX, read_index
 
 

@@ -89,7 +89,7 @@ def test_an_interrupted_run_says_what_it_lacks_and_how_it_goes_on(cli, train, tm
     assert cut.code == 0 and "3 of 8 steps" in cut.err
     assert "phases not reached: " in cut.err and "exact rounding of attributes" in cut.err
     monkeypatch.setattr(Learner, "step", step)
-    (command,) = (line.partition("to go on: ")[2] for line in cut.err.splitlines() if "to go on: " in line)
+    (command,) = (line.partition("to continue: ")[2] for line in cut.err.splitlines() if "to continue: " in line)
     program, *words = shlex.split(command)
     resumed = cli(program.removeprefix("pd4dgs-"), *words, "--json")
     assert resumed.code == 0 and resumed.json["iterations"] == 8 and resumed.json["finished"] is True

@@ -54,7 +54,7 @@ def test_a_folder_is_one_scene_and_all_segments_hold_the_rows_of_the_base(cli, t
     made = train(folder, "--overlap", 0.5, "--iterations", 60)  # enough for motion in the whole
     assert made.code == 0, made.err
     assert {"segments": 2, "kept": 0, "trained": 2, "finished": True}.items() <= made.json.items()
-    assert "2 segments from 0 to 4 s, with 11, 9 training views of them; 17 of all times for the whole" in made.err
+    assert "2 segments from 0 to 4 s, with 11, 9 training views of them; 17 for the model of all times" in made.err
     base, segments = parts(folder)
     own, whole = decode(base), (folder / "whole.pd4").read_bytes()
     assert own.layers == (0,) and len(own.anchor_q) and hashes(base) == hashes(whole, 0)

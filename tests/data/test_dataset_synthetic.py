@@ -5,6 +5,7 @@ from itertools import combinations, product
 
 import numpy as np
 import pytest
+from moving_bodies import movers
 
 from pd4dgs_codec.data import synthetic as syn
 from pd4dgs_codec.data.bodies import MOTIONS, NO_BODY, THINGS, Eye, bodies, enter, place, shade
@@ -84,7 +85,7 @@ def test_visibility_agrees_with_marching():
 def test_first_hit_is_the_nearest_of_all_bodies():
     placed = place(bodies("static", 3), 0.0)
     eye = Eye(placed, syn.ROOM.fixed[0])
-    xs, ys = syn._grid(LENS)
+    xs, ys = syn.grid(LENS)
     depth, index = eye.first_hits(xs, ys)
     full = np.stack([eye.enter(b, xs[None, :], ys[:, None]) for b in placed])
     np.testing.assert_array_equal(depth, full.min(axis=0))
@@ -134,7 +135,7 @@ def test_points_lie_on_visible_surfaces(large):
     c = v.viewmat[:3, :3] @ large.points.T + v.viewmat[:3, 3:]
     u, w = c[0] / c[2] * LENS.fx + LENS.cx, c[1] / c[2] * LENS.fy + LENS.cy
     ok = (c[2] > 0) & (u > 1) & (w > 1) & (u < 159) & (w < 119)
-    depth, index = eye.first_hits(*syn._grid(LENS))
+    depth, index = eye.first_hits(*syn.grid(LENS))
     ok[ok] = np.abs(depth[w[ok].astype(int), u[ok].astype(int)] - c[2][ok]) < 0.08
     assert ok.sum() > 1500
     line, column = w[ok].astype(int), u[ok].astype(int)
@@ -192,7 +193,7 @@ def test_size_and_frames_options(large):
 
 
 def shoot(scene, viewmat, t):
-    return syn._render(scene, viewmat, t, LENS, syn.ROOM.background)
+    return syn.render(scene, viewmat, t, LENS, syn.ROOM.background)
 
 
 def test_seed_and_name_change_the_picture():
@@ -362,7 +363,7 @@ def test_pictures_without_a_body_differ_where_it_is():
     """The body's pixels, its shadow and its edges are all that differ; nothing else moves in the scene."""
     source = "synthetic:flyby?size=64x64&frames=7"
     d = load(source)
-    (ball,) = syn.movers(source, d.test)
+    (ball,) = movers(source, d.test)
     truth = np.stack([v.image for v in d.test]).astype(int)
     changed = (np.abs(truth - ball.without).max(axis=3) > 3)[ball.shown]
     assert changed.mean() > 0.97
@@ -376,7 +377,7 @@ def test_pictures_without_a_body_differ_where_it_is():
 def test_pixels_of_a_body_count_within_the_masks():
     source = "synthetic:fast?size=40x30&frames=9"
     d = load(source)
-    found = syn.movers(source, d.test)
+    found = movers(source, d.test)
     assert len(found) == 6  # a crate, which turns in its place, three balls, a rod and its bob
     assert min(body.step for body in found) == 0 < found[1].step
     for body in found:

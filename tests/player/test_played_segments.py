@@ -30,7 +30,7 @@ from test_browser import (  # noqa: F401 - fixtures
 
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.draw.player import drawer
-from pd4dgs_codec.quality.timeline import Timeline
+from pd4dgs_codec.quality.levels import Timeline
 from pd4dgs_codec.scene import Camera
 from pd4dgs_codec.segments import INDEX, Segment, file_of, read_index
 from pd4dgs_codec.web.server import Server

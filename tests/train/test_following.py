@@ -5,10 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from moving_bodies import movers
 from runs import trainer_of
 
 from pd4dgs_codec.data.dataset import load
-from pd4dgs_codec.data.synthetic import movers, parse
+from pd4dgs_codec.data.synthetic import parse
 from pd4dgs_codec.model.config import PRESETS
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.train.following import bodies_of, followed
