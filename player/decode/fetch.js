@@ -67,8 +67,8 @@ export class SceneSource {
     this._tag = null;
     /** The open connection. @type {AbortController | null} */
     this._controller = null;
-    /** Its response. skip: bytes that are here already.
-     * @type {{reader: ReadableStreamDefaultReader<Uint8Array>, skip: number, rest: Uint8Array} | null} */
+    /** Its response. piece: the latest; at: where that begins in the file.
+     * @type {{reader: ReadableStreamDefaultReader<Uint8Array>, at: number, piece: Uint8Array} | null} */
     this._body = null;
     /** Ends the wait for the connection: not every body notices that it was aborted. */
     this._giveUp = (/** @type {unknown} */ _reason) => {};
@@ -176,7 +176,8 @@ export class SceneSource {
     if (!this._body && !this._ended) await this._request(until);
     while (this._body && this.received < end) {
       const body = this._body;
-      if (!body.rest.length) {
+      const piece = body.piece.subarray(this.received - body.at, end - body.at);
+      if (!piece.length) {
         const { done, value } = await this._wait(() => body.reader.read(), until, "the connection broke");
         if (done) {
           this.close();
@@ -186,15 +187,10 @@ export class SceneSource {
           this._ended = true;
           return [];
         }
-        const skipped = Math.min(body.skip, value.length);
-        body.skip -= skipped;
-        body.rest = skipped ? value.subarray(skipped) : value;
-        if (!body.rest.length) continue;
+        body.at += body.piece.length;
+        body.piece = value;
+        continue;
       }
-      const { rest } = body;
-      const all = rest.length <= end - this.received; // views take longer than a small piece
-      const piece = all ? rest : rest.subarray(0, end - this.received);
-      body.rest = all ? NOTHING : rest.subarray(piece.length);
       this.received += piece.length;
       this._options.progress?.(this.received, this.total);
       const scenes = this._feed(piece);
@@ -256,13 +252,13 @@ export class SceneSource {
     const request = () => this._fetch(this.url, { headers, signal, cache: start ? "no-store" : "default" });
     // browsers do not tell the two apart
     const response = await this._wait(request, until, "no connection, or no CORS permission of the server");
-    const skip = this._accept(response, "Range" in headers);
-    if (skip === null) this.close();
-    else this._body = { reader: (response.body ?? new Blob().stream()).getReader(), skip, rest: NOTHING };
+    const at = this._accept(response, "Range" in headers);
+    if (at === null) this.close();
+    else this._body = { reader: (response.body ?? new Blob().stream()).getReader(), at, piece: new Uint8Array(0) };
   }
 
   /** Checks a response; restarts if the file has changed. What does not say so is taken: slices have checksums. Returns
-   * how many of its bytes are here already, null if it is of no use.
+   * where its bytes begin in the file, null if it is of no use.
    * @param {Response} response @param {boolean} resumes whether a range was requested */
   _accept({ status, statusText, headers }, resumes) {
     const beyond = status === 416 && resumes; // there is no such byte
@@ -286,12 +282,12 @@ export class SceneSource {
     }
     if (status === 200 || (!range && length !== null && length === this._announced)) {
       this._announced = length;
-      return this.received; // the same file, from a server without ranges
+      return 0; // the same file, from a server without ranges
     }
     const start = range ? Number(range[1]) : this.received;
     if (!(start <= this.received)) throw new Cut("the response holds other bytes than requested");
     this._announced ??= total;
-    return this.received - start;
+    return start;
   }
 
   /** The file has changed. @returns {null} */
@@ -310,7 +306,6 @@ export class SceneSource {
 /** @param {string | null | undefined} text */
 const lengthOf = (text) => (/^\d{1,15}$/.test(text ?? "") ? Number(text) : null);
 
-const NOTHING = new Uint8Array(0);
 const now = () => performance.now() / 1000;
 
 /** @param {number} milliseconds @returns {Promise<void>} */
