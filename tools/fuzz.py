@@ -72,7 +72,7 @@ class Figures:
 
     def text(self) -> str:
         """A table."""
-        rows = [*self.counts.items(), ("faults under two names", self.differences.total())]
+        rows = [*sorted(self.counts.items()), ("faults under two names", self.differences.total())]
         rows += [("largest memory / bound", f"{self.memory:.0%}"), ("findings", len(self.findings))]
         lines = ["| figure | value |\n|---|---|", *(f"| {name} | {value} |" for name, value in rows)]
         lines += [f"{count} × {name}" for name, count in self.differences.most_common(10)]
