@@ -51,22 +51,20 @@ STUCK_SECONDS = 300.0  #: of wall time on one input, on a busy machine; then the
 
 @dataclass
 class Figures:
-    """Counts. findings: {input, kind, message, recipe}. differences: faults that two decoders name differently."""
+    """counts: of inputs, by name. differences: faults that two decoders name differently. findings: {input, kind,
+    message, recipe}."""
 
-    inputs: int = 0
-    legal: int = 0
-    sealed: int = 0
-    outcomes: Counter[str] = field(default_factory=Counter)
-    compared: Counter[str] = field(default_factory=Counter)
+    counts: Counter[str] = field(default_factory=Counter)
     differences: Counter[str] = field(default_factory=Counter)
     memory: float = 0.0  #: the largest share of the bound
     findings: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, other: Figures) -> None:
         """Count another part of the run as well."""
-        for name, value in vars(other).items():
-            own = getattr(self, name)
-            setattr(self, name, max(own, value) if name == "memory" else own + value)
+        self.counts += other.counts
+        self.differences += other.differences
+        self.memory = max(self.memory, other.memory)
+        self.findings += other.findings
 
     def add_finding(self, index: int, kind: str, message: str, recipe: str) -> None:
         """Count one of input `index`."""
@@ -74,12 +72,8 @@ class Figures:
 
     def text(self) -> str:
         """A table."""
-        rows: list[tuple[str, Any]] = [("inputs", self.inputs), ("legal files", self.legal)]
-        rows += [("CRCs recomputed after the mutation", self.sealed)]
-        rows += [(f"ends in {name}", count) for name, count in self.outcomes.most_common()]
-        rows += [(f"compared with {name}", count) for name, count in self.compared.items()]
-        rows += [("faults under two names", self.differences.total()), ("largest memory / bound", f"{self.memory:.0%}")]
-        rows += [("findings", len(self.findings))]
+        rows = [*sorted(self.counts.items()), ("faults under two names", self.differences.total())]
+        rows += [("largest memory / bound", f"{self.memory:.0%}"), ("findings", len(self.findings))]
         lines = ["| figure | value |\n|---|---|", *(f"| {name} | {value} |" for name, value in rows)]
         lines += [f"{count} × {name}" for name, count in self.differences.most_common(10)]
         lines += [f"{r['input']} {r['kind']}: {r['message']} ({r['recipe']})" for r in self.findings[:20]]
@@ -90,16 +84,19 @@ def examine(files: Sequence[Seed], run: int, index: int, decoders: dict[str, Dec
     """Examines one input. every: by all of `decoders`, also where it is not their turn."""
     case = make_case(files, run, index)
     legal = case.meaning is not None
-    figures = Figures(inputs=1, legal=legal, sealed=case.sealed and not legal)
+    sort = "legal files" if legal else "CRCs recomputed after the mutation" if case.sealed else "CRCs of before"
+    figures = Figures(Counter(["inputs", sort]))
     asked = {n: d for n, d in decoders.items() if every or legal or index % COMPARED.get(n, 1) == 0}
     try:
         own = check_package(case, random.Random(~index))
-        figures.outcomes[own.name if own.scene in ("", DECODED) else f"{own.name}, the scene {own.scene}"] += 1
+        figures.counts[
+            "ends in " + (own.name if own.scene in ("", DECODED) else f"{own.name}, the scene {own.scene}")
+        ] += 1
         answers = {"the writer": Answer(DECODED, case.meaning)} if legal else {}
         answers |= {"python": own} | {
             n: answer for n, d in asked.items() if (answer := d(case.data, case.base)) is not None
         }
-        figures.compared.update(set(answers) & set(asked))
+        figures.counts.update(f"compared with {name}" for name in asked if name in answers)
         if difference := compare(answers):
             figures.differences[difference] += 1
         if index % MEASURED == 0:
@@ -136,7 +133,7 @@ def run_safely(files: Sequence[Seed], run: int, inputs: range, names: Sequence[s
                 yield reader.recv()
             except EOFError:
                 child.join()
-                figures, message = Figures(inputs=1), f"the process ended with exit code {child.exitcode}"
+                figures, message = Figures(Counter(["inputs"])), f"the process ended with exit code {child.exitcode}"
                 figures.add_finding(index, "crash", message, make_case(files, run, index).recipe)
                 yield figures
                 break

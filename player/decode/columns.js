@@ -54,15 +54,3 @@ export class Column {
     this._room.set(values);
   }
 }
-
-/** Arrays one behind the other. @template {Uint8Array | Int32Array} A @param {new (length: number) => A} type
- * @param {A[]} arrays */
-export function joined(type, arrays) {
-  const all = new type(arrays.reduce((sum, { length }) => sum + length, 0));
-  let at = 0;
-  for (const array of arrays) {
-    all.set(array, at);
-    at += array.length;
-  }
-  return all;
-}

@@ -25,25 +25,20 @@ function fractions(count, root) {
 const ROUND_CONSTANTS = /* @__PURE__ */ fractions(64, Math.cbrt);
 const START = /* @__PURE__ */ fractions(8, Math.sqrt);
 
-/** SHA-256. @param {Uint8Array} bytes @returns {Uint8Array} [32] */
-export function sha256(bytes) {
-  const whole = bytes.length - (bytes.length % 64);
-  const end = new Uint8Array(bytes.length - whole < 56 ? 64 : 128);
-  end.set(bytes.subarray(whole));
-  end[bytes.length - whole] = 128;
-  const view = new DataView(end.buffer);
-  view.setUint32(end.length - 8, Math.floor(bytes.length / 2 ** 29));
-  view.setUint32(end.length - 4, bytes.length << 3);
+/** SHA-256 of bytes one behind the other. @param {Uint8Array[]} parts @returns {Uint8Array} [32] */
+export function sha256(...parts) {
+  const size = parts.reduce((sum, { length }) => sum + length, 0);
+  const bytes = new Uint8Array(64 * Math.ceil((size + 9) / 64));
+  let end = 0;
+  for (const part of parts) {
+    bytes.set(part, end);
+    end += part.length;
+  }
+  bytes[size] = 128;
+  const view = new DataView(bytes.buffer);
+  view.setUint32(bytes.length - 8, Math.floor(size / 2 ** 29));
+  view.setUint32(bytes.length - 4, size << 3);
   const state = START.slice();
-  compress(state, bytes.subarray(0, whole));
-  compress(state, end);
-  const out = new DataView(new ArrayBuffer(32));
-  state.forEach((word, i) => out.setInt32(4 * i, word));
-  return new Uint8Array(out.buffer);
-}
-
-/** @param {Int32Array} state [8], changed in place @param {Uint8Array} bytes whole blocks */
-function compress(state, bytes) {
   const w = new Int32Array(64);
   const k = ROUND_CONSTANTS;
   for (let at = 0; at < bytes.length; ) {
@@ -82,6 +77,9 @@ function compress(state, bytes) {
     state[6] += g;
     state[7] += h;
   }
+  const digest = new DataView(new ArrayBuffer(32));
+  state.forEach((word, i) => digest.setInt32(4 * i, word));
+  return new Uint8Array(digest.buffer);
 }
 
 /** @param {Uint8Array} bytes @returns {string} lower-case hexadecimal */

@@ -35,6 +35,8 @@ const MOST_BYTES = 2 ** 28;
 const TEMPORARY = [408, 425, 429, 500, 502, 503, 504];
 /** After so many changes the file counts as never stable. */
 const MOST_CHANGES = 4;
+/** Milliseconds between looks at whether a wait has lapsed. */
+const LOOK = 20;
 
 /** The connection ended early, or the response is invalid: a new request may help. */
 class Cut extends Error {}
@@ -45,8 +47,10 @@ class Cut extends Error {}
  */
 export class SceneSource {
   /** @param {string | URL} url @param {SourceOptions} [options] */
-  constructor(url, { signal, stall = 10, attempts = 5, pause = 0.2, progress, fetch, stream } = {}) {
+  constructor(url, { stall = 10, attempts = 5, pause = 0.2, stream = () => new Stream(), ...options } = {}) {
     this.url = String(url);
+    this._options = { stall, attempts, pause, stream, ...options };
+    this._fetch = options.fetch ?? globalThis.fetch.bind(globalThis);
     /** Connections that ended early, and changes of the file, so far. */
     this.cuts = 0;
     this.changes = 0;
@@ -57,30 +61,26 @@ export class SceneSource {
     this._announced = null;
     /** Whether the server has no byte behind those received. */
     this._ended = false;
-    this._signal = signal;
-    this._limits = { stall, attempts, pause };
-    this._progress = progress;
-    this._fetch = fetch ?? globalThis.fetch.bind(globalThis);
-    this._stream = stream ?? (() => new Stream());
     /** What decodes the bytes; another one if the file changes. */
-    this.decoder = this._stream();
+    this.decoder = stream();
     /** The file's ETag, or its date; null where the server does not show them. @type {string | null} */
     this._tag = null;
     /** The open connection. @type {AbortController | null} */
     this._controller = null;
-    /** Its response. skip: bytes that are here already.
-     * @type {{reader: ReadableStreamDefaultReader<Uint8Array>, skip: number, rest: Uint8Array} | null} */
+    /** Its response. piece: the latest; at: where that begins in the file.
+     * @type {{reader: ReadableStreamDefaultReader<Uint8Array>, at: number, piece: Uint8Array} | null} */
     this._body = null;
     /** Ends the wait for the connection: not every body notices that it was aborted. */
     this._giveUp = (/** @type {unknown} */ _reason) => {};
-    /** When a wait lapses, and the timer that looks. */
+    /** When a wait lapses, and the timer that looks: one for each wait would take longer than a small piece does. */
     this._lapse = Infinity;
-    /** @type {ReturnType<typeof setTimeout> | undefined} */
+    /** @type {ReturnType<typeof setInterval> | undefined} */
     this._timer = undefined;
     /** When the request was sent, and how many bytes were here then. */
     this._requested = { at: 0, received: 0 };
     /** Where the file was fetched anew after damage. */
     this._repairedAt = -1;
+    const { signal } = options;
     signal?.addEventListener("abort", () => this._abort(signal.reason), { once: true });
   }
 
@@ -99,11 +99,7 @@ export class SceneSource {
   close() {
     this._abort();
     this._controller = this._body = null;
-    this._stopTimer();
-  }
-
-  _stopTimer() {
-    clearTimeout(this._timer);
+    clearInterval(this._timer);
     this._timer = undefined;
   }
 
@@ -118,13 +114,13 @@ export class SceneSource {
    * @returns {AsyncGenerator<Scene, void, void>}
    */
   async *scenes({ maxLayer = Infinity, bytes, seconds = Infinity } = {}) {
-    const { attempts, pause } = this._limits;
+    const { attempts, pause, signal } = this._options;
     const begun = () => this.decoder.consumed >= (this.decoder.layerEnds[0]?.end ?? Infinity);
     let until = now() + seconds;
     let failures = 0;
     try {
       for (;;) {
-        this._signal?.throwIfAborted();
+        signal?.throwIfAborted();
         if (!begun()) until = Infinity; // also of a file that has changed
         const end = this._end(maxLayer, bytes, until);
         if (end === null || now() >= until) return;
@@ -134,7 +130,7 @@ export class SceneSource {
           scenes = await this._load(end, until);
         } catch (error) {
           this.close();
-          this._signal?.throwIfAborted();
+          signal?.throwIfAborted();
           if (!(error instanceof Cut)) throw error;
           if (now() >= until) return;
           this.cuts++;
@@ -147,10 +143,7 @@ export class SceneSource {
         }
         if (this.received > before) failures = 0;
         if (this._ended) return this.decoder.finish(); // the file ends within this layer: Truncated
-        if (seconds < Infinity && until === Infinity && begun()) {
-          until = now() + seconds;
-          this._stopTimer(); // the next wait may lapse earlier than the one it was set for
-        }
+        if (until === Infinity && begun()) until = now() + seconds;
         yield* scenes;
       }
     } finally {
@@ -183,7 +176,8 @@ export class SceneSource {
     if (!this._body && !this._ended) await this._request(until);
     while (this._body && this.received < end) {
       const body = this._body;
-      if (!body.rest.length) {
+      const piece = body.piece.subarray(this.received - body.at, end - body.at);
+      if (!piece.length) {
         const { done, value } = await this._wait(() => body.reader.read(), until, "the connection broke");
         if (done) {
           this.close();
@@ -193,17 +187,12 @@ export class SceneSource {
           this._ended = true;
           return [];
         }
-        const skipped = Math.min(body.skip, value.length);
-        body.skip -= skipped;
-        body.rest = skipped ? value.subarray(skipped) : value;
-        if (!body.rest.length) continue;
+        body.at += body.piece.length;
+        body.piece = value;
+        continue;
       }
-      const { rest } = body;
-      const all = rest.length <= end - this.received; // views take longer than a small piece
-      const piece = all ? rest : rest.subarray(0, end - this.received);
-      body.rest = all ? NOTHING : rest.subarray(piece.length);
       this.received += piece.length;
-      this._progress?.(this.received, this.total);
+      this._options.progress?.(this.received, this.total);
       const scenes = this._feed(piece);
       if (scenes.length) return scenes;
     }
@@ -230,29 +219,21 @@ export class SceneSource {
     }
   }
 
-  /** Waits for the connection. One timer serves all of it, since one for each wait would take longer than a small piece
-   * does; waits that follow lapse no earlier.
-   * @template T @param {() => Promise<T>} start @param {number} until @param {string} lost says that it is gone
-   * @returns {Promise<T>} */
+  /** Waits for the connection. @template T @param {() => Promise<T>} start @param {number} until
+   * @param {string} lost says that it is gone @returns {Promise<T>} */
   _wait(start, until, lost) {
     return new Promise((resolve, reject) => {
       this._controller?.signal.throwIfAborted();
       this._giveUp = reject;
-      this._lapse = Math.min(performance.now() + 1000 * this._limits.stall, 1000 * until);
-      if (this._timer === undefined) this._look();
+      this._lapse = Math.min(now() + this._options.stall, until);
+      this._timer ??= setInterval(() => {
+        if (now() >= this._lapse) this._abort(new Cut("timed out waiting for data"));
+      }, LOOK);
       start().then((value) => {
         this._lapse = Infinity;
         resolve(value);
       }, (error) => reject(error instanceof TypeError || error instanceof DOMException ? new Cut(lost) : error));
     });
-  }
-
-  /** Ends the connection if the wait has lapsed, else looks again when it will have. */
-  _look() {
-    const left = this._lapse - performance.now();
-    const later = Math.min(Math.ceil(left) + 1, 2 ** 31 - 1); // more would fire at once
-    this._timer = left > 0 && left < Infinity ? setTimeout(() => this._look(), later) : undefined;
-    if (left <= 0) this._abort(new Cut("timed out waiting for data"));
   }
 
   /** Requests the missing bytes. @param {number} until */
@@ -271,13 +252,13 @@ export class SceneSource {
     const request = () => this._fetch(this.url, { headers, signal, cache: start ? "no-store" : "default" });
     // browsers do not tell the two apart
     const response = await this._wait(request, until, "no connection, or no CORS permission of the server");
-    const skip = this._accept(response, "Range" in headers);
-    if (skip === null) this.close();
-    else this._body = { reader: (response.body ?? new Blob().stream()).getReader(), skip, rest: NOTHING };
+    const at = this._accept(response, "Range" in headers);
+    if (at === null) this.close();
+    else this._body = { reader: (response.body ?? new Blob().stream()).getReader(), at, piece: new Uint8Array(0) };
   }
 
   /** Checks a response; restarts if the file has changed. What does not say so is taken: slices have checksums. Returns
-   * how many of its bytes are here already, null if it is of no use.
+   * where its bytes begin in the file, null if it is of no use.
    * @param {Response} response @param {boolean} resumes whether a range was requested */
   _accept({ status, statusText, headers }, resumes) {
     const beyond = status === 416 && resumes; // there is no such byte
@@ -301,19 +282,19 @@ export class SceneSource {
     }
     if (status === 200 || (!range && length !== null && length === this._announced)) {
       this._announced = length;
-      return this.received; // the same file, from a server without ranges
+      return 0; // the same file, from a server without ranges
     }
     const start = range ? Number(range[1]) : this.received;
     if (!(start <= this.received)) throw new Cut("the response holds other bytes than requested");
     this._announced ??= total;
-    return this.received - start;
+    return start;
   }
 
   /** The file has changed. @returns {null} */
   _restart() {
     this.changes++;
     if (this.changes > MOST_CHANGES) throw new FetchError(`${this.url}: changed ${this.changes} times while it loaded`);
-    this.decoder = this._stream();
+    this.decoder = this._options.stream();
     this.received = 0;
     this._requested.received = 0;
     this._announced = this._tag = null;
@@ -325,7 +306,6 @@ export class SceneSource {
 /** @param {string | null | undefined} text */
 const lengthOf = (text) => (/^\d{1,15}$/.test(text ?? "") ? Number(text) : null);
 
-const NOTHING = new Uint8Array(0);
 const now = () => performance.now() / 1000;
 
 /** @param {number} milliseconds @returns {Promise<void>} */

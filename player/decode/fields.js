@@ -100,10 +100,9 @@ export const optional = (read, missing) => (value, where) => (value === undefine
  * @param {number} limit @returns {Read<T[]>} */
 export const tensors = (read, limit) => (value, where) => {
   const found = list(read, 1, limit)(value, where);
-  for (let i = 1; i < found.length; i++) {
-    const [{ id: before }, { id }] = found.slice(i - 1);
-    if (id <= before) throw malformed(`${where}: id ${id} after ${before}`);
-  }
+  found.forEach(({ id }, i) => {
+    if (id <= found[i - 1]?.id) throw malformed(`${where}: id ${id} after ${found[i - 1].id}`);
+  });
   return found;
 };
 

@@ -1,37 +1,37 @@
 // Clauses 8.6, 8.7 and 11.3: grids in stages, and samples from their residuals.
 
 import { channelsOf, groupByClass } from "./channels.js";
-import { malformed } from "./errors.js";
-import { MAX_SYMBOL } from "./limits.js";
+import { checked, dequantise } from "./rows.js";
 /** @import { ChannelReader } from "./channels.js" */
-/** @import { Plane } from "./tensors.js" */
+/** @import { Grid, Plane } from "./tensors.js" */
 
 /** Classes of a plane channel that is split. */
 const CLASSES = 8;
-/** Relative magnitudes of residuals below this come from a table. */
-const LOOKED_UP = 256;
+const SAMPLE = "a plane sample"; // in messages
 
-/** The samples of each plane of all grids, [channels, height, width]. @param {ChannelReader} reader
- * @param {Plane[]} shapes */
-export function decodePlanes(reader, shapes) {
-  const planes = shapes.map(({ channels, height, width }) => new Int32Array(channels * height * width));
-  const all = planes.map((plane, i) => channelsOf(plane, shapes[i].channels));
-  /** @type {Float64Array[]} */
-  const magnitudes = shapes.map(() => new Float64Array(0)); // sums over the stages before, per plane
-  const most = Math.max(0, ...shapes.map(({ channels }) => channels));
-  for (let first = 0, end = 2; first < most; first = end, end *= 2) {
-    shapes.forEach(({ channels, height, width }, i) => {
-      const stage = all[i].slice(first, end);
-      if (!stage.length) return;
-      const groups = first ? groupByActivity(sumOfThree(sumOfThree(magnitudes[i], width, 1), height, width)) : null;
-      for (const channel of stage) reader.fill(channel, groups);
-      if (end >= channels) return;
-      if (!first) magnitudes[i] = new Float64Array(height * width);
-      for (const residuals of stage) addRelativeMagnitudes(residuals, magnitudes[i]);
-    });
+/** Fills the planes of all grids, the first stage of each before the second of any. @param {ChannelReader} reader
+ * @param {Grid[]} grids */
+export function decodeGrids(reader, grids) {
+  let planes = grids.flatMap(({ planes, step }) => planes.map((plane) => stagesOf(reader, plane, step)));
+  while (planes.length) planes = planes.filter((stages) => !stages.next().done);
+}
+
+/** Reads one stage of a plane at a time, then fills it. @param {ChannelReader} reader @param {Plane} plane
+ * @param {number} step */
+function* stagesOf(reader, plane, step) {
+  const { channels, height, width } = plane;
+  const samples = new Int32Array(channels * height * width);
+  const all = channelsOf(samples, channels);
+  const magnitudes = new Float64Array(channels > 2 ? height * width : 0); // sums over the stages before
+  for (let first = 0, end = 2; first < channels; first = end, end *= 2) {
+    const stage = all.slice(first, end);
+    const groups = first ? groupByActivity(sumOfThree(sumOfThree(magnitudes, width, 1), height, width)) : null;
+    for (const channel of stage) reader.fill(channel, groups);
+    if (end < channels) for (const residuals of stage) addRelativeMagnitudes(residuals, magnitudes);
+    yield;
   }
-  all.forEach((plane, i) => plane.forEach((channel) => restore(channel, shapes[i])));
-  return planes;
+  for (const channel of all) restore(channel, plane);
+  plane.data = dequantise(samples, step);
 }
 
 /** Adds the relative magnitude of each cell in one channel to `sums`. @param {Int32Array} residuals
@@ -41,17 +41,11 @@ function addRelativeMagnitudes(residuals, sums) {
   let total = 1;
   for (let p = 0; p < n; p++) total += Math.abs(residuals[p]);
   const factor = 256 * n;
-  /** The floor is exact: the quotient of two integers below 2^53, rounded to binary64, does not reach the next integer.
-   * @param {number} e */
-  const relative = (e) => {
-    if (e * factor <= Number.MAX_SAFE_INTEGER) return Math.floor((e * factor) / total);
-    return Number((BigInt(e) * BigInt(factor)) / BigInt(total));
-  };
-  const known = new Float64Array(LOOKED_UP);
-  for (let e = 0; e < LOOKED_UP; e++) known[e] = relative(e);
   for (let p = 0; p < n; p++) {
-    const e = Math.abs(residuals[p]);
-    sums[p] += e < LOOKED_UP ? known[e] : relative(e);
+    const product = Math.abs(residuals[p]) * factor;
+    // The floor is exact: the quotient of two integers below 2^53, rounded to binary64, is below the next integer.
+    if (product <= Number.MAX_SAFE_INTEGER) sums[p] += Math.floor(product / total);
+    else sums[p] += Number((BigInt(Math.abs(residuals[p])) * BigInt(factor)) / BigInt(total));
   }
 }
 
@@ -82,18 +76,16 @@ function sumOfThree(values, length, stride) {
 /** 11.3, in place: residuals of a channel become samples. Each is checked before others are predicted from it, so that
  * a sum stays small. @param {Int32Array} samples @param {Plane} shape */
 function restore(samples, { width, predictor }) {
-  check(samples[0]);
+  checked(samples[0], SAMPLE);
   // both predictors give W in row 0 and N in column 0
-  for (let at = 1; at < width; at++) check((samples[at] += samples[at - 1]));
+  for (let at = 1; at < width; at++) checked((samples[at] += samples[at - 1]), SAMPLE);
   for (let row = width; row < samples.length; row += width) {
-    check((samples[row] += samples[row - width]));
+    checked((samples[row] += samples[row - width]), SAMPLE);
     let w = samples[row];
     let nw = samples[row - width];
     for (let at = row + 1; at < row + width; at++) {
       const n = samples[at - width];
-      const k = samples[at] + (predictor ? median(w, n, w + n - nw) : n);
-      check(k);
-      samples[at] = w = k;
+      samples[at] = w = checked(samples[at] + (predictor ? median(w, n, w + n - nw) : n), SAMPLE);
       nw = n;
     }
   }
@@ -109,9 +101,4 @@ function median(a, b, c) {
   const below = most - (step & ~(step >> 31));
   step = below - least;
   return least + (step & ~(step >> 31));
-}
-
-/** @param {number} k */
-function check(k) {
-  if ((k + MAX_SYMBOL) >>> 0 > 2 * MAX_SYMBOL) throw malformed(`a plane sample of ${k}, limit ±${MAX_SYMBOL}`);
 }

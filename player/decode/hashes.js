@@ -1,13 +1,7 @@
 // Clause 12.4: digests of what a file decodes to.
 
-import { channelsOf } from "./channels.js";
-import { joined } from "./columns.js";
 import { hex, sha256 } from "./digests.js";
-import { widthOf } from "./fields.js";
 import { readAll } from "./reader.js";
-import { mortonOrder } from "./voxels.js";
-/** @import { Slice } from "./slice.js" */
-/** @import { Tensors } from "./tensors.js" */
 
 /** In hexadecimal. @typedef {{layer: number, symbols: string, tensors: string}} LayerHashes */
 
@@ -15,11 +9,10 @@ const LITTLE_ENDIAN = new Uint8Array(Uint16Array.of(1).buffer)[0] === 1;
 
 /** @param {(Int32Array | Float32Array)[]} arrays */
 function digest(arrays) {
-  const bytes = joined(Uint8Array, arrays.map(({ buffer, byteOffset, byteLength }) => {
-    return new Uint8Array(buffer, byteOffset, byteLength);
-  }));
-  if (!LITTLE_ENDIAN) for (let at = 0; at < bytes.length; at += 4) bytes.subarray(at, at + 4).reverse();
-  return hex(sha256(bytes));
+  return hex(sha256(...arrays.map(({ buffer, byteOffset, byteLength }) => {
+    const bytes = new Uint8Array(buffer, byteOffset, byteLength);
+    return LITTLE_ENDIAN ? bytes : bytes.map((_, i) => bytes[i ^ 3]);
+  })));
 }
 
 /** Per layer the SHA-256 of its integers and of its float32 values, of a complete file, of its layers up to maxLayer,
@@ -27,50 +20,42 @@ function digest(arrays) {
  * @param {Uint8Array} bytes @param {import("./index.js").Options} [options]
  * @returns {LayerHashes[]} */
 export function hashes(bytes, options = {}) {
-  /** @type {Slice[]} */
-  const slices = [];
-  const tensors = readAll(bytes, options, null, (slice) => slices.push(slice));
-  let first = tensors.header.base?.rows ?? 0;
-  return tensors.layers.map(({ layer, codes: { length: end } }, i) => {
-    const symbols = symbolsOf(tensors, i, first, slices.filter((slice) => slice.layer === layer));
-    const values = valuesOf(tensors, i, first, end);
+  const { header, layers, voxels, positions, rows, classes } = readAll(bytes, options, null);
+  let first = header.base?.rows ?? 0;
+  return layers.map(({ layer, codes, rowTensors, rows: layerRows, grids, chains }, i) => {
+    const end = codes.length;
+    const before = layers[i - 1]?.codes; // those of a base are above 0
+    const rises = codes.subarray(0, first).map((code, row) => (before ? code - before[row] : Number(code === 0)));
+    const symbols = [voxels.subarray(3 * first, 3 * end), symbolsOf(rises), symbolsOf(codes.subarray(first))];
+    if (classes) symbols.push(symbolsOf(classes.subarray(first, end)));
+    const tensors = [positions.subarray(3 * first, 3 * end)];
+    /** @param {Float32Array} values @param {number} step @param {number} [channels] */
+    const add = (values, step, channels) => {
+      symbols.push(symbolsOf(values, step, channels));
+      tensors.push(values);
+    };
+    for (const [k, { step, channels }] of header.rows.entries()) {
+      add(rows[k].subarray(channels * first, channels * end), step, channels);
+    }
+    for (const [k, { step, channels }] of rowTensors.entries()) add(layerRows[k], step, channels);
+    const own = i || !header.base; // else grids and chains are the base's
+    for (const { step, planes } of own ? grids : []) for (const { data } of planes) add(data, step);
+    for (const { step, network } of own ? chains : []) {
+      for (const { weight, bias } of network) for (const values of [weight, bias]) add(values, step);
+    }
     first = end;
-    return { layer, symbols: digest(symbols), tensors: digest(values) };
+    return { layer, symbols: digest(symbols), tensors: digest(tensors) };
   });
 }
 
-/** @param {Tensors} tensors @param {number} i index of the layer @param {number} first row of its own
- * @param {Slice[]} slices of it */
-function symbolsOf({ header: { width }, voxels, layers }, i, first, slices) {
-  const order = slices.length > 1 ? mortonOrder(joined(Int32Array, slices.map((slice) => slice.voxels))) : null;
-  /** Channels of all slices, which first have so many rows of earlier layers. @param {number} count
-   * @param {(slice: Slice) => Int32Array} of @param {number} [earlier] */
-  const channels = (count, of, earlier = 0) => {
-    const parts = slices.map((slice) => channelsOf(of(slice), count));
-    return Array.from({ length: count }, (_, c) => {
-      const came = joined(Int32Array, parts.map((part) => part[c]));
-      return order ? came.map((v, k) => (k < earlier ? v : came[earlier + order[k - earlier]])) : came;
-    });
-  };
-  const [{ rises, stepClasses, planes, weights }] = slices;
-  const { codes, rowTensors } = layers[i];
-  const classes = stepClasses ? channels(1, (slice) => /** @type {Int32Array} */ (slice.stepClasses)) : [];
-  const rows = channels(width, (slice) => slice.rows);
-  const layerRows = channels(widthOf(rowTensors), (slice) => slice.layerRows, first);
-  const own = [voxels.subarray(3 * first, 3 * codes.length), rises, Int32Array.from(codes.subarray(first))];
-  return [...own, ...classes, ...rows, ...layerRows, ...planes, ...weights];
-}
-
-/** @param {Tensors} tensors @param {number} i index of the layer @param {number} first row of its own
- * @param {number} end behind its rows */
-function valuesOf({ header, positions, rows, layers }, i, first, end) {
-  const { rows: layerRows, grids, chains } = layers[i];
-  const own = rows.map((values, k) => {
-    const { channels } = header.rows[k];
-    return values.subarray(channels * first, channels * end);
-  });
-  if (header.base && !i) return [positions.subarray(3 * first, 3 * end), ...own]; // the rest is the base's
-  const planes = grids.flatMap((grid) => grid.planes.map(({ data }) => data));
-  const weights = chains.flatMap(({ network }) => network.flatMap(({ weight, bias }) => [weight, bias]));
-  return [positions.subarray(3 * first, 3 * end), ...own, ...layerRows, ...planes, ...weights];
+/** The symbols, channel by channel, of values [rows, channels]. Each is the nearest integer to its value in steps, of
+ * which rounding to binary32 took less than 1/2: symbols have 24 bits. @param {Float32Array | Uint8Array} values
+ * @param {number} [step] @param {number} [channels] */
+function symbolsOf(values, step = 1, channels = 1) {
+  const symbols = new Int32Array(values.length);
+  let at = 0;
+  for (let c = 0; c < channels; c++) {
+    for (let i = c; i < values.length; i += channels) symbols[at++] = Math.round(values[i] / step);
+  }
+  return symbols;
 }

@@ -44,56 +44,41 @@ const HEADER = map([1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15], {
   base: optional(BASE, null),
 });
 
-/** width: W, the channels of all tensors of rows. centres: of these channels; null if anchors have no step classes.
- * identity: SHA-256 of the `described` bytes behind the chunk list; it begins with the scene id (3.3), in hexadecimal.
- * base: null where the file holds its scene whole.
- * @typedef {Pick<ReturnType<typeof HEADER>, "chunks" | "kind" | "rows" | "centres" | "base"> & {width: number,
- * info: Info, identity: Uint8Array, described: number, sceneId: string}} Header */
+/** @typedef {ReturnType<typeof readHeader>} Header */
 /** @typedef {Made<typeof CHUNK>} ListedChunk */
 
-/** @param {Uint8Array} packed @returns {Header} */
+/** width: W, the channels of all tensors of rows. centres: of these channels; null if anchors have no step classes.
+ * identity: SHA-256 of the `described` bytes behind the chunk list; it begins with the scene id (3.3), in hexadecimal.
+ * base: null where the file holds its scene whole. @param {Uint8Array} packed */
 export function readHeader(packed) {
   const { value, firstEntryEnd } = unpack(packed, "header");
-  const { chunks, mode, kind, rows, centres, base, ...described } = HEADER(value, "header");
+  const { chunks, mode, kind, rows, centres, base, box, range, camera, digest, ...others } = HEADER(value, "header");
   const layers = chunks.map(({ type }) => type).filter((type) => type < LAYER_TYPES);
   const fall = layers.findIndex((layer, i) => layer < layers[i - 1]);
   if (fall > 0) throw malformed(`header: layer ${layers[fall]} after ${layers[fall - 1]}, expected ascending ones`);
   if (chunks[0].type !== 0) throw malformed(`header: the first chunk is of type ${chunks[0].type}, expected layer 0`);
   const width = widthOf(rows);
   if (centres && centres.length !== width) throw malformed(`header: ${centres.length} centres, expected ${width}`);
-  const info = infoOf(described);
-  if (mode === 1) throw unsupported("header: mode lzma, expected mode ans"); // an ans-only decoder (clause 16)
-  const identity = sha256(packed.subarray(firstEntryEnd));
-  const sceneId = hex(identity.subarray(0, SCENE_ID_SIZE));
-  const size = packed.length - firstEntryEnd;
-  return { chunks, kind, rows, width, centres, info, identity, described: size, sceneId, base };
-}
-
-/** @param {Omit<ReturnType<typeof HEADER>, "chunks" | "mode" | "kind" | "rows" | "centres" | "base">} fields
- * @returns {Info} */
-function infoOf({ voxelSize, box, timeRange, background, range: [near, far], up, unit, camera }) {
-  const [x0, y0, z0, x1, y1, z1] = box;
-  const [start, end] = timeRange;
-  if (x0 > x1 || y0 > y1 || z0 > z1) throw malformed("header: a lower corner of the box lies above the upper one");
+  const corners = [box.slice(0, 3), box.slice(3)];
+  if (corners[0].some((low, axis) => low > corners[1][axis])) {
+    throw malformed("header: a lower corner of the box lies above the upper one");
+  }
+  const [start, end] = others.timeRange;
   if (end < start) throw malformed(`header: times ${start} and ${end}, expected ascending ones`);
+  const [near, far] = range;
   if (near >= far) throw malformed(`header: near ${near} and far ${far}, expected near < far`);
   const [fx, fy, cx, cy] = camera?.intrinsics ?? [1, 1];
   if (!(fx > 0 && fy > 0)) throw malformed(`header: camera: focal lengths ${fx} and ${fy}, expected positive ones`);
-  const info = {
-    voxelSize,
-    box: [[x0, y0, z0], [x1, y1, z1]],
-    timeRange,
-    background,
-    near,
-    far,
-    up,
-    unit,
-    camera: camera && {
-      viewmat: Float32Array.from([...camera.matrix, 0, 0, 0, 1]),
-      K: Float32Array.from([fx, 0, cx, 0, fy, cy, 0, 0, 1]),
-      width: camera.width,
-      height: camera.height,
-    },
+  const pinhole = camera && {
+    viewmat: Float32Array.from([...camera.matrix, 0, 0, 0, 1]),
+    K: Float32Array.from([fx, 0, cx, 0, fy, cy, 0, 0, 1]),
+    width: camera.width,
+    height: camera.height,
   };
-  return /** @type {Info} */ (info);
+  if (mode === 1) throw unsupported("header: mode lzma, expected mode ans"); // an ans-only decoder (clause 16)
+  const info = /** @type {Info} */ ({ ...others, box: corners, near, far, camera: pinhole });
+  const described = packed.subarray(firstEntryEnd);
+  const identity = sha256(described);
+  const sceneId = hex(identity.subarray(0, SCENE_ID_SIZE));
+  return { chunks, kind, rows, width, centres, info, identity, described: described.length, sceneId, base };
 }

@@ -30,16 +30,13 @@ export { Stream } from "./stream.js";
  * the bytes, or a Base of them, which decodes it once for many files.
  * @typedef {{maxLayer?: number | null, allowPartial?: boolean, base?: GivenBase}} Options */
 
-/** @param {Uint8Array | ArrayBuffer} bytes */
-const viewOf = (bytes) => (bytes instanceof Uint8Array ? bytes : new Uint8Array(bytes));
-
 /** The scene of a file, or of a prefix. Raises DecodeError, also where a kind is unknown or its tensors break its rules
  * (clause 13.1). @param {Uint8Array | ArrayBuffer} bytes @param {Options} [options] @returns {Scene} */
-export const decode = (bytes, options = {}) => sceneOf(readAll(viewOf(bytes), options, RULES));
+export const decode = (bytes, options = {}) => sceneOf(readAll(bytes, options, RULES));
 
 /** The tensors of a file, or of a prefix, whatever their kinds are. Raises DecodeError.
  * @param {Uint8Array | ArrayBuffer} bytes @param {Options} [options] @returns {Tensors} */
-export const decodeTensors = (bytes, options = {}) => readAll(viewOf(bytes), options, null);
+export const decodeTensors = (bytes, options = {}) => readAll(bytes, options, null);
 
 /** A decoder that takes a file in pieces: `feed(bytes)` gives the newest scene of each layer that they complete a slice
  * of. @param {Omit<Options, "allowPartial">} [options] */

@@ -29,13 +29,8 @@ for (const [kind, first, sizes, bits] of /** @type {[string, number, number[], n
   sizes.forEach((size, i) => (FORMS[first + i] = { kind, size, least: bits[i] && 2 ** bits[i] }));
 }
 
-/**
- * The one value that `bytes` hold. firstEntryEnd: the offset behind the first entry of the outermost map, 0 if there is
- * none.
- *
- * @param {Uint8Array} bytes @param {string} where names the value in messages
- * @returns {{value: Value, firstEntryEnd: number}}
- */
+/** The one value that `bytes` hold. firstEntryEnd: the offset behind the first entry of the outermost map, 0 if none
+ * is there. @param {Uint8Array} bytes @param {string} where names the value in messages */
 export function unpack(bytes, where) {
   const reader = new Reader(bytes, where);
   const value = reader.value(0);
@@ -76,7 +71,12 @@ class Reader {
     if (b < 0xa0) return this.items(b < 0x90 ? "map" : "list", b & 15, depth);
     if (b < 0xc0) return this.text(b & 31);
     if (b === 0xc2 || b === 0xc3) return b === 0xc3;
-    if (b === 0xca) return this.real();
+    if (b === 0xca) {
+      const { buffer, byteOffset } = this.take(4);
+      const real = new DataView(buffer, byteOffset).getFloat32(0);
+      if (!Number.isFinite(real)) throw this.fault(`${real}, expected a finite real`);
+      return new Real(real);
+    }
     if (!FORMS[b]) throw this.fault(`type byte 0x${b.toString(16)}, which canonical msgpack does not have`);
     const { kind, size, least } = FORMS[b];
     const n = this.integer(size, kind === "negative");
@@ -84,13 +84,6 @@ class Reader {
     if (kind === "integer" || kind === "negative") return n;
     if (kind === "bytes") return this.take(n).slice();
     return kind === "text" ? this.text(n) : this.items(kind, n, depth);
-  }
-
-  real() {
-    const { buffer, byteOffset } = this.take(4);
-    const real = new DataView(buffer, byteOffset).getFloat32(0);
-    if (!Number.isFinite(real)) throw this.fault(`${real}, expected a finite real`);
-    return new Real(real);
   }
 
   /** @param {number} size bytes */

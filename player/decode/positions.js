@@ -24,23 +24,21 @@ export function decodePositions(reader, rows) {
   const minimum = [0, 1, 2].map(() => codes.zigzag(MAX_VOXEL, "the minimum of the voxel indices"));
   const depth = codes.byte("the depth of the octree");
   if (depth > MAX_DEPTH) throw limitExceeded(`a depth of ${depth}, limit ${MAX_DEPTH}`);
-  const offsets = grow(reader, readLevels(reader, depth, rows), rows);
-  const voxels = new Int32Array(3 * rows);
-  let largestOfAll = 0;
-  offsets.forEach((along, axis) => {
+  const voxels = grow(reader, readLevels(reader, depth, rows), rows);
+  let bits = 0;
+  for (let axis = 0; axis < 3; axis++) {
     let least = Infinity;
     let largest = 0;
-    for (let i = 0; i < rows; i++) {
-      least = Math.min(least, along[i]);
-      largest = Math.max(largest, along[i]);
-      voxels[3 * i + axis] = minimum[axis] + along[i];
+    for (let at = axis; at < voxels.length; at += 3) {
+      least = Math.min(least, voxels[at]);
+      largest = Math.max(largest, voxels[at]);
+      voxels[at] += minimum[axis];
     }
     if (least !== 0) throw malformed(`voxel offsets begin at ${least} on an axis, expected 0`);
     const last = minimum[axis] + largest;
     if (last > MAX_VOXEL) throw malformed(`a voxel index of ${last}, limit ${MAX_VOXEL}`);
-    largestOfAll = Math.max(largestOfAll, largest);
-  });
-  const bits = 32 - Math.clz32(largestOfAll);
+    bits = Math.max(bits, 32 - Math.clz32(largest));
+  }
   if (bits !== depth) throw malformed(`voxel offsets of ${bits} bits, expected the octree's depth ${depth}`);
   return voxels;
 }
@@ -61,21 +59,20 @@ function readLevels(reader, depth, rows) {
   return levels;
 }
 
-/** The offsets of all anchors along x, y, z. @param {ChannelReader} reader @param {Int32Array[]} levels
+/** The offsets of all anchors, [rows, 3]. @param {ChannelReader} reader @param {Int32Array[]} levels
  * @param {number} rows */
 function grow(reader, levels, rows) {
-  let [parents, nodes] = [0, 1].map(() => [0, 1, 2].map(() => new Int32Array(rows)));
+  let [parents, nodes] = [new Int32Array(3 * rows), new Int32Array(3 * rows)];
   for (const further of levels) {
     const indices = new Int32Array(further.length);
     reader.fill(indices, groupByClass(further, ALL));
-    let made = 0;
+    let at = 0;
     for (let i = 0; i < indices.length; i++) {
       const pattern = PATTERNS[further[i]][indices[i]];
       if (pattern === undefined) throw malformed(`pattern ${indices[i]} of a node with ${further[i] + 1} children`);
       for (let child = 0; child < ALL; child++) {
         if (!((pattern >> child) & 1)) continue;
-        for (let axis = 0; axis < 3; axis++) nodes[axis][made] = 2 * parents[axis][i] + ((child >> axis) & 1);
-        made++;
+        for (let axis = 0; axis < 3; axis++) nodes[at++] = 2 * parents[3 * i + axis] + ((child >> axis) & 1);
       }
     }
     [parents, nodes] = [nodes, parents];

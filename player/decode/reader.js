@@ -1,16 +1,13 @@
 // Clause 12: a file's chunks in order, slice by slice, to tensors.
 
-import { Column, joined } from "./columns.js";
+import { Column } from "./columns.js";
 import { CHUNK_OVERHEAD, PREAMBLE_SIZE, readChunk, readPreamble } from "./container.js";
 import { hex, sha256 } from "./digests.js";
 import { DecodeError, limitExceeded, malformed } from "./errors.js";
 import { LAYER_TYPES, readHeader } from "./header.js";
-import { dequantise, rowsOf } from "./rows.js";
-import { LEAST_OWN_CODE, MOST_CODE, decodeSlice } from "./slice.js";
+import { decodeSlice } from "./slice.js";
 import { VoxelTable, mortonOrder } from "./voxels.js";
-/** @import { Values } from "./columns.js" */
 /** @import { Header } from "./header.js" */
-/** @import { Slice } from "./slice.js" */
 /** @import { Prior } from "./tables.js" */
 /** @import { LayerTensors, Tensors } from "./tensors.js" */
 
@@ -23,28 +20,30 @@ import { VoxelTable, mortonOrder } from "./voxels.js";
 /** @typedef {Omit<LayerTensors, "codes" | "fill" | "spread" | "rows">} LayerTables */
 
 /**
- * A layer as far as it has been read: `first` row of its own; codes of the mask, of all rows up to its own, and its own
- * tensors of rows; `sorted`, whether its rows are.
+ * A layer as far as it has been read: `first` row of its own; in columns of all rows up to its own the mask codes and
+ * its tensors; `sorted`, whether its rows are.
  *
  * @typedef {Omit<LayerTensors, "codes" | "rows"> & {slices: number, first: number, sorted: boolean,
- *   codes: Column<Uint8Array>, rows: Column<Float32Array>[], priors: Prior[]}} Layer
+ *   columns: Column<any>[], priors: Prior[]}} Layer
  */
 
 /** @typedef {Base | Uint8Array | ArrayBuffer | null} GivenBase a file's bytes, or what was read of them */
+
+/** @param {Uint8Array | ArrayBuffer} bytes */
+const viewOf = (bytes) => (bytes instanceof Uint8Array ? bytes : new Uint8Array(bytes));
 
 /**
  * Reads a whole file, or its layers up to maxLayer; of a cut file, if allowPartial, the slices that are there, at least
  * one, or without any those of its base. Raises DecodeError.
  *
- * @param {Uint8Array} bytes @param {{maxLayer?: number | null, allowPartial?: boolean, base?: GivenBase}} options
- * @param {Rules | null} rules null: tensors of any kind are taken
- * @param {(slice: Slice) => void} [take] is given each slice
- * @returns {Tensors}
+ * @param {Uint8Array | ArrayBuffer} bytes
+ * @param {{maxLayer?: number | null, allowPartial?: boolean, base?: GivenBase}} options
+ * @param {Rules | null} rules null: tensors of any kind are taken @returns {Tensors}
  */
-export function readAll(bytes, { maxLayer = null, allowPartial = false, base = null }, rules, take) {
+export function readAll(bytes, { maxLayer = null, allowPartial = false, base = null }, rules) {
   const reader = new TensorReader(maxLayer, rules, base);
   try {
-    reader.read(bytes, take);
+    reader.read(viewOf(bytes));
   } catch (error) {
     const cut = error instanceof DecodeError && error.kind === "Truncated";
     if (!cut || !allowPartial || !reader.layers.length) throw error;
@@ -104,14 +103,13 @@ export class TensorReader {
    * Raises Truncated if they end before all that were asked for: whole chunks are consumed then. Of a file that is read
    * whole, bytes behind the last chunk are Malformed.
    *
-   * @param {Uint8Array} bytes @param {(slice: Slice) => void} [take] is given each slice once it is read
+   * @param {Uint8Array} bytes @param {() => void} [told] is called behind each slice
    */
-  read(bytes, take) {
+  read(bytes, told) {
     const start = this.consumed;
     const header = this.header ?? this._begin(bytes);
     while (!this.complete) {
-      const slice = this._readChunk(bytes.subarray(this.consumed - start), header);
-      if (slice) take?.(slice);
+      if (this._readChunk(bytes.subarray(this.consumed - start), header)) told?.();
     }
     const left = start + bytes.length - this.consumed;
     if (this.maxLayer !== null || left <= 0) return;
@@ -134,7 +132,7 @@ export class TensorReader {
     }
     this.end = end;
     const { rows, width, centres } = header;
-    this._columns = [new Column(Int32Array, 3), ...[3, ...widths(rows)].map((each) => new Column(Float32Array, each))];
+    this._columns = [new Column(Int32Array, 3), new Column(Float32Array, 3), ...floats(rows)];
     if (centres) this._columns.push(new Column(Uint8Array, 1));
     if (!base) return header;
     this._base = base;
@@ -153,7 +151,7 @@ export class TensorReader {
     if (!given) throw new DecodeError("BaseMissing", `${wanted}, and no base is given`);
     let base;
     try {
-      base = given instanceof Base ? given : new Base(given instanceof Uint8Array ? given : new Uint8Array(given));
+      base = given instanceof Base ? given : new Base(viewOf(given));
     } catch (error) {
       if (!(error instanceof DecodeError)) throw error; // its place is none in this file, of which no bytes are missing
       throw new DecodeError(error.kind === "Truncated" ? "BaseMismatch" : error.kind, `the base: ${error.message}`);
@@ -162,40 +160,37 @@ export class TensorReader {
     if (hex(named.sceneId) !== header.sceneId || hex(named.digest) !== base.digest) {
       throw new DecodeError("BaseMismatch", `${wanted}, the base given is another one, of scene ${header.sceneId}`);
     }
-    if (named.rows !== base.rows || named.bytes !== base.bytes) {
-      const wrong = `a base of ${named.rows} rows and ${named.bytes} bytes`;
-      throw malformed(`header: ${wrong}, not ${base.rows} and ${base.bytes}`);
-    }
-    const same = [header.kind, header.rows, header.centres, header.info.voxelSize];
-    if (JSON.stringify([kind, rows, centres, voxelSize]) !== JSON.stringify(same)) {
-      throw malformed("header: kind, rows, centres or voxel size, expected those of the base");
+    const said = [kind, rows, centres, voxelSize, named.rows, named.bytes];
+    const same = [header.kind, header.rows, header.centres, header.info.voxelSize, base.rows, base.bytes];
+    if (JSON.stringify(said) !== JSON.stringify(same)) {
+      throw malformed("header: kind, rows, centres, voxel size or counts, expected those of the base");
     }
     return base;
   }
 
-  /** The next chunk's slice, if it has one. @param {Uint8Array} bytes from the chunk on @param {Header} header */
+  /** Reads the next chunk: whether it has a slice. @param {Uint8Array} bytes from it on @param {Header} header */
   _readChunk(bytes, header) {
     const { consumed, _chunks: chunk } = this;
-    const listed = header.chunks[chunk];
-    let slice = null;
+    const { type, length } = header.chunks[chunk];
+    const sliced = type < LAYER_TYPES;
     try {
-      const read = readChunk(bytes, listed, header.sceneId);
-      if (listed.type < LAYER_TYPES) slice = this._readSlice(read, listed.type, header);
+      const read = readChunk(bytes, header.chunks[chunk], header.sceneId);
+      if (sliced) this._readSlice(read, type, header);
     } catch (error) {
       // What an engine says where it cannot allocate an array.
       const full = error instanceof RangeError && /allocation|array length|buffer length/i.test(error.message);
-      const fault = full ? limitExceeded(`layer ${listed.type} takes more memory than there is`) : error;
+      const fault = full ? limitExceeded(`layer ${type} takes more memory than there is`) : error;
       if (!(fault instanceof DecodeError)) throw fault;
       const place = { offset: consumed + (fault.offset ?? 0), chunk, needs: consumed + fault.needs };
       throw new DecodeError(fault.kind, fault.reason, place);
     }
     this._chunks++;
-    if (slice) this._slices++;
-    this.consumed += CHUNK_OVERHEAD + listed.length;
-    return slice;
+    this._slices += Number(sliced);
+    this.consumed += CHUNK_OVERHEAD + length;
+    return sliced;
   }
 
-  /** A slice, which is added to its layer under the rules of 12.1 that need earlier slices, and those of kinds. If it
+  /** Reads a slice and adds it to its layer, under the rules of 12.1 that need earlier slices and those of kinds. If it
    * is refused, nothing is added: it may be fetched again. @param {ReturnType<typeof readChunk>} chunk
    * @param {number} number of the layer @param {Header} header */
   _readSlice({ more, number: place, payload }, number, header) {
@@ -208,56 +203,33 @@ export class TensorReader {
       const says = more ? "announces a further slice" : "ends";
       throw malformed(`layer ${number} ${says}, but layer ${next.layer} follows`, 2);
     }
-    const classes = header.centres && this._columns[this._columns.length - 1].values;
-    const slice = decodeSlice(payload, number, header, { declared: this._declared, classes, layer: had });
-    const { voxels, rises, stepClasses, rowTensors } = slice;
-    const own = slice.codes.length;
-    const codes = new Uint8Array(rises.length + own);
-    const before = latest?.codes.values; // of a whole layer, in order, or with no rises
-    for (let i = 0; i < rises.length; i++) {
-      const code = number ? before[i] + rises[i] : before[i] * (1 - rises[i]);
-      if (code > MOST_CODE || (code && code < LEAST_OWN_CODE)) {
-        throw malformed(`layer ${number}: a mask code of ${code}, expected 0 or ${LEAST_OWN_CODE}..${MOST_CODE}`);
-      }
-      codes[i] = code;
-    }
-    codes.set(slice.codes, rises.length);
+    const before = {
+      declared: this._declared,
+      codes: latest ? latest.columns[0].values : new Uint8Array(0), // of a whole layer, in order, where they matter
+      classes: header.centres && this._columns[this._columns.length - 1].values,
+      layer: had,
+    };
+    const slice = decodeSlice(payload, number, header, before);
     for (const table of [this._taken, this._base?._taken]) {
-      const [x, y, z] = table?.common(voxels) ?? [];
+      const [x, y, z] = table?.common(slice.voxels) ?? [];
       if (x !== undefined) throw malformed(`voxel ${x} ${y} ${z} holds more than one anchor`);
     }
-    const positions = dequantise(voxels, header.info.voxelSize);
-    /** @type {Values[]} */
-    const values = [voxels, positions, ...rowsOf(header.rows, slice.rows, own)];
-    if (stepClasses) values.push(Uint8Array.from(stepClasses));
-    values.push(codes, ...rowsOf(rowTensors, slice.layerRows, rises.length + own));
-    const layer = had ?? this._begun(slice);
+    const { kind, rowTensors, priors, fill, spread } = slice;
+    const { grids, chains } = (!number && this.layers[0]) || slice; // layer 0 over a base has the base's
+    const own = [new Column(Uint8Array, 1), ...floats(rowTensors)];
+    const begun = had ?? { layer: number, kind, grids, chains, rowTensors, columns: own, first: this._declared.rows };
+    const sorted = !had || (had.sorted && !slice.rows);
+    const layer = { ...begun, slices: place + 1, sorted, priors, fill: fill ?? header.info.background, spread };
     if (!had) this._rules?.checkLayer(header, [...this.layers, layer]);
     const growth = next ? Math.max(1.5, (1.25 * (last - start)) / (end - start)) : 1;
-    const columns = [...this._columns, layer.codes, ...layer.rows];
-    columns.forEach((column, i) => column.reserve(values[i], growth));
+    const columns = [...this._columns, ...layer.columns];
+    columns.forEach((column, i) => column.reserve(slice.columns[i], growth));
     // from here on nothing fails, but for want of memory to sort
-    columns.forEach((column, i) => column.append(values[i], growth));
-    if (!had) this.layers = [...this.layers.filter((other) => other.layer !== number), layer];
-    layer.slices++;
-    layer.sorted = !had || (layer.sorted && !voxels.length);
-    const [spread = 0] = slice.fill?.slice(3) ?? [];
-    layer.fill = slice.fill?.slice(0, 3).map((c) => c / 255) ?? header.info.background;
-    layer.spread = 1 + spread / 64;
-    layer.priors = slice.priors;
-    this._taken.add(voxels);
+    columns.forEach((column, i) => column.append(slice.columns[i], growth));
+    this.layers = [...this.layers.filter((other) => other.layer !== number), layer];
+    this._taken.add(slice.voxels);
     this._declared = slice.declared;
     if (next?.layer !== number) this.sort(growth);
-    return slice;
-  }
-
-  /** A layer without rows. @param {Slice} slice its first @returns {Layer} */
-  _begun(slice) {
-    const { layer, kind, rowTensors, priors } = slice;
-    const { grids, chains } = (!layer && this.layers[0]) || slice; // layer 0 over a base has the base's
-    const rows = widths(rowTensors).map((channels) => new Column(Float32Array, channels));
-    const empty = { codes: new Column(Uint8Array, 1), rows, fill: [], spread: 1, slices: 0, sorted: true };
-    return { layer, kind, grids, chains, rowTensors, priors, first: this._declared.rows, ...empty };
   }
 
   /** Puts the rows of the latest layer in the order of 12.2. @param {number} [growth] as in Column */
@@ -265,7 +237,7 @@ export class TensorReader {
     const layer = this.layers[this.layers.length - 1];
     if (!layer || layer.sorted) return;
     const order = mortonOrder(this._columns[0].values.subarray(3 * layer.first));
-    for (const column of [...this._columns, layer.codes, ...layer.rows]) column.reorder(layer.first, order, growth);
+    for (const column of [...this._columns, ...layer.columns]) column.reorder(layer.first, order, growth);
     layer.sorted = true;
   }
 
@@ -275,12 +247,13 @@ export class TensorReader {
    * @returns {Tensors} */
   tensors() {
     if (!this.header || !this.layers.length) throw new TypeError("no layer has been read");
-    const layers = this.layers.map(({ layer, codes, fill, spread, grids, chains, kind, rowTensors, rows }) => {
-      const arrays = { codes: codes.values, rows: rows.map(({ values }) => values) };
-      return { layer, ...arrays, fill, spread, grids, chains, kind, rowTensors };
+    const layers = this.layers.map(({ layer, columns, fill, spread, grids, chains, kind, rowTensors }) => {
+      const [codes, ...rows] = columns.map(({ values }) => values);
+      return { layer, codes, rows, fill, spread, grids, chains, kind, rowTensors };
     });
     const [voxels, positions, ...rows] = this._columns.map(({ values }) => values);
-    return { header: this.header, layers, voxels, positions, rows: rows.slice(0, this.header.rows.length) };
+    const classes = this.header.centres ? rows.pop() : null;
+    return { header: this.header, layers, voxels, positions, rows, classes };
   }
 }
 
@@ -291,15 +264,14 @@ export class Base extends TensorReader {
   constructor(bytes) {
     super(0, null);
     this.read(bytes);
-    const [{ codes, rowTensors }] = this.layers;
+    const [{ rowTensors }] = this.layers;
     if (rowTensors.length) throw malformed("the base has layer rows in layer 0, expected none");
     const { identity, described } = /** @type {Header} */ (this.header);
     const chunks = this.layerEnds.filter(({ layer }) => !layer).map(({ start, end }) => bytes.subarray(start, end));
-    const digests = [identity, ...chunks.map(sha256)];
-    this.digest = hex(sha256(joined(Uint8Array, digests)));
+    this.digest = hex(sha256(identity, ...chunks.map((chunk) => sha256(chunk))));
     /** That the digest is of. */
     this.bytes = chunks.reduce((sum, { length }) => sum + length, described);
-    this.rows = codes.rows;
+    this.rows = this._declared.rows;
   }
 
   /** @param {Header} header @returns {null} */
@@ -310,4 +282,4 @@ export class Base extends TensorReader {
 }
 
 /** @param {{channels: number}[]} tensors */
-const widths = (tensors) => tensors.map(({ channels }) => channels);
+const floats = (tensors) => tensors.map(({ channels }) => new Column(Float32Array, channels));

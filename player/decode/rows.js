@@ -1,8 +1,7 @@
-// Clauses 8.5, 11.2 and 11.5: tensors of rows, from symbols to their values.
+// Clauses 8.5, 11.2 and 11.5: tensors of rows, from symbols to values.
 
 import { channelsOf, checkRange, groupByClass } from "./channels.js";
 import { malformed } from "./errors.js";
-import { widthOf } from "./fields.js";
 import { MAX_SYMBOL } from "./limits.js";
 /** @import { ChannelReader } from "./channels.js" */
 /** @import { RowTensor } from "./tensors.js" */
@@ -11,25 +10,26 @@ import { MAX_SYMBOL } from "./limits.js";
 const WHOLE = 2;
 export const STEP_CLASSES = 7;
 
-/** The values in steps of tensors of rows, [channels, count] of all tensors one behind the other.
- * @param {ChannelReader} reader @param {RowTensor[]} tensors @param {number} count of rows
- * @param {Int32Array | Uint8Array | null} classes [count] step classes, null if rows have none
- * @param {number[] | null} centres of the channels, null if they are 0
+/** Tensors of rows, [count, channels] each. @param {ChannelReader} reader @param {RowTensor[]} tensors
+ * @param {number} count of rows @param {Uint8Array | null} classes [count] step classes, null if rows have none
+ * @param {number[] | null} centres of the channels of all tensors, null if they are 0
  * @param {number} [base] rows of a base, the first ones, which are channels of their own */
 export function decodeRows(reader, tensors, count, classes, centres, base = 0) {
-  const values = new Int32Array(widthOf(tensors) * count);
   const parts = base ? new Uint8Array(count).fill(STEP_CLASSES, base) : classes;
   if (base) classes?.forEach((c, i) => (/** @type {Uint8Array} */ (parts)[i] += c));
   const groups = parts && groupByClass(parts, 2 * STEP_CLASSES);
-  const predictors = tensors.flatMap(({ channels, predictor }) => new Array(channels).fill(predictor));
-  channelsOf(values, predictors.length).forEach((channel, c) => {
-    reader.fill(channel, groups);
-    restore(channel, classes, centres?.[c] ?? 0, predictors[c]);
+  let c = 0;
+  return tensors.map(({ channels, predictor, step }) => {
+    const values = new Int32Array(channels * count);
+    for (const channel of channelsOf(values, channels)) {
+      reader.fill(channel, groups);
+      restore(channel, classes, centres?.[c++] ?? 0, predictor);
+    }
+    return dequantise(values, step, count, channels);
   });
-  return values;
 }
 
-/** 11.2, in place: symbols become values. @param {Int32Array} values @param {Int32Array | Uint8Array | null} classes
+/** 11.2, in place: symbols become values in steps. @param {Int32Array} values @param {Uint8Array | null} classes
  * @param {number} centre @param {number} predictor */
 function restore(values, classes, centre, predictor) {
   checkRange(values, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of a row");
@@ -45,19 +45,10 @@ function restore(values, classes, centre, predictor) {
   }
 }
 
-/** @param {number} v of steps, below 2^30 in magnitude */
-function checked(v) {
-  if ((v + MAX_SYMBOL) >>> 0 > 2 * MAX_SYMBOL) throw malformed(`a row's value of ${v} steps, limit ±${MAX_SYMBOL}`);
+/** A value in steps, in its range. @param {number} v below 2^30 in magnitude @param {string} what */
+export function checked(v, what = "a row's value") {
+  if ((v + MAX_SYMBOL) >>> 0 > 2 * MAX_SYMBOL) throw malformed(`${what} of ${v} steps, limit ±${MAX_SYMBOL}`);
   return v;
-}
-
-/** Each tensor of rows dequantised, [count, channels]. @param {RowTensor[]} tensors @param {Int32Array} values as
- * decodeRows gives them @param {number} count */
-export function rowsOf(tensors, values, count) {
-  let at = 0;
-  return tensors.map(({ channels, step }) => {
-    return dequantise(values.subarray(at, (at += channels * count)), step, count, channels);
-  });
 }
 
 /** Rows that are transposed at a time, so few that they stay in the cache. */

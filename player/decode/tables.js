@@ -61,21 +61,17 @@ const INDEX_BITS = 9;
 export const INDEX_SHIFT = 24 - INDEX_BITS;
 
 /** A frequency table for the symbols from kmin on. index: the entry at the first state of each value of the upper
- * INDEX_BITS bits; the table of one symbol needs none. */
+ * INDEX_BITS bits. */
 export class Prior {
   /** @param {number} kmin @param {Int32Array} [cum] [n + 1], 7.2, default: of one symbol */
-  constructor(kmin, cum = ONE) {
+  constructor(kmin, cum = Int32Array.of(0, TOTAL)) {
     this.kmin = kmin;
     this.n = cum.length - 1;
     this.cum = cum;
-    this.index = cum === ONE ? NONE : new Uint16Array((1 << INDEX_BITS) + 1).fill(this.n - 1);
-    if (cum === ONE) return;
+    this.index = new Uint16Array((1 << INDEX_BITS) + 1).fill(this.n - 1);
     for (let bucket = 0, s = 0; bucket < 1 << INDEX_BITS; bucket++) {
       while (cum[s + 1] <= bucket << INDEX_SHIFT) s++;
       this.index[bucket] = s;
     }
   }
 }
-
-const ONE = /* @__PURE__ */ Int32Array.of(0, TOTAL);
-const NONE = /* @__PURE__ */ new Uint16Array(0);

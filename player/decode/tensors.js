@@ -25,13 +25,13 @@
 /** A plane of a grid, [channels, height, width].
  * @typedef {{data: Float32Array, channels: number, height: number, width: number, predictor: number}} Plane */
 
-/** A grid with one plane for each pair of its sides in order: 01, 02, .. 12, 13, ..
- * @typedef {{id: number, channels: number, sides: number[], planes: Plane[]}} Grid */
+/** A grid with one plane for each pair of its sides in order: 01, 02, .. 12, 13, .. Samples are multiples of the step.
+ * @typedef {{id: number, channels: number, step: number, sides: number[], planes: Plane[]}} Grid */
 
 /** Linear layers from the input side. weight: row-major [outputs][inputs].
  * @typedef {{weight: Float32Array, bias: Float32Array, inputs: number, outputs: number}[]} Network */
 
-/** @typedef {{id: number, network: Network}} Chain */
+/** Weights are multiples of the step. @typedef {{id: number, step: number, network: Network}} Chain */
 
 /**
  * A layer as far as it has been read.
@@ -57,4 +57,5 @@
  * @property {Int32Array} voxels [N, 3] indices
  * @property {Float32Array} positions [N, 3] scene units
  * @property {Float32Array[]} rows [N, channels] of each tensor of the header's
+ * @property {Uint8Array | null} classes [N] step classes, null if rows have none
  */

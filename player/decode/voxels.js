@@ -22,7 +22,7 @@ export class VoxelTable {
 
   /** The first of these voxels that is there, null if none is. @param {Int32Array} voxels [n, 3] */
   common(voxels) {
-    if (voxels.length) for (const part of this._loose.splice(0)) this._enter(part);
+    if (voxels.length) this._enter();
     for (let i = 0; i < voxels.length && this._count; i += 3) {
       if (this._slots[this._slot(voxels, i)] !== EMPTY) return voxels.subarray(i, i + 3);
     }
@@ -42,30 +42,24 @@ export class VoxelTable {
     }
   }
 
-  /** @param {Int32Array} voxels [n, 3] */
-  _enter(voxels) {
-    this._count += voxels.length / 3;
-    const old = this._slots;
-    if (6 * this._count > old.length) {
+  /** Puts the loose ones into the table. */
+  _enter() {
+    const parts = this._loose.splice(0);
+    for (const { length } of parts) this._count += length / 3;
+    if (6 * this._count > this._slots.length) {
+      parts.push(this._slots);
       // at most half full: most look-ups find nothing
       this._slots = new Int32Array(3 * 2 ** Math.ceil(Math.log2(2 * this._count))).fill(EMPTY);
-      this._put(old);
     }
-    this._put(voxels);
-  }
-
-  /** @param {Int32Array} voxels [n, 3] */
-  _put(voxels) {
-    for (let i = 0; i < voxels.length; i += 3) {
-      if (voxels[i] === EMPTY) continue;
-      const at = this._slot(voxels, i);
-      for (let k = 0; k < 3; k++) this._slots[at + k] = voxels[i + k];
+    for (const voxels of parts) {
+      for (let i = 0; i < voxels.length; i += 3) {
+        if (voxels[i] === EMPTY) continue;
+        const at = this._slot(voxels, i);
+        for (let k = 0; k < 3; k++) this._slots[at + k] = voxels[i + k];
+      }
     }
   }
 }
-
-/** Whether the highest bit of a is lower than that of b, both below 2^31. @param {number} a @param {number} b */
-const isLower = (a, b) => a < b && a < (a ^ b);
 
 /** The rows in the order of the codes (10.1) of their voxels. @param {Int32Array} voxels [n, 3] */
 export function mortonOrder(voxels) {
@@ -78,7 +72,7 @@ export function mortonOrder(voxels) {
     let highest = offsets[3 * a + 2] ^ offsets[3 * b + 2];
     for (let k = 1; k >= 0; k--) {
       const difference = offsets[3 * a + k] ^ offsets[3 * b + k];
-      if (!isLower(highest, difference)) continue;
+      if (highest >= difference || highest >= (highest ^ difference)) continue; // its highest bit is not higher
       axis = k;
       highest = difference;
     }

@@ -480,7 +480,8 @@ class File:
     """A file. header: fields; those of value None are left out, chunk list and digest follow from the chunks.
 
     packed: bytes instead of the header's. declared: the stated length of the header. crc: xored to the right CRC-32.
-    tail: bytes after the last chunk.
+    tail: bytes after the last chunk. flips: (chunk, offset in it, mask) of bytes that are changed at last. end: (chunk,
+    offset in it) where it is cut. The chunk None begins with the file.
     """
 
     chunks: tuple[Chunk, ...]
@@ -492,6 +493,8 @@ class File:
     declared: int | None = None
     crc: int = 0
     tail: bytes = b""
+    flips: tuple[tuple[int | None, int, int], ...] = ()
+    end: tuple[int | None, int] | None = None
 
     def fields(self) -> dict[int, Any]:
         chunk_list = [list(c.listed or (c.type, len(c.payload))) for c in self.chunks]
@@ -502,9 +505,13 @@ class File:
     def header_bytes(self) -> bytes:
         return pack(self.fields()) if self.packed is None else self.packed
 
-    def start(self, index: int) -> int:
-        """Offset of a chunk; that of the end of the file for the number of chunks."""
-        return 20 + len(self.header_bytes()) + sum(20 + len(c.payload) for c in self.chunks[:index])
+    def start(self, index: int | None) -> int:
+        """Offset of a chunk; that of the end of the file for the number of chunks, 0 for None."""
+        return (
+            0
+            if index is None
+            else 20 + len(self.header_bytes()) + sum(20 + len(c.payload) for c in self.chunks[:index])
+        )
 
     @property
     def described(self) -> bytes:
@@ -530,7 +537,11 @@ class File:
         declared = len(header) if self.declared is None else self.declared
         front = struct.pack("<8sHHI", self.signature, self.major, self.minor, declared)
         crc = zlib.crc32(header, zlib.crc32(front)) ^ self.crc
-        return front + struct.pack("<I", crc) + header + b"".join(c.frame(scene_id) for c in self.chunks) + self.tail
+        chunks = b"".join(c.frame(scene_id) for c in self.chunks)
+        data = bytearray(front + struct.pack("<I", crc) + header + chunks + self.tail)
+        for chunk, offset, mask in self.flips:
+            data[self.start(chunk) + offset] ^= mask
+        return bytes(data if self.end is None else data[: self.start(self.end[0]) + self.end[1]])
 
     def with_header(self, fields: Mapping[int, Any]) -> File:
         """With other fields in the header; the value None takes one out."""

@@ -113,17 +113,15 @@ def _vector(text: str, folder: str, base: File, clauses: str, error: str | None,
     marks = {option[0]: option[1:] for option in options if option[0] in "!~^@"}
     (clauses,) = [option for option in options if option[0] not in marks] or [clauses]
     error, target = marks.get("!", error), marks.get("@")
-    file, edits, place = base, list[Any](), None
+    file, place = base, None
     for patch in patches.split(" ; "):
-        file, found = _patched(file, patch, edits, {**names, "base": base})
+        file, found = _patched(file, patch, {**names, "base": base})
         place = place or found
     chunk, at = place or (None, None)
     if target not in (None, "end"):
         chunk, at = int(target), None
-    data, end = _finished(file, edits)
-    if at == "end":
-        at, chunk = end, None if edits[0][1] is None else edits[0][1]
-    elif at is not None and chunk is not None:
+    data = file.data()
+    if at is not None:
         at += file.start(chunk)
     count = None if error is None or target == "end" else chunk or 0
     layers, slices = file.hashes(count), [x.number for x in file.slices()]
@@ -146,8 +144,8 @@ def _vector(text: str, folder: str, base: File, clauses: str, error: str | None,
     return row | ({"prefix": layers[-1]["layer"] if layers else None} if error else {}) | {"layers": layers}, data
 
 
-def _patched(file: File, patch: str, edits: list[Any], names: dict[str, Any]) -> tuple[File, Any]:
-    """The file, and (chunk, offset of the field in it or None) of the patch. Edits of the finished bytes are noted."""
+def _patched(file: File, patch: str, names: dict[str, Any]) -> tuple[File, Any]:
+    """The file, and (chunk, offset in it or None) where the patch is found out."""
     left, op, right = re.fullmatch(r"([\w.]*) ?(:=|\+=|=) (.+)", patch).groups()  # type: ignore[union-attr]
     (target, index), *keys = re.fullmatch(r"([a-z]*)(\d*)", left.split(".")[0]).groups(), *left.split(".")[1:]  # type: ignore[union-attr]
     names = names | {"n": lambda i: len(file.chunks[i].payload), "c": list(getattr(file, "chunks", ()))}
@@ -159,9 +157,11 @@ def _patched(file: File, patch: str, edits: list[Any], names: dict[str, Any]) ->
         return value(file), None
     if target in ("cut", "xor"):
         found = value()
-        chunk, *rest = found if isinstance(found, tuple) else (None, found)
-        edits.append((target, chunk, *rest))
-        return file, (chunk, "end")
+        chunk, offset, *mask = found if isinstance(found, tuple) else (None, found)
+        if target == "cut":
+            return replace(file, end=(chunk, offset)), (chunk, offset)
+        crc = 16 + (0 if chunk is None else len(file.chunks[chunk].payload))
+        return replace(file, flips=(*file.flips, (chunk, offset, *mask))), (chunk, crc)
     if target == "file":
         at = file.start(len(file.chunks)) if keys[0] == "tail" else PREAMBLE.get(keys[0])
         return replace(file, **{keys[0]: value(getattr(file, keys[0]))}), (None, at)
@@ -213,20 +213,6 @@ def _bytes(op: str, right: str, packed: bytes, value: Any) -> bytes:
         return bytes(value(packed))
     entry = right if re.fullmatch("[0-9a-f]+", right) else value()
     return bytes([packed[0] + 1]) + packed[1:] + bytes.fromhex(entry)
-
-
-def _finished(file: File, edits: list[Any]) -> tuple[bytes, int | None]:
-    """The bytes of the file after the edits, and where the fault of the first of them is found."""
-    data, place = bytearray(file.data()), None
-    for kind, chunk, offset, *mask in edits:
-        start = 0 if chunk is None else file.start(chunk)
-        if kind == "cut":
-            del data[start + offset :]
-        else:
-            data[start + offset] ^= mask[0]
-            start, offset = (0, 16) if chunk is None else (start, 16 + len(file.chunks[chunk].payload))
-        place = place or start + offset
-    return bytes(data), place
 
 
 # -- files that lines of the table share -------------------------------------------------------------------------------
