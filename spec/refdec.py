@@ -325,7 +325,7 @@ def read_chunk(data, at, kind, size, scene_id):
     return data[at + 16 : end], flags, end + 4
 
 
-# 6.1 Layout: "u32: length P of the layer parameters, ≤ 4096" "A slice MUST use up its codes and its stream"
+# 6.1 Layout: "u32: length P of the layer parameters, ≤ 4096" "A slice MUST use up its side information"
 class Layer:
     """One slice; the first becomes the whole layer (add_slice). cells: [(x, y, z)] of its rows; symbols: {name:
     [channel]} in the order of clause 12.4; tensors: {name: [float]}, every one a binary32 value."""
@@ -343,7 +343,7 @@ class Layer:
         self.check_sizes(len(payload), before)
         codes, stream = Reader(reader.take(codes)), reader.take(reader.left)
         self.cells, channels = (self.decode_lzma if header[2] else self.decode_ans)(codes, stream)
-        need(not codes.left, f"{codes.left} bytes after the last code")
+        need(not codes.left, f"{codes.left} bytes after the last channel")
         self.name_channels(iter(channels))
 
     @property
@@ -354,10 +354,10 @@ class Layer:
     # 6.2 Layer parameters: "Later slices have none of keys 4 to 7, else Malformed."
     # 5.6 Base: "Layer 0 of a file with a base has none of layer keys 4 to 7, else Malformed"
     def read_parameters(self, data, rows_before):
-        """The length of the codes."""
+        """The length of the side information."""
         parameters = fields(unpack(data), range(1, 8), (1, 2), "layer parameters")
         self.rows = limited(parameters[1], (1 << 24) - rows_before, "own rows")
-        length = limited(parameters[2], MAX_LENGTH, "the length of the codes")
+        length = limited(parameters[2], MAX_LENGTH, "the length of the side information")
         if 3 in parameters:
             integers(a_list(parameters[3], "the fill", 3, 4), 255, "a number of the fill")
         bare = self.later or (self.number == 0 and 15 in self.header)
@@ -402,7 +402,7 @@ class Layer:
         need(symbols <= (1 << 22) + 256 * size, f"{symbols} symbols", "LimitExceeded")
 
     # 6.4 Channels: "In mode ans a slice codes the channels in this order:"
-    # 8.5 Rows by step class: "the base's rows come first, by class, then all others"
+    # 8.5 Rows by step class: "each channel of the layer rows has two parts, first the base's rows, then all others"
     # 11.2 Rows: "A step class MUST lie in 0..6"
     def decode_ans(self, codes, stream):
         """The voxels and the channels of items 2 to 8, none split."""
@@ -420,7 +420,7 @@ class Layer:
         coder.stream.finish()
         return cells, channels
 
-    # 9.1 Channels and codes: "the symbol is base + v, which MUST lie in −K..K (8.2), else Malformed"
+    # 9.1 Channels and side information: "the symbol is base + v, which MUST lie in −K..K, else Malformed"
     def decode_lzma(self, codes, stream):
         """As decode_ans."""
         n, e, graded = self.rows, len(self.earlier), self.header["graded"]
@@ -439,7 +439,7 @@ class Layer:
         return voxels_in_order(zip(*channels[:3])), channels[3:]
 
     # 11.1 Masks: "Layer ℓ codes a rise 0..255 for each earlier row and a code 3..255 for each own row."
-    # 5.6 Base: "in layer 0 of such a file a rise MUST be 0 or 1, else Malformed"
+    # 5.6 Base: "There a rise MUST be 0 or 1, else Malformed"
     # 11.2 Rows: "Symbols of rows and layer rows, plane samples (11.3), weights and biases MUST lie in −2^23..2^23"
     def name_channels(self, channels):
         """The symbols: of rows their v (11.2), of planes their samples (11.3)."""
@@ -508,11 +508,11 @@ M = [round(2 ** (31 - j / 64)) for j in range(64)]
 
 
 # 7.3 NormTable: "C = 2^27 − v if t < 0, else 2^27 + v"
-def norm_cdf(n, mu8, si):
+def norm_cdf(m, mu8, si):
     e, j = si >> 6, si & 63
     nb = max(0, e - 8)
     result = []
-    for k in range(n - 1):
+    for k in range(m - 1):
         t = 256 * k + 128 - mu8
         a = min(abs(t) >> nb, (1 << 21) - 1)
         z = min((a * M[j]) >> (23 + e - nb), 1 << 19)
@@ -522,10 +522,10 @@ def norm_cdf(n, mu8, si):
     return result
 
 
-# 7.3 NormTable: "the table cum[q] = ((C(q−1) · (2^24 − 16·n)) >> 28) + 16·q for 0 < q < n"
+# 7.3 NormTable: "the table cum[q] = ((C(q−1) · (2^24 − 16·m)) >> 28) + 16·q for 0 < q < m"
 def table_of(cdf):
-    n = len(cdf) + 1
-    return [0, *(((c * (TOTAL - 16 * n)) >> 28) + 16 * q for q, c in enumerate(cdf, 1)), TOTAL]
+    m = len(cdf) + 1
+    return [0, *(((c * (TOTAL - 16 * m)) >> 28) + 16 * q for q, c in enumerate(cdf, 1)), TOTAL]
 
 
 # 7.5 ANS streams: "A stream is a multiple of 4 bytes" "its first word MUST NOT be 0"
@@ -558,27 +558,27 @@ class Ans:
         need(self.x == 0 and self.at == len(self.words), "the ANS stream does not end in state 0")
 
 
-# 8.2 Priors: "kmin + n − 1 MUST NOT exceed K, else Malformed." "mu8 = g + 128·(n − 1) and si = v − 640"
+# 8.2 Priors: "kmin + m − 1 MUST NOT exceed K, else Malformed." "mu8 = g + 128·(m − 1) and si = v − 640"
 # 8.1 Tokens: "a new prior of this family"
 # 7.4 Mixture tables: "C(k) = ((256 − w)·C1(k) + w·C2(k)) >> 8"
 def read_prior(codes, family):
-    """(kmin, n, cum) of clause 8.2."""
+    """(kmin, m, cum) of clause 8.2."""
     need(family <= 2, f"prior family {family}", "UnsupportedFeature")
     kmin = codes.zigzag(K)
     if family == 0:
         return kmin, 1, [0, TOTAL]
-    n = 2 + codes.varint((1 << 14) - 2)
-    need(kmin + n - 1 <= K, "a window reaches beyond symbol K")
-    cdfs = [norm_cdf(n, codes.zigzag(1 << 31) + 128 * (n - 1), codes.varint(1920) - 640) for _ in range(family)]
+    m = 2 + codes.varint((1 << 14) - 2)
+    need(kmin + m - 1 <= K, "a window reaches beyond symbol K")
+    cdfs = [norm_cdf(m, codes.zigzag(1 << 31) + 128 * (m - 1), codes.varint(1920) - 640) for _ in range(family)]
     if family == 2:
         w = codes.number("B")
         need(w, "a mixture of weight 0")
         cdfs = [[((256 - w) * c1 + w * c2) >> 8 for c1, c2 in zip(*cdfs)]]
-    return kmin, n, table_of(cdfs[0])
+    return kmin, m, table_of(cdfs[0])
 
 
-# 8.3 Exceptions: "the symbol is kmin − 1 − (c >> 1) if c is odd, else kmin + n + (c >> 1)"
-def read_exceptions(codes, count, kmin, n):
+# 8.3 Exceptions: "the symbol is kmin − 1 − (c >> 1) if c is odd, else kmin + m + (c >> 1)"
+def read_exceptions(codes, count, kmin, m):
     number = 1 + codes.varint(VARINT_MAX)
     most = min(count, codes.left // 2)
     need(number <= most, f"{number} exceptions, expected at most {most}")
@@ -586,7 +586,7 @@ def read_exceptions(codes, count, kmin, n):
     for _ in range(number):
         at += 1 + codes.varint(VARINT_MAX)
         c = codes.varint(4 * K + 2)
-        value = kmin - 1 - (c >> 1) if c & 1 else kmin + n + (c >> 1)
+        value = kmin - 1 - (c >> 1) if c & 1 else kmin + m + (c >> 1)
         need(at < count, f"an exception at symbol {at} of {count}")
         need(abs(value) <= K, f"an exception of value {value}, limit K")
         result[at] = value
@@ -597,16 +597,16 @@ def read_exceptions(codes, count, kmin, n):
 PATTERNS = [[byte for byte in range(256) if bin(byte).count("1") == k] for k in range(1, 9)]
 
 
-# 8 Coded channels: "Mode ans reads a slice with two cursors, one in the codes and one in the ANS stream."
+# 8 Coded channels: "Mode ans reads a slice with two cursors, one in the side information and one in the ANS stream."
 class Coder:
-    """The two cursors of a slice, in its codes and its stream; priors: the prior list of its layer."""
+    """The two cursors of a slice, codes in its side information and stream; priors: the prior list of its layer."""
 
     def __init__(self, codes, stream, priors, most_entries):
         self.codes, self.stream, self.priors, self.most_entries = codes, Ans(stream), priors, most_entries
 
     # 8 Coded channels: "Channels of length 0 leave no trace."
-    # 8.1 Tokens: "the prior F − 8 places before the last one of the prior list"
-    # 8.2 Priors: "The entries of all windows of the prior list, n each, MUST NOT exceed the S of the slice (6.5)"
+    # 8.1 Tokens: "the prior F − 8 entries before the last one of the prior list"
+    # 8.2 Priors: "the sum of m over the prior list MUST NOT exceed S (6.5) at this slice plus 2^18"
     # 8.4 Symbols: "The symbol is kmin + s. Exceptions are then put in their places."
     def channel(self, count):
         if count == 0:
@@ -614,15 +614,15 @@ class Coder:
         token = self.codes.varint(2 * ((1 << 26) + 8))
         if token >> 1 < 8:
             self.priors.append(read_prior(self.codes, token >> 1))
-            need(sum(n for _, n, _ in self.priors) <= self.most_entries, "too many entries", "LimitExceeded")
+            need(sum(m for _, m, _ in self.priors) <= self.most_entries, "too many entries", "LimitExceeded")
         back = max(token >> 1, 8) - 8
         need(back < len(self.priors), "a channel reuses a prior before the first")
-        kmin, n, cum = self.priors[-1 - back]
-        exceptions = read_exceptions(self.codes, count, kmin, n) if token & 1 else {}
+        kmin, m, cum = self.priors[-1 - back]
+        exceptions = read_exceptions(self.codes, count, kmin, m) if token & 1 else {}
         inside = iter(self.stream.take(count - len(exceptions), cum))
         return [exceptions[at] if at in exceptions else kmin + next(inside) for at in range(count)]
 
-    # 8.5 Rows by step class: "for each step class 0..6 in order, the symbols of the rows of that class, in row order"
+    # 8.5 Rows by step class: "split by the step class of each row, 0..6, into seven coded channels"
     # 8.6 Grids in stages: "one per class (8.7), ascending, each with the residuals of the cells of that class"
     def split(self, classes, class_count):
         parts = [iter(self.channel(classes.count(q))) for q in range(class_count)]
@@ -639,7 +639,7 @@ class Coder:
             first, end = end, 2 * end
         return [channel for e in planes for channel in e]
 
-    # 10.1 Head: "The smallest relative index along each axis MUST be 0, the largest along any axis MUST have R bits"
+    # 10.1 Head: "The smallest relative index along each axis MUST be 0, the largest of all three axes MUST have R bits"
     def decode_positions(self, count):
         codes = self.codes
         low, depth = [codes.zigzag(MAX_VOXEL) for _ in range(3)], limited(codes.number("B"), 21, "the depth")
@@ -650,7 +650,7 @@ class Coder:
         need(all(v <= MAX_VOXEL for cell in cells for v in cell), "a voxel index over 2^20")
         return cells
 
-    # 10.2 Octree: "From a level of n nodes on, every node has one child, which is not coded."
+    # 10.2 Octree: "From a level of n nodes on, every node has one child, so no more numbers are coded."
     def grow(self, depth, count):
         """The relative indices (x, y, z) of the anchors, in Morton order."""
         levels, size = [], 1
@@ -682,7 +682,7 @@ def cell_activity(channels, h, w):
     return [sum(magnitude[i * w + j] for i in near_i for j in near_j) for near_i in rows for near_j in columns]
 
 
-# 8.7 Classes by activity: "(|e_c[p]| · 256·N) // (1 + s_c), s_c the sum over cells q of |e_c[q]|"
+# 8.7 Classes by activity: "(|e_c[p]| · 256·H·W) // (1 + s_c), s_c the sum over cells q of |e_c[q]|"
 def relative_magnitude(channels, n):
     """Of each of the n cells."""
     magnitude = [0] * n
@@ -730,7 +730,7 @@ def morton_code(offset):
     return sum((v >> i & 1) << 3 * i + axis for axis, v in enumerate(offset) for i in range(22))
 
 
-# 9.3 LZMA2: "It MUST unpack to exactly the bytes of all channels, at most 2^31, and end at the payload's last byte."
+# 9.3 LZMA2: "It MUST unpack to exactly the bytes of all channels, at most 2^31, else LimitExceeded"
 def unpack_lzma(data, size):
     need(size <= 1 << 31, f"{size} bytes uncompressed, limit 2^31", "LimitExceeded")
     decoder = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=[{"id": lzma.FILTER_LZMA2, "dict_size": 1 << 26}])
@@ -752,8 +752,8 @@ def dequantise(symbols, step):
 
 
 # 11.1 Masks: "its code in the layer before in the file plus its rise, and MUST NOT exceed 255 nor be 1 or 2"
-# 5.6 Base: "1 makes the code 0, which hides the row until a layer above raises it again"
-# 12.1 Order: "each voxel at most once over all slices of all layers so far, and dequantisation"
+# 5.6 Base: "with 0 the row's mask code in layer 0 is that in the base, with 1 it is 0"
+# 12.1 Order: "each voxel at most once over the base and all slices of all layers so far, and dequantisation"
 def finish_last(layers):
     codes = []
     for layer in layers:
@@ -766,7 +766,7 @@ def finish_last(layers):
 
 
 # 5.6 Base: "The digest is the SHA-256 of the SHA-256s, one behind the other, of the header from the end of its chunk
-# list and of each chunk of layer 0." "It is Malformed if the other file has key 15 too or layer rows in layer 0"
+# list and of each chunk of layer 0, its 20 + L bytes from type to CRC-32." "layer 0 decodes, and has no layer rows"
 # 15 Errors and security: "the file has a base (5.6), and none or another one is given"
 def read_base(data, header):
     """The layer 0 of the base, as a layer before layer 0."""
@@ -791,9 +791,9 @@ def read_base(data, header):
 
 
 # 3.2 Chunks: "Bytes after the last chunk make the file Malformed."
-# 5.6 Base: "N from b, S from (W + 4)·b, with header key 5 (W + 5)·b, and B from P"
+# 5.6 Base: "N from b, S from (C_r + 4)·b, with header key 5 (C_r + 5)·b, and B from P"
 # 3.6 Slices: "Bit 1 MUST be 1 if the next layer chunk in the list is of the same layer, and 0 if it is of another one."
-# 12.1 Order: "A decoder of prefix ℓ stops after the last chunk of a layer ≤ ℓ in the list and reads no further."
+# 12.1 Order: "A decoder of prefix ℓ stops after the last chunk of a layer ≤ ℓ in the list."
 def decode(data, max_layer=None, base=None):
     """The layers of a file's bytes, or of prefix max_layer, with cells, symbols and tensors. base: its base's bytes."""
     header, scene_id, at = read_preamble(data)
@@ -823,7 +823,7 @@ def decode(data, max_layer=None, base=None):
     return [layer for layer in layers if layer.number >= 0]
 
 
-# 12.4 Hashes: "two SHA-256 digests per layer, of its decoded slices with the rows of 12.2"
+# 12.4 Hashes: "two SHA-256 digests per layer, of its decoded slices, with n rows of its own in the order of 12.2"
 def hashes(data, max_layer=None, base=None):
     rows = []
     for layer in decode(data, max_layer, base):

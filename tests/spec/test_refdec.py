@@ -159,7 +159,7 @@ def test_the_example_of_an_octree():
     places = re.search(r"Four anchors at (.*?)\. The minimum", text)[1]
     cells = np.array([[int(v) for v in place.split(",")] for place in re.findall(r"\((.*?)\)", places)], np.int32)
     head, channels = position_channels(cells[morton_order(cells)])
-    assert head == bytes.fromhex(re.search(r"codes begin ((?:[0-9A-F]{2} ?)+);", text)[1])
+    assert head == bytes.fromhex(re.search(r"information begins ((?:[0-9A-F]{2} ?)+);", text)[1])
     differences = re.search(r"10\.3's anchors give ([\d, −·]+)\.", plain(TEXT))[1].replace("−", "-")
     axes = [[int(v) for v in axis.split(",")] for axis in differences.split("·")]
     assert refdec.voxels_in_order(zip(*axes, strict=True)) == list(map(tuple, cells[morton_order(cells)].tolist()))
