@@ -9,7 +9,7 @@ lower quality would leave out: layer 0 is a good picture of the key instant in a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import replace
 from typing import Any
@@ -37,18 +37,22 @@ from pd4dgs_codec.interchange.splats import evenly, picture
 from pd4dgs_codec.interchange.teacher import Teacher, spread
 from pd4dgs_codec.interchange.tracks import BIT, STRAIGHT, Change, Grouping, tracks_of
 from pd4dgs_codec.kinds import splats
-from pd4dgs_codec.kinds.splats import YCOCG, Splats, product
+from pd4dgs_codec.kinds.splats import HEADS, YCOCG, Splats, product
 from pd4dgs_codec.kinds.tracks import Tracks, place
+from pd4dgs_codec.quality.image import mpsnr
 from pd4dgs_codec.scene import Camera, SceneInfo
 
 #: One of so many cameras measures the error and does not decide about steps: those that do look better than others. Of
 #: fewer than FEW all decide, and CHECKED of them measure.
 HOLDOUT, FEW, CHECKED = 5, 30, 12
-#: Bits of a scalar, about. Gaussians leave in rounds, each at twice the theta of the one before, the first at the share
-#: FIRST of the first guess of theta: several that hide each other's absence cannot all leave. Of EACH views one decides
-#: about it.
-SCALAR_BITS, FIRST, EACH = 2.8, 1 / 256, 2
+#: Bits of a scalar, about. Gaussians leave in rounds, each at twice the theta of the one before, four times where they
+#: only leave layer 0, or that at which the share LEAVE leaves: several that hide each other's absence cannot all leave.
+#: Of EACH views one decides about it. Of what the error allows each scalar, the first guess of theta is the share GUESS
+#: if coefficients of motion add to it.
+SCALAR_BITS, LEAVE, EACH, GUESS = 2.8, 1 / 32, 2, 0.3
 EARLY = 14.0  #: in layer 0 are the Gaussians that stay at so many times theta
+BEST = 100.0  #: dB that stand for equal pictures
+BLOCK = 1024  #: Gaussians whose changes are computed at once, which the cache holds
 NEAR = 8.0  #: principal components and groups serve for thetas that differ by this factor
 #: Windows are precise to PRECISE of the width that all but the share SHORT of them have.
 PRECISE, SHORT = 0.1, 0.01
@@ -104,15 +108,23 @@ class Packer:
         """Numbers of all Gaussians at the key instant."""
         return len(self.ordered.rows) * sum(self.ordered.channels.values())
 
-    def scene(self, psnr: float) -> splats.SplatScene:
+    def guess(self, psnr: float) -> float:
+        """Returns about the theta of `psnr` dB."""
+        share = GUESS if len(self.source.times) > 1 else 1.0
+        return float(share * 10 ** (-psnr / 10) / self.scalars)
+
+    def scene(self, theta: float) -> splats.SplatScene:
+        """Returns the scene at a theta."""
+        return self._thinned(theta)._scene(theta)
+
+    def matched(self, psnr: float) -> splats.SplatScene:
         """Returns the scene whose pictures have `psnr` dB against those of the source."""
-        error = 10 ** (-psnr / 10)
 
         def build(theta: float) -> tuple[splats.SplatScene, float]:
-            scene = self._thinned(theta)._scene(theta)
-            return scene, self._error(scene)
+            scene = self.scene(theta)
+            return scene, self._psnr(scene) - psnr
 
-        return matched(build, psnr, error / self.scalars)
+        return matched(build, self.guess(psnr))
 
     def _thinned(self, theta: float) -> Packer:
         """Returns the packer of the Gaussians whose absence would add more to the error than their bits are worth: of
@@ -120,9 +132,11 @@ class Packer:
         worth = BIT * SCALAR_BITS * sum(self.ordered.channels.values())
         moving = len(self.source.times) > 1
         while not self.few and self._reached < theta * (EARLY if moving else 1):
-            at, kept = absence(self.deciding, self._leave > self._reached) / worth, self._leave > self._reached
-            next_ = 2 * self._reached or FIRST * theta
-            leaving = kept & self._often & (at < next_)
+            kept = self._leave > self._reached
+            at, free = absence(self.deciding, kept) / worth, kept & self._often
+            soon = np.quantile(np.append(at[free], np.inf), LEAVE, method="lower")
+            next_ = max((2 if self._reached < theta else 4) * self._reached or LEAVE * theta, float(soon))
+            leaving = free & (at < next_)
             self._leave[leaving] = np.maximum(at[leaving], self._reached)
             self._reached = next_
         if self._moving is None or not 1 / NEAR <= theta / self._moving[0] <= NEAR:
@@ -145,13 +159,13 @@ class Packer:
         own.grouping = self.grouping and self.grouping.taken(kept)
         return own
 
-    def _error(self, scene: splats.SplatScene) -> float:
-        """Returns the squared error of the pictures that stands for their mean PSNR."""
+    def _psnr(self, scene: splats.SplatScene) -> float:
+        """Returns the mean PSNR of the pictures in dB, which are not rounded."""
         errors, info, player = [], self.info, SplatPlayer(scene)
         for camera, t, truth in zip(self.cameras, self.times, self.images, strict=True):
             image = picture(player.splats(t)[0], camera, info.background, info.near)
             errors.append(np.square(image - truth, dtype=np.float64).mean())
-        return float(np.exp(np.mean(np.log(np.maximum(errors, 1e-12)))))
+        return float(np.mean(-10 * np.log10(np.maximum(errors, 1e-12))))
 
     def _scene(self, theta: float) -> splats.SplatScene:
         grid = self.ordered.grid(theta)
@@ -203,8 +217,10 @@ class Packer:
         for name, (given, differences) in made.items():
             if (given == given[key]).all():
                 continue
-            values = differences(given[:, rows], given[key, rows]).transpose(1, 2, 0)  # [n, c, T]
-            values = np.ascontiguousarray(values, np.float32)
+            blocks = np.split(rows, range(BLOCK, len(rows), BLOCK))  # of [T, n, c], to be [n, c, T] in memory
+            values = np.empty((len(rows), HEADS[name], len(given)), np.float32)
+            for own, part in zip(blocks, np.split(values, range(BLOCK, len(rows), BLOCK)), strict=True):
+                part[:] = differences(given[:, own], given[key, own]).transpose(1, 2, 0)
             if change := Change.of(values, self.ordered.weights[name]):
                 found[name] = change
         return found
@@ -221,6 +237,15 @@ class Packer:
         return {1: tracks_of(self.changes, chosen, grid, self.source.times, self.key, allowed, grouping)}
 
 
+def mean_psnr(scene: splats.SplatScene, views: Iterable[tuple[Camera, float, np.ndarray]]) -> float:
+    """Returns the mean PSNR of a scene's pictures in dB. views: cameras, normalised times, and the pictures float32
+    [H, W, 3] that they are compared with."""
+    player, found = SplatPlayer(scene), []
+    for camera, t, truth in views:
+        found.append(mpsnr(picture(player.splats(t)[0], camera, player.background, scene.info.near), truth))
+    return float(np.minimum(found, BEST).mean())
+
+
 def _logs(scales: np.ndarray) -> np.ndarray:
     """The logarithms of scales [.., n, 3], bounded as those of splats."""
     return log_scales(scales.reshape(-1, 3)).reshape(scales.shape)
@@ -235,12 +260,14 @@ def _turns(quats: np.ndarray, key: np.ndarray) -> np.ndarray:
 
 def canonical(source: Sampled, key: int) -> Sampled:
     """Describes each ellipsoid so that its rotation is smallest at the key instant, and continuous over time."""
-    quats, scales = source.quats.astype(np.float64), source.scales.copy()
-    instants = len(quats)
-    quats[key], scales[key] = turned(quats[key], scales[key], np.array([1.0, 0, 0, 0]))
-    for way in (range(key + 1, instants), range(key - 1, -1, -1)):
-        last = key
+    quats, scales = np.empty_like(source.quats), np.empty_like(source.scales)
+    given = source.quats[key]
+    upright, axes = turned(given, np.tile(np.arange(3), (len(given), 1)), np.array([1, 0, 0, 0], np.float32))
+    turn = product(conjugate(given), upright)
+    for way in (range(key, len(quats)), range(key - 1, -1, -1)):
+        last = upright
         for i in way:
-            quats[i], scales[i] = turned(quats[i], scales[i], quats[last])
-            last = i
-    return replace(source, quats=quats.astype(np.float32), scales=scales)
+            sizes = np.take_along_axis(source.scales[i], axes, 1)
+            quats[i], scales[i] = turned(product(source.quats[i], turn), sizes, last)
+            last = quats[i]
+    return replace(source, quats=quats, scales=scales)

@@ -12,17 +12,16 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.data.view import depth_range, held_out, points_box, seconds_range
-from pd4dgs_codec.draw.player import SplatPlayer
 from pd4dgs_codec.errors import DataError, EncodeError
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import Report, encode_with_report, with_metadata
 from pd4dgs_codec.format.metadata import Metadata
-from pd4dgs_codec.interchange.direct import Packer
+from pd4dgs_codec.interchange.direct import Packer, mean_psnr
+from pd4dgs_codec.interchange.pack import matched
 from pd4dgs_codec.interchange.sampled import Sampled, sampled
 from pd4dgs_codec.interchange.splats import evenly, picture
 from pd4dgs_codec.interchange.teacher import GOLDEN, SOLID, Options, Teacher, cameras_beside, cameras_of, read_model
 from pd4dgs_codec.kinds.splats import Splats, SplatScene
-from pd4dgs_codec.quality.image import mpsnr
 from pd4dgs_codec.scene import Camera, SceneInfo
 from pd4dgs_codec.threads import one_blas_thread
 
@@ -30,11 +29,9 @@ from pd4dgs_codec.threads import one_blas_thread
 CAMERAS, HOLDOUT, SIZE = 72, 6, 400
 FPS = 30.0  #: frames per second of a folder that does not say it
 BOX_INSTANTS = 5  #: number of instants whose Gaussians the box encloses
-#: A target size is met if the file has at least this share of it; most tries; dB of the first guess and the bounds.
-FULL, TRIES, LOWEST, HIGHEST = 0.95, 8, 15.0, 70.0
+FULL = 0.98  #: the share of a target size that is looked for
 METADATA_ROOM = 150  #: bytes of metadata without texts, at most
-GROWTH = 0.05  #: first guess of the change of the logarithm of bytes by dB
-BEST = 100.0  #: dB that stand for equal pictures
+GROWTH = 0.07  #: the change of the logarithm of bytes by dB, about
 FAR = 2.0  #: dB by which a result may be below what was asked for without a note
 
 Progress = Callable[[str, "int | None"], AbstractContextManager[Callable[[], None]]]
@@ -97,14 +94,22 @@ def import_model(
     info, cameras, judges = scene_info(place, model, some, seconds, background, up)
     with progress("packing", None) as step:
         packer = Packer(model, source, cameras, info, step)
-        write = _writer(packer, slices, step)
-        room = most_bytes and most_bytes - METADATA_ROOM - sum(len(str(text)) for text in vars(about).values())
-        data, report = write(psnr) if room is None else _of_size(write, psnr, room)
+
+        def write(scene: SplatScene) -> tuple[bytes, Report]:
+            made = encode_with_report(scene, slices=slices)
+            step()
+            return made
+
+        if most_bytes is None:
+            data, report = write(packer.matched(psnr))
+        else:
+            room = most_bytes - METADATA_ROOM - sum(len(str(text)) for text in vars(about).values())
+            data, report = _of_size(lambda theta: write(packer.scene(theta)), packer.guess(psnr), room)
     scene = decode(data)
     assert isinstance(scene, SplatScene)
     with progress("measuring", len(judges)) as step:
         quality = _quality(model, scene, judges, step)
-    if room is None and (found := quality[scene.level]) < psnr - FAR:
+    if most_bytes is None and (found := quality[scene.level]) < psnr - FAR:
         tell(f"note: has {found:.1f} dB, not {psnr:g}: these cameras and instants show more than those that decided")
     data, size = with_metadata(data, replace(about, quality=quality))
     report = replace(report, bytes=len(data), metadata_bytes=size)
@@ -151,55 +156,30 @@ def scene_info(
     return SceneInfo(1.0, box, times, behind, near, far, up or level, 0.0, front), fitting, judges
 
 
-def _writer(packer: Packer, slices: int | None, step: Callable[[], None]) -> Callable[[float], tuple[bytes, Report]]:
-    """Returns the function from dB to (file without metadata, report)."""
+def _of_size(write: Callable[[float], tuple[bytes, Report]], theta: float, most: int) -> tuple[bytes, Report]:
+    """Returns the largest file tried that has at most `most` bytes. Raises EncodeError if there is none."""
+    tried = list[tuple[bytes, Report]]()
 
-    def write(psnr: float) -> tuple[bytes, Report]:
-        made = encode_with_report(packer.scene(psnr), slices=slices)
-        step()
-        return made
+    def build(theta: float) -> tuple[None, float]:
+        tried.append(write(theta))
+        return None, math.log(len(tried[-1][0]) / (most * FULL)) / GROWTH
 
-    return write
-
-
-def _of_size(write: Callable[[float], tuple[bytes, Report]], psnr: float, most: int) -> tuple[bytes, Report]:
-    """Returns the file of the most dB that has at most `most` bytes. Raises EncodeError if there is none."""
-    low, high = LOWEST, HIGHEST
-    best, tried = None, list[tuple[float, float]]()
-    for _ in range(TRIES):
-        made = write(psnr)
-        tried.append((psnr, math.log(len(made[0]))))
-        if len(made[0]) <= most:
-            best, low = made, psnr
-            if len(made[0]) >= FULL * most or psnr == HIGHEST:
-                return best
-        elif psnr == LOWEST:
-            break
-        else:
-            high = psnr
-        (a, la), (b, lb) = (tried[-2] if len(tried) > 1 else (psnr - 1, tried[-1][1] - GROWTH)), tried[-1]
-        slope = (lb - la) / (b - a) if b != a else GROWTH
-        psnr = min(max(b + (math.log(most * (1 + FULL) / 2) - lb) / max(slope, GROWTH / 3), LOWEST), HIGHEST)
-        if len(tried) > 1 and not low < psnr < high:
-            psnr = (low + high) / 2
-    if best is None:
-        found = min(math.exp(size) for _, size in tried)
+    matched(build, theta)
+    fitting = [made for made in tried if len(made[0]) <= most]
+    if not fitting:
+        found = min(len(data) for data, _ in tried)
         raise EncodeError(
-            f"target size: the smallest file tried takes {found:,.0f} bytes, expected {most:,}, less metadata"
+            f"target size: the smallest file tried takes {found:,} bytes, expected {most:,}, less metadata"
         )
-    return best
+    return max(fitting, key=lambda made: len(made[0]))
 
 
 def _quality(
     model: Teacher, scene: SplatScene, judges: list[tuple[Camera, float]], step: Callable[[], None]
 ) -> dict[int, float]:
     """Returns the mean PSNR in dB of each level against the source's own pictures."""
-    players = {level: SplatPlayer(scene.prefix(level)) for level in scene.layers}
-    found: dict[int, list[float]] = {level: [] for level in scene.layers}
+    views = []
     for camera, t in judges:
-        truth = picture(model.splats(t), camera, scene.info.background, scene.info.near)
-        for level, player in players.items():
-            image = picture(player.splats(t)[0], camera, player.background, scene.info.near)
-            found[level].append(min(mpsnr(image, truth), BEST))
+        views.append((camera, t, picture(model.splats(t), camera, scene.info.background, scene.info.near)))
         step()
-    return {level: float(np.mean(row)) for level, row in found.items()}
+    return {level: mean_psnr(scene.prefix(level), views) for level in scene.layers}

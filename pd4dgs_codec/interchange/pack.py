@@ -57,6 +57,7 @@ def _turns() -> tuple[np.ndarray, np.ndarray]:
 
 
 TURNS, AXES = _turns()
+HALFWAY = np.cos(np.pi / 8)  #: w of half of the turn between two of them that are neighbours
 
 
 def turned(quats: np.ndarray, scales: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -64,10 +65,12 @@ def turned(quats: np.ndarray, scales: np.ndarray, towards: np.ndarray) -> tuple[
 
     quats: [n, 4] wxyz, unit. scales: [n, 3] along the own axes. Signs of quaternions are the nearest ones, too.
     """
-    near = product(conjugate(quats), np.broadcast_to(towards, quats.shape)) @ TURNS.T
-    best = np.abs(near).argmax(axis=1)
-    sign = np.where(np.take_along_axis(near, best[:, None], 1) < 0, -1.0, 1.0)
-    return product(quats, TURNS[best]) * sign, np.take_along_axis(scales, AXES[best], 1)
+    quats, scales, towards = quats.copy(), scales.copy(), np.broadcast_to(towards, quats.shape)
+    far = np.flatnonzero(np.abs(np.einsum("nd,nd->n", quats, towards)) < HALFWAY)  # to others none is nearer
+    best = np.abs(product(conjugate(quats[far]), towards[far]) @ TURNS.T).argmax(axis=1)
+    quats[far], scales[far] = product(quats[far], TURNS[best]), np.take_along_axis(scales[far], AXES[best], 1)
+    quats[np.einsum("nd,nd->n", quats, towards) < 0] *= -1
+    return quats, scales
 
 
 def logits(opacities: np.ndarray) -> np.ndarray:
@@ -121,11 +124,12 @@ def sensitivity(pictures: Pictures) -> Tensors:
                 "color": g.colors * np.float32(SH_C0 * np.sqrt(8 / 3)),
                 "opacity": (g.geometry.opacities * splats.opacities * (1 - splats.opacities))[:, None],
                 "scale": g.geometry.scales * splats.scales,
-                "rotation": product(conjugate(splats.quats), g.geometry.quats)[:, 1:],
+                "rotation": g.geometry.quats,  # orthogonal to the quaternion, which leaves three numbers
             }
             for name, slope in slopes.items():
-                mean = np.square(slope, dtype=np.float64).mean(axis=1) / (image.size * len(pictures.views) * PROBES)
-                total[name] = total.get(name, 0) + mean
+                numbers = min(slope.shape[1], 3) * image.size * len(pictures.views) * PROBES
+                squares = np.einsum("nc,nc->n", slope, slope, dtype=np.float64)
+                total[name] = total.get(name, 0) + squares / numbers
     return total
 
 
@@ -169,14 +173,13 @@ class Pictures:
         return [picture(splats, camera, self.background, self.near) for camera, splats in self.views]
 
 
-def matched(build: Callable[[float], tuple[T, float]], psnr: float, theta: float) -> T:
-    """Returns what build(theta) makes at the theta where its error, the second result, is nearest to `psnr` dB: by
+def matched(build: Callable[[float], tuple[T, float]], theta: float) -> T:
+    """Returns what build(theta) makes at the theta where its excess, the second result, in dB, is nearest to 0: by
     secants of dB over the logarithm of theta, within the bracket that is known and DECADES of `theta`."""
     tried, place = list[tuple[float, float, T]](), float(np.log10(theta))
     low, high = place - DECADES, place + DECADES
     for _ in range(ROUNDS):
-        made, error = build(10**place)
-        excess = -10 * np.log10(max(error, 1e-20)) - psnr
+        made, excess = build(10**place)
         tried.append((place, excess, made))
         if abs(excess) < CLOSE:
             break

@@ -181,8 +181,6 @@ def stacked(
     """Stacks frames with the same rows. rest: harmonics but the constants; by default means over the frames."""
     names = ("means", "quats", "scales", "opacities")
     means, quats, scales, opacities = (np.stack([getattr(frame, name) for frame in frames]) for name in names)
-    flips = np.einsum("tnd,tnd->tn", quats[1:], quats[:-1])
-    quats[1:] *= np.cumprod(np.where(flips < 0, np.float32(-1), np.float32(1)), axis=0)[..., None]
     colors = np.stack([frame.sh[:, 0] for frame in frames])
     if rest is None:
         rest = np.asarray(sum(frame.sh[:, 1:] for frame in frames) / len(frames), np.float32)

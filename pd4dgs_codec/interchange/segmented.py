@@ -20,7 +20,6 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.data.view import seconds_range
-from pd4dgs_codec.draw.player import SplatPlayer
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode_with_report, with_metadata
@@ -28,8 +27,8 @@ from pd4dgs_codec.format.info import info as about
 from pd4dgs_codec.format.metadata import Metadata
 from pd4dgs_codec.format.reader import Base, read_base
 from pd4dgs_codec.format.registry import MAX_SIDE
-from pd4dgs_codec.interchange.direct import CHECKED, Packer, Views, canonical
-from pd4dgs_codec.interchange.imported import BEST, BOX_INSTANTS, FPS, Progress, scene_info, seen_by
+from pd4dgs_codec.interchange.direct import CHECKED, Packer, Views, canonical, mean_psnr
+from pd4dgs_codec.interchange.imported import BOX_INSTANTS, FPS, Progress, scene_info, seen_by
 from pd4dgs_codec.interchange.pack import Grid, Ordered, Packed, Pictures, Tensors, cells_of, matched, sensitivity
 from pd4dgs_codec.interchange.sampled import (
     MOVES,
@@ -41,13 +40,12 @@ from pd4dgs_codec.interchange.sampled import (
     reach_of,
     stacked,
 )
-from pd4dgs_codec.interchange.splats import evenly, picture
+from pd4dgs_codec.interchange.splats import evenly
 from pd4dgs_codec.interchange.teacher import Teacher, read_model, spread
 from pd4dgs_codec.interchange.tracks import Grouping
 from pd4dgs_codec.io import check_path, write_bytes
 from pd4dgs_codec.kinds.splats import Splats, SplatScene
 from pd4dgs_codec.kinds.tracks import Tracks, place
-from pd4dgs_codec.quality.image import mpsnr
 from pd4dgs_codec.scene import Camera, Grading, SceneInfo
 from pd4dgs_codec.segments import INDEX, File, Index, Segment, check, file_of, parse
 from pd4dgs_codec.threads import one_blas_thread
@@ -140,16 +138,8 @@ class Still:
         still = (apart[:, :3].max(axis=1) < MOVES * size) & (apart[:, 3:].max(axis=1) < MOVES) & (turn > 1 - MOVES**2)
         rows = kept[still]
         sums = {name: self.sums[name][rows] + part[still] for name, part in _sums(own).items()}
-        return Still(
-            self.first.taken(rows),
-            self.rows[rows],
-            low[still],
-            high[still],
-            turn[still],
-            sums,
-            self.count + 1,
-            self.reach,
-        )
+        part = {"low": low[still], "high": high[still], "turn": turn[still], "sums": sums, "count": self.count + 1}
+        return replace(self, first=self.first.taken(rows), rows=self.rows[rows], **part)
 
     @cached_property
     def mean(self) -> Splats:
@@ -512,9 +502,9 @@ class _Writer:
         def build(theta: float) -> tuple[tuple[float, SplatScene], float]:
             scene = packer._scene(theta)
             here = first.on(scene)
-            return (theta, scene), here._error(here._scene(theta))
+            return (theta, scene), here._psnr(here._scene(theta)) - self.psnr
 
-        theta, scene = matched(build, self.psnr, guess)
+        theta, scene = matched(build, guess)
         data, _ = encode_with_report(scene)
         return with_metadata(data, self.about)[0], theta
 
@@ -534,7 +524,7 @@ class _Writer:
                 scene = packer._scene(group.theta)
             else:
                 packer = Packer(_known(source), source, self.cameras, info, lambda: None)
-                scene = packer.scene(self.psnr)
+                scene = packer.matched(self.psnr)
             data, _ = encode_with_report(scene, base=base)
             decoded = decode(data, base=base)
             assert isinstance(decoded, SplatScene)
@@ -547,9 +537,6 @@ class _Writer:
 
     def _quality(self, scene: SplatScene, source: Sampled, behind: Splats | None) -> float:
         """Returns the mean PSNR in dB from cameras that decided nothing."""
-        views, player, found = Backed(source, evenly(self.judges, CHECKED), behind), SplatPlayer(scene), []
-        for (camera, shown), t in zip(views, views.times, strict=True):
-            truth = picture(shown, camera, self.info.background, self.info.near)
-            image = picture(player.splats(t)[0], camera, player.background, self.info.near)
-            found.append(min(mpsnr(image, truth), BEST))
-        return float(np.mean(found))
+        views = Backed(source, evenly(self.judges, CHECKED), behind)
+        images = Pictures(views, self.info.background, self.info.near).images
+        return mean_psnr(scene, zip(views.cameras, views.times, images, strict=False))

@@ -163,14 +163,19 @@ def usable(where: str, parts: dict[str, np.ndarray], also: np.ndarray | bool = T
     if not good.all():
         left = f"{n - np.count_nonzero(good):,} of {n:,} Gaussians are left out, expected all to be {wanted}"
         warnings.warn(DamageWarning(f"{where}: {left}"), stacklevel=2)
-    kept = {name: np.ascontiguousarray(array[good], np.float32) for name, array in parts.items()}
+    rows = slice(None) if good.all() else good
+    kept = {name: np.ascontiguousarray(array[rows], np.float32) for name, array in parts.items()}
     return Splats(**kept | {"quats": unit(kept["quats"])}), good
 
 
 def finite_rows(parts: dict[str, np.ndarray]) -> np.ndarray:
     """Returns bool [n]: whether a row has only numbers of magnitude up to LARGEST in all arrays [n, ...]."""
-    found = [(np.abs(array) <= LARGEST).all(axis=tuple(range(1, array.ndim))) for array in parts.values()]  # not NaN
-    return np.asarray(np.logical_and.reduce(found))
+    found = np.ones(len(next(iter(parts.values()))), bool)
+    for array in parts.values():
+        good = np.abs(array) <= LARGEST  # not NaN
+        if not good.all():
+            found &= good.all(axis=tuple(range(1, array.ndim)))
+    return found
 
 
 @contextlib.contextmanager

@@ -37,11 +37,13 @@ FINE = 20.0  #: a map is so many times as precise as coefficients of class 0, si
 
 @dataclass(frozen=True, eq=False)
 class Change:
-    """How a head changes. values: float32 [n, c T], n Gaussians at T instants, c components. weights: float64 [n],
-    `pack.sensitivity`. vectors: float64 [c T, K], its principal components, with mean squares over time of 1.
-    coefficients: float32 [n, K] of these. energies: float64 [K], squared errors of pictures without each, falling."""
+    """How a head changes. values: float32 [m, c T], m Gaussians at T instants, c components. rows: int64 [n], those of
+    them that are meant. weights: float64 [n], `pack.sensitivity`. vectors: float64 [c T, K], its principal components,
+    with mean squares over time of 1. coefficients: float32 [n, K] of these. energies: float64 [K], squared errors of
+    pictures without each, falling."""
 
     values: np.ndarray
+    rows: np.ndarray
     weights: np.ndarray
     components: int
     vectors: np.ndarray
@@ -61,13 +63,14 @@ class Change:
         if not len(order):
             return None
         coefficients = values @ (found / instants).astype(np.float32)
-        return Change(values, weights, components, found, coefficients, energies[order])
+        return Change(values, np.arange(len(values)), weights, components, found, coefficients, energies[order])
 
     def taken(self, rows: np.ndarray) -> Change:
         """Returns that of some of the Gaussians, bool [n], by the same components."""
         weights, coefficients = self.weights[rows], self.coefficients[rows]
         energies = weights @ np.square(coefficients, dtype=np.float64)
-        return replace(self, values=self.values[rows], weights=weights, coefficients=coefficients, energies=energies)
+        kept = self.rows[rows]  # a copy of the values would take longer than all else here
+        return replace(self, rows=kept, weights=weights, coefficients=coefficients, energies=energies)
 
     def gains(self, theta: float) -> np.ndarray:
         """Returns by how much each component lowers the error, less what its bits are worth, float64 [K]."""
@@ -130,7 +133,7 @@ def tracks_of(
         exact = change.vectors[:, own].T.reshape(len(own), change.components, -1)[:, :, kept]
         bases[name] = (np.rint(exact / fine[name]) * step).astype(np.float32)
         whole = between(times[kept], bases[name].astype(np.float64), times).reshape(len(own), -1)
-        values[name] = (change.values @ np.linalg.pinv(whole).astype(np.float32)).astype(np.float64)
+        values[name] = (change.values @ np.linalg.pinv(whole).astype(np.float32))[change.rows].astype(np.float64)
     groups = grouping.fitted(values, weights, grid.theta, step) if grouping else None
     heads = {}
     for name, x in values.items():
