@@ -21,10 +21,10 @@ import { VoxelTable, mortonOrder } from "./voxels.js";
 
 /**
  * A layer as far as it has been read: `first` row of its own; in columns of all rows up to its own the mask codes and
- * its tensors; `sorted`, whether its rows are.
+ * its tensors; `sorted`, whether its rows are; `fill` if its last slice has one.
  *
- * @typedef {Omit<LayerTensors, "codes" | "rows"> & {slices: number, first: number, sorted: boolean,
- *   columns: Column<any>[], priors: Prior[]}} Layer
+ * @typedef {Omit<LayerTensors, "codes" | "fill" | "rows"> & {fill: number[] | null, slices: number, first: number,
+ *   sorted: boolean, columns: Column<any>[], priors: Prior[]}} Layer
  */
 
 /** @typedef {Base | Uint8Array | ArrayBuffer | null} GivenBase a file's bytes, or what was read of them */
@@ -219,7 +219,7 @@ export class TensorReader {
     const own = [new Column(Uint8Array, 1), ...floats(rowTensors)];
     const begun = had ?? { layer: number, kind, grids, chains, rowTensors, columns: own, first: this._declared.rows };
     const sorted = !had || (had.sorted && !slice.rows);
-    const layer = { ...begun, slices: place + 1, sorted, priors, fill: fill ?? header.info.background, spread };
+    const layer = { ...begun, slices: place + 1, sorted, priors, fill, spread };
     if (!had) this._rules?.checkLayer(header, [...this.layers, layer]);
     const growth = next ? Math.max(1.5, (1.25 * (last - start)) / (end - start)) : 1;
     const columns = [...this._columns, ...layer.columns];
@@ -247,8 +247,10 @@ export class TensorReader {
    * @returns {Tensors} */
   tensors() {
     if (!this.header || !this.layers.length) throw new TypeError("no layer has been read");
-    const layers = this.layers.map(({ layer, columns, fill, spread, grids, chains, kind, rowTensors }) => {
+    const { background } = this.header.info;
+    const layers = this.layers.map(({ layer, columns, spread, grids, chains, kind, rowTensors, ...rest }) => {
       const [codes, ...rows] = columns.map(({ values }) => values);
+      const fill = rest.fill ?? background; // that of this file, also behind the base's layer 0
       return { layer, codes, rows, fill, spread, grids, chains, kind, rowTensors };
     });
     const [voxels, positions, ...rows] = this._columns.map(({ values }) => values);

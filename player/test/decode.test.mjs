@@ -221,3 +221,10 @@ test("bytes behind the last requested layer are not read", () => {
   assert.deepEqual(stream.feed(damaged), []);
   stream.finish();
 });
+
+test("a file that is cut before its first slice shows its base over its own background", () => {
+  const [base, bytes] = [readVector("valid/base"), readVector("valid/adds-header")];
+  const cut = decode(bytes.subarray(0, -30), { base, allowPartial: true });
+  assert.notDeepEqual(cut.info.background, decode(base).info.background);
+  assert.deepEqual(cut.fill, [cut.info.background]);
+});
