@@ -72,11 +72,14 @@ class SelectLevels(phases.Phase):
 
     def _try(self, state: TrainState, below: int, views: Sequence[TrainingView]) -> None:
         """Trains the level `below` with all anchors. Makes it the highest level if the levels above do not lower the
-        squared error by more than its noise and their bits, which training weighs against an absolute error. Otherwise
-        restores the state, after half of the steps if as many with as much gain would not suffice: gains diminish."""
+        squared error by more than its noise and their bits, which training weighs against an absolute error, once the
+        rate has made them few: planes that never had one take up to three times as many. Otherwise restores the state,
+        after half of the steps if as many with as much gain would not suffice: gains diminish."""
         top, before = state.model.level, state.snapshot()
         errors = workers.alike(lambda: [error(state, view, top) for view in views])
-        rate = 2 * math.sqrt(fmean(errors)) * state.config.plane_rate * sum(state.plane_bits()[below:])
+        rated = state.position >= state.schedule.rounding
+        bits = sum(state.plane_bits()[below:]) if rated else 0.0
+        rate = 2 * math.sqrt(fmean(errors)) * state.config.plane_rate * bits
         with torch.no_grad():
             for above in range(below + 1, 3):  # the anchors of these levels, without their motion
                 state.model.mask_logits[:, below] += softplus(state.model.mask_logits[:, above])
