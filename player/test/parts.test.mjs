@@ -32,7 +32,7 @@ test("T and M are those of 7.3, far from where rounding could turn", () => {
 
 test("NormTable gives the table of 7.3", () => {
   const [, numbers] = /** @type {RegExpExecArray} */ (
-    /Check:\s+n = 7, mu8 = 832, si = 0 gives ([\d, ]+), 2\^24\./.exec(TEXT)
+    /Check:\s+m = 7, mu8 = 832, si = 0 gives ([\d, ]+), 2\^24\./.exec(TEXT)
   );
   assert.deepEqual([...normTable(7, { mu8: 832, si: 0 })], [...numbers.split(", ").map(Number), 2 ** 24]);
 });
