@@ -272,7 +272,8 @@ class Maker:
         for grid in grids_of(meta):
             samples = [symbols(self.rng, *shape, most=self.rng.choice((M, 3))) for shape in grid.shapes()]
             if meta.get(6) == [1] and grid.id == 0:
-                samples = [k * 0 + np.arange(k.size).reshape(k.shape) ** self.rng.choice((1, 2)) for k in samples]
+                rising = [np.arange(k.size).reshape(k.shape) ** self.rng.choice((1, 2)) for k in samples]
+                samples = [(k if k.max() <= M else np.sqrt(k)).astype(np.int32) for k in rising]
             predictors = tuple(self.rng.randrange(2) for _ in samples)
             made.append(replace(grid, predictors=predictors, fill=lambda place, shape, samples=samples: samples[place]))  # type: ignore[misc]
         return made
