@@ -45,10 +45,9 @@ from pd4dgs_codec.scene import Camera, SceneInfo
 #: One of so many cameras measures the error and does not decide about steps: those that do look better than others. Of
 #: fewer than FEW all decide, and CHECKED of them measure.
 HOLDOUT, FEW, CHECKED = 5, 30, 12
-#: Bits of a scalar, about. Gaussians leave in rounds, each at twice the theta of the one before, four times where they
-#: only leave layer 0, or that at which the share LEAVE leaves: several that hide each other's absence cannot all leave.
-#: Of EACH views one decides about it. Of what the error allows each scalar, the first guess of theta is the share GUESS
-#: if coefficients of motion add to it.
+#: Bits of a scalar, about. Gaussians leave in rounds, each at twice the theta of the one before or that at which the
+#: share LEAVE leaves: several that hide each other's absence cannot all leave. Of EACH views one decides about it. Of
+#: what the error allows each scalar, the first guess of theta is the share GUESS if coefficients of motion add to it.
 SCALAR_BITS, LEAVE, EACH, GUESS = 2.8, 1 / 32, 2, 0.3
 EARLY = 14.0  #: in layer 0 are the Gaussians that stay at so many times theta
 BEST = 100.0  #: dB that stand for equal pictures
@@ -135,7 +134,7 @@ class Packer:
             kept = self._leave > self._reached
             at, free = absence(self.deciding, kept) / worth, kept & self._often
             soon = np.quantile(np.append(at[free], np.inf), LEAVE, method="lower")
-            next_ = max((2 if self._reached < theta else 4) * self._reached or LEAVE * theta, float(soon))
+            next_ = max(2 * self._reached or LEAVE * theta, float(soon))
             leaving = free & (at < next_)
             self._leave[leaving] = np.maximum(at[leaving], self._reached)
             self._reached = next_

@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -21,6 +22,7 @@ from pd4dgs_codec.format.registry import MAX_SIDE
 from pd4dgs_codec.interchange.splats import evenly
 from pd4dgs_codec.interchange.teacher import GOLDEN, Teacher, spread
 from pd4dgs_codec.kinds.splats import MAX_DEGREE, Splats, unit, visible
+from pd4dgs_codec.threads import aside
 
 MOST_NUMBERS = 1 << 29  #: numbers of all samples, which take 2 GiB
 NUMBERS = 14  #: of a Gaussian that may change over time: all but harmonics
@@ -126,8 +128,7 @@ def sampled(model: Teacher, where: str, fps: float = 30.0, step: Step = lambda: 
         if len(times) > MAX_SIDE:
             raise DataError(f"{where}: holds {len(times):,} frames, expected at most {MAX_SIDE:,}")
         exact, frames = np.asarray(times), list[Splats]()
-        for t in times:
-            frame = read(float(t))
+        for frame in _ahead(read, times):
             _check_size(where, len(times), len(frame.means))
             frames.append(kept.without_rest(frame))
             step()
@@ -139,6 +140,15 @@ def sampled(model: Teacher, where: str, fps: float = 30.0, step: Step = lambda: 
     frames = [read(float(t)) for t in exact]
     frames = [replace(frame, sh=frame.sh[:, : 1 + kept.harmonics]) for frame in frames]
     return matched_frames(where, exact, frames)
+
+
+def _ahead(read: Callable[[float], Splats], times: Sequence[float]) -> Iterator[Splats]:
+    """Yields the frame of each time. The next one is read meanwhile."""
+    coming = aside(partial(read, float(times[0])))
+    for t in times[1:]:
+        frame, coming = coming(), aside(partial(read, float(t)))
+        yield frame
+    yield coming()
 
 
 class _Kept:
@@ -180,8 +190,8 @@ def stacked(
 ) -> Sampled:
     """Stacks frames with the same rows. rest: harmonics but the constants; by default means over the frames."""
     names = ("means", "quats", "scales", "opacities")
-    means, quats, scales, opacities = (np.stack([getattr(frame, name) for frame in frames]) for name in names)
-    colors = np.stack([frame.sh[:, 0] for frame in frames])
+    parts = [[getattr(frame, name) for frame in frames] for name in names] + [[frame.sh[:, 0] for frame in frames]]
+    means, quats, scales, opacities, colors = [stack() for stack in [aside(partial(np.stack, part)) for part in parts]]
     if rest is None:
         rest = np.asarray(sum(frame.sh[:, 1:] for frame in frames) / len(frames), np.float32)
     return Sampled(times, means, quats, scales, opacities, colors, rest, windows, order)
@@ -267,12 +277,10 @@ def in_order(frames: Sequence[Splats]) -> bool:
     for i in evenly(range(min(1, len(frames) - 2), len(frames) - 1), TRIPLES):  # before the first there is no movement
         before, now, later = frames[max(i - 1, 0)], frames[i], frames[i + 1]
         rows, reach = rng.permutation(n)[:ROWS], reach_of(now)
-        guesses = (now.means, 2 * now.means - before.means)
-        ranks = []
-        for guess in guesses:
-            here, there = features(now, guess, reach)[rows], features(later, later.means, reach)
-            ranks.append(_others(here, there, rows)[0])
-        if np.median(np.minimum(*ranks)) > RANK:
+        there = features(later, later.means, reach)
+        here = [features(now, guess, reach)[rows] for guess in (now.means, 2 * now.means - before.means)]
+        ranks = [aside(partial(_others, guess, there, rows)) for guess in here]
+        if np.median(np.minimum(*(found()[0] for found in ranks))) > RANK:
             return False
     return True
 
