@@ -47,7 +47,7 @@ SHARE = 1 / 18
 #: Pictures of a segment for each of its finest planes' instants, see `ModelConfig`.
 PICTURES = 4
 #: Steps that fit a segment's motion to that of the whole, before pictures do.
-FITTING = 600
+FITTING = 2000
 #: Squared steps that an attribute's error grows by when it has a bit less, at high rates (Gersho and Gray, Vector
 #: quantization and signal compression, 1992).
 SQUARES_PER_BIT = math.log(2) / 6
