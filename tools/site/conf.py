@@ -68,7 +68,8 @@ CONTENTS = {
     "Log": ["docs/log/README", *sorted(f"docs/log/{page.stem}" for page in ROOT.glob("docs/log/[a-z]*.md"))],
 }
 
-PLAYER = '<iframe src="sample.html" title="The dancer, playing" width="480" height="480" style="border: 0"></iframe>'
+STYLE = "border: 0; width: 480px; max-width: 100%; aspect-ratio: 1"  # no wider than a phone
+PLAYER = f'<iframe src="sample.html" title="The dancer, playing" style="{STYLE}"></iframe>'
 
 #: Rooms that are used as commands, not as a library.
 LEFT_OUT = {"cli", "bench"}
