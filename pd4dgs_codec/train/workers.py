@@ -8,6 +8,7 @@ If a worker ends early, those that wait for it raise TrainError.
 
 from __future__ import annotations
 
+import atexit
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -35,6 +36,7 @@ def start(device: str, views: int) -> None:
             if device == "cuda":
                 torch.cuda.set_device(_local_rank())
             distributed.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo")
+        atexit.register(stop)  # also after an error, or the group's threads sometimes abort the process at exit
 
 
 def _local_rank() -> int:
