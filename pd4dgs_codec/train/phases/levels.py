@@ -65,19 +65,18 @@ class SelectLevels(phases.Phase):
         late = state.position >= state.schedule.rounding
         wrong = workers.alike(lambda: any(_wrong(state, view, state.model.level if late else None) for view in views))
         if not wrong:
-            self._try(state, 0, views)
+            self._try(state, 0, views, late)
         if late and state.model.level == 2:
-            self._try(state, 1, views)
+            self._try(state, 1, views, late)
         record["left_out"] = self.left_out
 
-    def _try(self, state: TrainState, below: int, views: Sequence[TrainingView]) -> None:
+    def _try(self, state: TrainState, below: int, views: Sequence[TrainingView], rated: bool) -> None:
         """Trains the level `below` with all anchors. Makes it the highest level if the levels above do not lower the
-        squared error by more than its noise and their bits, which training weighs against an absolute error, once the
-        rate has made them few: planes that never had one take up to three times as many. Otherwise restores the state,
-        after half of the steps if as many with as much gain would not suffice: gains diminish."""
+        squared error by more than its noise and their bits, which training weighs against an absolute error, if they
+        are `rated`: planes that had no rate yet take up to three times as many. Otherwise restores the state, after
+        half of the steps if as many with as much gain would not suffice: gains diminish."""
         top, before = state.model.level, state.snapshot()
         errors = workers.alike(lambda: [error(state, view, top) for view in views])
-        rated = state.position >= state.schedule.rounding
         bits = sum(state.plane_bits()[below:]) if rated else 0.0
         rate = 2 * math.sqrt(fmean(errors)) * state.config.plane_rate * bits
         with torch.no_grad():
