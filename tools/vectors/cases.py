@@ -74,6 +74,7 @@ def vectors(without: Container[str] = ()) -> Iterator[tuple[dict[str, Any], byte
     """The entry in the manifest and the bytes of all vectors but those of some names, in the order of the table."""
     names: dict[str, Any] = {**vars(blocks), **globals()}
     bases: dict[str, File] = {}
+    ans_only: dict[str, str] = {}
     group = ("", "", "", "")
     for text in _lines():
         try:
@@ -90,7 +91,11 @@ def vectors(without: Container[str] = ()) -> Iterator[tuple[dict[str, Any], byte
             folder, base, clauses, error = group
             if base not in bases:
                 bases[base] = eval(base, names)
-            yield _vector(text, folder, bases[base], clauses, error, names)
+            row, data = _vector(text, folder, bases[base], clauses, error, names)
+            if ans_only.get(row.get("base")) == "UnsupportedFeature":
+                row["ans_only"] = "UnsupportedFeature"
+            ans_only[row["file"]] = row["ans_only"]
+            yield row, data
         except Exception as fault:
             raise ValueError(f"{TABLE.name}: {text}: {type(fault).__name__}: {fault}") from fault
 
@@ -374,6 +379,12 @@ def every_chunk(data: bytes) -> bytes:
     sizes = [211 + 7 * i for i in range(len(controls) - 1)]
     plan = list(zip(controls, [*sizes, len(data) - sum(sizes)], strict=True))
     return lzma2.chunks(data, plan, properties)
+
+
+def later_resets(data: bytes) -> bytes:
+    """An LZMA2 stream that resets the dictionary behind large bytes, at places that are no multiples of 16."""
+    plan = [(0xE0, 1003), (0xE0, 501), (1, 203), (0xC0, 105), (1, 7), (0xE0, 702), (0xE0, len(data) - 2521)]
+    return lzma2.chunks(data, plan, [(4, 0, 4), (3, 1, 3), (2, 2, 1), (4, 0, 3), (1, 3, 2)])
 
 
 def lzma_text() -> Layer:
