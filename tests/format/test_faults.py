@@ -7,24 +7,24 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from fuzzing.parts import Chunk, put_together, take_apart
 from strategies import memory_below, small_file
+from vectors.blocks import ancillary, read_file
 
 from pd4dgs_codec.errors import DecodeError, LimitExceeded
-from pd4dgs_codec.format.container import FLAG_ANCILLARY, read_chunk, read_preamble
+from pd4dgs_codec.format.container import read_chunk, read_preamble
 from pd4dgs_codec.format.decoder import decode
 
 VECTORS = Path(__file__).parents[2] / "spec" / "vectors" / "faulty"
 
 
 def test_a_scene_keeps_its_id_when_chunks_come_and_go():
-    parts = take_apart(small_file())
-    extra = [Chunk(99, FLAG_ANCILLARY, b"x")] * 20  # a chunk list in its longer form
-    others = [replace(parts, chunks=chunks) for chunks in (parts.chunks[:2], parts.chunks + extra)]
-    files = [small_file(), *map(put_together, others)]
+    file = read_file(small_file())
+    extra = [ancillary(99, b"x")] * 20  # a chunk list in its longer form
+    others = [replace(file, chunks=chunks) for chunks in (file.chunks[:2], [*file.chunks, *extra])]
+    files = [small_file(), *(other.data() for other in others)]
     assert len({read_chunk(data, read_preamble(data).size).scene_id for data in files}) == 1
-    many = {**parts.header, **{64 + i: i for i in range(10)}}  # a map in its longer form
-    assert decode(put_together(replace(parts, header=many))).layers == (0, 1, 2)
+    many = {**file.header, **{64 + i: i for i in range(10)}}  # a map in its longer form
+    assert decode(replace(file, header=many).data()).layers == (0, 1, 2)
 
 
 #: What one reads of a broken file, by vector: what was found, what was expected, and where.

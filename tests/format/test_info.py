@@ -5,13 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from fuzzing.parts import Chunk, put_together, take_apart
 from strategies import make_scene, small_file
+from vectors.blocks import ancillary, read_file
 
 from pd4dgs_codec import FORMAT_VERSION
 from pd4dgs_codec.errors import DecodeError, EncodeError, Truncated
 from pd4dgs_codec.format import encoder
-from pd4dgs_codec.format.container import FLAG_ANCILLARY
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode, encode_with_report
 from pd4dgs_codec.format.info import hashes, info, metadata_of, to_npz_dict
@@ -78,8 +77,8 @@ def test_npz_keys_and_symbols():
 
 def test_info_names_chunks_it_does_not_know():
     data = small_file(omit="nothing")
-    parts = take_apart(data)
-    longer = put_together(replace(parts, chunks=[*parts.chunks, Chunk(99, FLAG_ANCILLARY, b"a preview")]))
+    file = read_file(data)
+    longer = replace(file, chunks=[*file.chunks, ancillary(99, b"a preview")]).data()
     assert info(longer)["chunks"] == [{"type": 99, "offset": len(longer) - 29, "bytes": 29, "end": len(longer)}]
     assert [row["layer"] for row in info(longer)["layers"]] == [0, 1, 2] and hashes(longer) == hashes(data)
 

@@ -5,10 +5,10 @@ from functools import partial
 
 import numpy as np
 import pytest
-from fuzzing.parts import Chunk, Parts, put_together
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import LAYER_SETS, assert_same_scene, flipped, scenes, small_file
+from vectors.blocks import Chunk, File
 
 from pd4dgs_codec import decode, encode, open_stream
 from pd4dgs_codec.errors import BadSignature, ChecksumMismatch, DecodeError, Malformed, Truncated
@@ -115,8 +115,8 @@ def test_of_two_faults_every_door_names_that_of_the_earlier_layer(first):
     else:
         layers[1] = replace(layers[1], anchor_q=layers[0].anchor_q[: len(layers[1].anchor_q)])
     fields = unpack(pack_header(replace(header, table=replace(header.table, tensors=rows))))
-    chunks = [Chunk(i, 0, write_slice(layer, EncodeOptions(effort=1))[0]) for i, layer in enumerate(layers)]
-    whole = put_together(Parts(fields, chunks))
+    chunks = [Chunk(i, write_slice(layer, EncodeOptions(effort=1))[0]) for i, layer in enumerate(layers)]
+    whole = File(chunks, {key: value for key, value in fields.items() if key != 1}).data()
     offset = info(whole[: read_preamble(whole).size])["layers"][which]["offset"]
     for data in (whole, whole[:-9], flipped(whole, -9)):
         ((error, _, *place),) = set(faults_by_every_door(data))

@@ -6,8 +6,8 @@ from itertools import accumulate
 
 import numpy as np
 import pytest
-from fuzzing.parts import put_together, take_apart
 from strategies import assert_same_scene, make_scene, slice_ends
+from vectors.blocks import read_file
 
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import DecodeError, EncodeError, Truncated
@@ -40,7 +40,7 @@ def sliced():
 
 
 def test_all_slices_are_what_one_slice_per_layer_holds():
-    kinds = [chunk.type for chunk in take_apart(sliced()).chunks]
+    kinds = [chunk.type for chunk in read_file(sliced()).chunks]
     assert kinds == sorted(kinds) and all(kinds.count(layer) > 1 for layer in (0, 1, 2))
     assert hashes(sliced()) == hashes(one_slice())
     assert_same_scene(decode(sliced()), decode(one_slice()))
@@ -49,7 +49,7 @@ def test_all_slices_are_what_one_slice_per_layer_holds():
 
 def test_every_prefix_of_slices_is_a_scene_by_every_door():
     """Cut off, as a file of its own, from a stream: the same scene, of rows that the whole has too."""
-    whole, parts, ends = decode(sliced()), take_apart(sliced()), slice_ends(sliced())
+    whole, parts, ends = decode(sliced()), read_file(sliced()), slice_ends(sliced())
     streamed = list(every_prefix(sliced()))
     assert len(streamed) == len(ends)
     rows = {tuple(q): i for i, q in enumerate(whole.anchor_q.tolist())}
@@ -60,7 +60,7 @@ def test_every_prefix_of_slices_is_a_scene_by_every_door():
         prefix, complete = decode_partial(sliced()[:end])
         assert complete == (count == len(ends))
         assert sorted(from_stream.anchor_q.tolist()) == sorted(prefix.anchor_q.tolist())
-        assert_same_scene(prefix, decode(put_together(replace(parts, chunks=parts.chunks[:count]))))
+        assert_same_scene(prefix, decode(replace(parts, chunks=parts.chunks[:count]).data()))
         at = [rows[tuple(q)] for q in prefix.anchor_q.tolist()]
         np.testing.assert_array_equal(prefix.feature, whole.feature[at])
         assert prefix.level == parts.chunks[count - 1].type
@@ -92,7 +92,7 @@ def test_utility_decides_what_comes_first():
 def test_slices_take_what_was_asked_and_the_report_says_so():
     data, report = with_report()
     rows = [row for layer in report.layers for row in layer.slices]
-    assert [row.bytes for row in rows] == [CHUNK_OVERHEAD + len(chunk.payload) for chunk in take_apart(data).chunks]
+    assert [row.bytes for row in rows] == [CHUNK_OVERHEAD + len(chunk.payload) for chunk in read_file(data).chunks]
     assert all(row.bytes <= 1750 for row in rows)
     ends = [*accumulate((row.bytes for row in rows), initial=read_preamble(data).size)][1:]
     assert ends[0] <= 1750 and ends[-1] == len(data)

@@ -9,14 +9,12 @@ from itertools import chain
 
 import numpy as np
 import pytest
-from fuzzing.parts import Chunk, put_together, take_apart
 from strategies import assert_same_scene, by_voxel, slice_ends, small_file
 from streams import cost
-from vectors.blocks import later, line, make_file, make_layer, pattern
+from vectors.blocks import ancillary, later, line, make_file, make_layer, pattern, read_file
 
 from pd4dgs_codec import decode, open_stream
 from pd4dgs_codec.errors import ChecksumMismatch
-from pd4dgs_codec.format.container import FLAG_ANCILLARY
 
 SLICES, ROWS = 120, 64
 
@@ -79,8 +77,8 @@ def test_any_split_takes_the_time_and_memory_of_decoding(split):
 
 def test_bytes_that_are_skipped_take_a_constant_a_piece():
     """Of a chunk of a type to come, decode takes the checksum alone, so that multiples of its time promise nothing."""
-    parts = take_apart(small_file())
-    data = put_together(replace(parts, chunks=[*parts.chunks, Chunk(99, FLAG_ANCILLARY, bytes(300_000))]))
+    file = read_file(small_file())
+    data = replace(file, chunks=[*file.chunks, ancillary(99, bytes(300_000))]).data()
 
     def fed() -> None:
         stream = open_stream()

@@ -15,8 +15,8 @@ from urllib.parse import urlsplit
 
 import pytest
 from faulty import Fault, FaultyServer
-from fuzzing.parts import take_apart
 from strategies import assert_same_scene, flipped, small_file
+from vectors.blocks import read_file
 
 from pd4dgs_codec import decode, encode, open_stream
 from pd4dgs_codec.errors import (
@@ -333,8 +333,9 @@ def test_random_cuts_give_the_same_scenes(file, cuts):
 
 def promising(*sizes: int) -> bytes:
     """The header of a file of such chunks, and the head of the first of them."""
-    parts = take_apart(small_file())
-    header = canonical.pack({**parts.header, 1: [[0 if i == 0 else 9, size] for i, size in enumerate(sizes)]})
+    header = canonical.pack(
+        {**read_file(small_file()).header, 1: [[0 if i == 0 else 9, size] for i, size in enumerate(sizes)]}
+    )
     return write_preamble(header) + struct.pack("<HHI8s", 0, 0, sizes[0], scene_id_of(header))
 
 

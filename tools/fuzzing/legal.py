@@ -35,12 +35,11 @@ from vectors.blocks import (
     morton_order,
     ordered,
     pack,
+    read_file,
 )
 
 from pd4dgs_codec.errors import DecodeError
 from pd4dgs_codec.format.info import hashes
-
-from .parts import take_apart
 
 VECTORS = ROOT / "spec" / "vectors"
 LARGEST_SEED = 6000  #: bytes of a vector: larger ones decode slowly
@@ -171,11 +170,11 @@ def all_tables() -> list[Tables]:
     """Those of the small vectors without large grids, and of which no base has a part."""
     found = list[Tables]()
     for seed in valid_vectors():
-        parts = take_apart(seed.data)
-        layers = {c.type: {k: v for k, v in c.meta.items() if 3 < k < 8} for c in reversed(parts.chunks) if c.meta}
+        file = read_file(seed.data)
+        layers = {c.type: {k: v for k, v in c.layer.meta.items() if 3 < k < 8} for c in file.chunks[::-1] if c.layer}
         samples = sum(np.prod(s) for x in layers.values() for grid in grids_of(x) for s in grid.shapes())
-        if 15 not in parts.header and samples <= LARGEST_GRIDS:
-            found.append(Tables(parts.header[3], parts.header[4], layers, seed.scene))
+        if 15 not in file.header and samples <= LARGEST_GRIDS:
+            found.append(Tables(file.header[3], file.header[4], layers, seed.scene))
     return found
 
 

@@ -9,14 +9,14 @@ from __future__ import annotations
 import copy
 import itertools
 import random
+import struct
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from vectors.blocks import varint
+from vectors.blocks import Chunk, File, read_file, varint
 
 from .legal import Seed, legal
-from .parts import Parts, put_together, take_apart
 
 VARINT_MAX = (1 << 35) - 1
 _POWERS = (7, 8, 9, 12, 14, 15, 16, 20, 21, 22, 23, 24, 26, 28, 31, 32)
@@ -135,41 +135,40 @@ def change_value(rng: random.Random, tree: Any) -> None:
 PARTS = {"coded": 40, "swap": 8, "parameter": 22, "header": 14, "payload": 10, "chunks": 6, "header bytes": 8}
 
 
-def change_part(rng: random.Random, part: str, parts: Parts, other: Parts, names: list[str]) -> None:
+def change_part(rng: random.Random, part: str, file: File, other: File, names: list[str]) -> None:
     """Changes something in place."""
     names.append(part)
-    own, donors = ([chunk for chunk in x.chunks if chunk.meta is not None] for x in (parts, rng.choice((parts, other))))
+    own, donors = ([c.layer for c in x.chunks if c.layer] for x in (file, rng.choice((file, other))))
     if part == "chunks":
-        _change_chunks(rng, parts, other)
+        _change_chunks(rng, file.chunks, other.chunks)  # type: ignore[arg-type]
     elif part == "payload":
-        chunk = rng.choice(parts.chunks)
-        chunk.payload = change_bytes(rng, chunk.packed(), rng.choice(other.chunks).packed(), names)
-        chunk.meta = None
+        chunk = rng.choice(file.chunks)
+        chunk.payload = change_bytes(rng, chunk.payload, rng.choice(other.chunks).payload, names)
+        chunk.layer = None
     elif part == "header" or not own:
-        tables = [parts.header[key] for key in (3, 4, 5) if isinstance(parts.header.get(key), list)]
-        change_value(rng, rng.choice(tables) if tables and rng.random() < 0.5 else parts.header)
+        tables = [file.header[key] for key in (3, 4, 5) if isinstance(file.header.get(key), list)]
+        change_value(rng, rng.choice(tables) if tables and rng.random() < 0.5 else file.header)
     elif part == "parameter":
         change_value(rng, rng.choice(own).meta)
     elif part != "header bytes":
-        chunk, donor, size = rng.choice(own), rng.choice(donors or own), rng.randint(1, 200)
-        name = rng.choice(("codes", "stream", "meta") if part == "swap" else ("codes", "codes", "codes", "stream"))
-        value = copy.deepcopy(getattr(donor, name))
+        layer, donor, size = rng.choice(own), rng.choice(donors or own), rng.randint(1, 200)
+        name = rng.choice(("pieces", "stream", "meta") if part == "swap" else ("pieces", "pieces", "pieces", "stream"))
+        value, before = (b"".join(x.pieces.values()) if name == "pieces" else getattr(x, name) for x in (donor, layer))
         if part == "coded":
-            value = change_bytes(rng, getattr(chunk, name), value, names)
+            value = change_bytes(rng, before, value, names)
         elif name != "meta" and rng.random() < 0.5:
             value = rng.choice((b"", rng.randbytes(size), bytes(size), b"\x10" * size))
-        setattr(chunk, name, value)
+        setattr(layer, name, {"codes": value} if name == "pieces" else copy.deepcopy(value))
         names.append(f"of {name}")
 
 
-def _change_chunks(rng: random.Random, parts: Parts, other: Parts) -> None:
+def _change_chunks(rng: random.Random, chunks: list[Chunk], others: Sequence[Chunk]) -> None:
     """Chunks are dropped, doubled, swapped, of another type, flagged, or from another file; then numbered, or not."""
-    chunks, act = parts.chunks, rng.randrange(6)
-    i, j = (rng.randrange(len(chunks)) for _ in range(2))
+    act, (i, j) = rng.randrange(6), (rng.randrange(len(chunks)) for _ in range(2))
     if act == 0 and len(chunks) > 1:
         del chunks[i]
     elif act == 1:
-        chunks.insert(i, copy.deepcopy(rng.choice((chunks[j], *other.chunks))))
+        chunks.insert(i, copy.deepcopy(rng.choice((chunks[j], *others))))
     elif act == 2:
         chunks[i], chunks[j] = chunks[j], chunks[i]
     elif act == 3:
@@ -184,15 +183,18 @@ def _change_chunks(rng: random.Random, parts: Parts, other: Parts) -> None:
 
 def change_parts(rng: random.Random, data: bytes, other: bytes, names: list[str]) -> bytes:
     """A file whose parts were changed, with lengths, chunk list, scene ids and CRCs right again."""
-    parts, donor, header = take_apart(data), take_apart(other), None
+    file, donor, packed = replace(read_file(data), minor=0), read_file(other), None
     try:
         for part in rng.choices([*PARTS], [*PARTS.values()], k=rng.choice((1, 1, 1, 2))):
             if part == "header bytes":  # msgpack in forms that nobody writes
-                size = int.from_bytes(data[12:16], "little")
-                header = change_bytes(rng, data[20 : 20 + size], other[20:200], names)[:4096]
-            change_part(rng, part, parts, donor, names)
-        return put_together(parts, header)
-    except ValueError:  # a number that has no form
+                packed = change_bytes(rng, data[20 : 20 + int.from_bytes(data[12:16], "little")], other[20:200], names)[
+                    :4096
+                ]
+            change_part(rng, part, file, donor, names)
+        for chunk in file.chunks:
+            chunk.payload = chunk.layer.payload() if chunk.layer else chunk.payload
+        return replace(file, header={14: None, **file.header}, packed=packed).data()
+    except (ValueError, TypeError, OverflowError, struct.error):  # a value that has no form
         return data
 
 

@@ -1,10 +1,9 @@
 """Writes `.pd4` structures from explicit choices, right or wrong.
 
 This is written from the specification. It shares frequency tables and Morton codes with the reference decoder, and with
-the package no code but the library that packs msgpack, so that a misreading of either is found.
-Nothing here searches, fits or rounds: the caller names every prior, predictor and field, or it follows from the symbols
-by a rule on integers, so the bytes are the same on every machine. Lengths, scene ids and CRCs are right unless the
-caller asks for others.
+the package no code but the library that packs msgpack, so that a misreading of either is found. The caller names every
+prior, predictor and field, or it follows from the symbols by a rule on integers, so the bytes are the same on every
+machine. Lengths, scene ids and CRCs are right unless the caller asks for others.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from typing import Any
 
 import msgpack
 import numpy as np
-from refdec import PATTERNS, less_minimum, morton_code, norm_cdf, row_values, table_of
+from refdec import PATTERNS, less_minimum, morton_code, norm_cdf, row_values, table_of, unpack
 
 from . import lzma2
 
@@ -59,8 +58,7 @@ def words(*values: int) -> bytes:
 
 def pack(value: Any) -> bytes:
     """Canonical msgpack (clause 4), if the keys of maps ascend. ValueError for a number that has no form."""
-    data: bytes = msgpack.packb(value, use_single_float=True)
-    return data
+    return bytes(msgpack.packb(value, use_single_float=True))
 
 
 def pattern(*shape: int, low: int = -3, high: int = 3, seed: int = 0) -> np.ndarray:
@@ -230,16 +228,13 @@ def constant(value: int) -> Callable[[int, tuple[int, ...]], np.ndarray]:
 def residual(predictor: int, k: np.ndarray) -> np.ndarray:
     """int64 [C, H, W] of samples (clause 11.3)."""
     k = k.astype(np.int64)
-    if not k.size:
-        return k
-    west, north, corner = (np.zeros_like(k) for _ in range(3))
-    west[:, :, 1:], north[:, 1:], corner[:, 1:, 1:] = k[:, :, :-1], k[:, :-1], k[:, :-1, :-1]
-    north[:, 0] = corner[:, 0] = west[:, 0]
-    west[:, 1:, 0] = corner[:, 1:, 0] = north[:, 1:, 0]
-    if predictor == 0:
-        return k - north
-    low, high = np.minimum(west, north), np.maximum(west, north)
-    return k - np.maximum(low, np.minimum(high, west + north - corner))
+    west, north, corner = k[:, 1:, :-1], k[:, :-1, 1:], k[:, :-1, :-1]
+    median = np.clip(west + north - corner, np.minimum(west, north), np.maximum(west, north))
+    e = k.copy()
+    e[:, 0, 1:] -= k[:, 0, :-1]  # in row 0 and in column 0 both predictors have one neighbour
+    e[:, 1:, 0] -= k[:, :-1, 0]
+    e[:, 1:, 1:] -= median if predictor else north
+    return e
 
 
 def classes_of_plane(e: np.ndarray) -> np.ndarray:
@@ -258,7 +253,7 @@ def grid_channels(planes: Sequence[np.ndarray]) -> Iterator[np.ndarray]:
     first, end = 0, 2
     while any(first < len(e) for e in planes):
         for e in planes:
-            classes = classes_of_plane(e[:first]) if 0 < first < len(e) and e.size else None
+            classes = classes_of_plane(e[:first]) if 0 < first < len(e) else None
             for channel in map(np.ravel, e[first:end]):
                 yield from [channel] if classes is None else (channel[classes == q] for q in range(8))
         first, end = end, 2 * end
@@ -267,7 +262,7 @@ def grid_channels(planes: Sequence[np.ndarray]) -> Iterator[np.ndarray]:
 # -- layers (clause 6) -------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Layer:
     """A slice of a layer: what it means, and its parameters, codes and stream as they are written.
 
@@ -449,7 +444,7 @@ def later(number: int, cells: Sequence[Sequence[int]], **fields: Any) -> Layer:
 # -- files (clause 3) --------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Chunk:
     """A chunk. None: the value that follows from the payload, for the type and length in the header's list, and the
     length and scene id in the frame. crc: xored to the right CRC-32. layer: what the payload means."""
@@ -484,7 +479,7 @@ class File:
     offset in it) where it is cut. The chunk None begins with the file.
     """
 
-    chunks: tuple[Chunk, ...]
+    chunks: Sequence[Chunk]
     header: dict[int, Any] = field(default_factory=lambda: HEADER)
     packed: bytes | None = None
     signature: bytes = SIGNATURE
@@ -507,11 +502,8 @@ class File:
 
     def start(self, index: int | None) -> int:
         """Offset of a chunk; that of the end of the file for the number of chunks, 0 for None."""
-        return (
-            0
-            if index is None
-            else 20 + len(self.header_bytes()) + sum(20 + len(c.payload) for c in self.chunks[:index])
-        )
+        before = self.chunks[:index]
+        return 0 if index is None else 20 + len(self.header_bytes()) + sum(20 + len(c.payload) for c in before)
 
     @property
     def described(self) -> bytes:
@@ -555,9 +547,7 @@ class File:
 
     def layer(self, index: int) -> Layer:
         """The meaning of a layer's chunk."""
-        layer = self.chunks[index].layer
-        assert layer is not None
-        return layer
+        return self.chunks[index].layer  # type: ignore[return-value]
 
     def slices(self, chunks: int | None = None) -> list[Layer]:
         """Those among the first `chunks` chunks."""
@@ -586,6 +576,25 @@ def adding(base: File, *layers: Layer, header: Mapping[int, Any] | None = None) 
     """A file of these layers that adds to the layer 0 of another one."""
     shared = {key: base.fields().get(key) for key in (3, 4, 5, 6)}
     return make_file(*layers, header={**shared, 15: base.reference(), **(header or {})})
+
+
+def read_file(data: bytes) -> File:
+    """The parts of a valid file. Its layers have parameters, codes in one piece and a stream, and no meaning."""
+    minor, size = struct.unpack_from("<HI", data, 10)
+    header, chunks, at = unpack(data[20 : 20 + size]), list[Chunk](), 20 + size
+    while at < len(data):
+        kind, flags, length = struct.unpack_from("<HHI", data, at)
+        chunk = Chunk(kind, data[at + 16 : at + 16 + length], flags)
+        if kind < 3:
+            codes = 4 + int.from_bytes(chunk.payload[:4], "little")
+            meta = unpack(chunk.payload[4:codes])
+            end = codes + meta.pop(2)
+            pieces, stream = {"codes": chunk.payload[codes:end]}, chunk.payload[end:]
+            chunk.layer = replace(make_layer(kind, ()), meta=meta, pieces=pieces, stream=stream)
+        chunks.append(chunk)
+        at += 20 + length
+    del header[1]
+    return File(chunks, header, minor=minor)
 
 
 def slices_of(*parts: Layer) -> File:

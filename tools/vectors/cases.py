@@ -42,22 +42,8 @@ from typing import Any
 
 import numpy as np
 
-from . import blocks, lzma2
-from .blocks import (
-    LZMA,
-    File,
-    Grid,
-    Layer,
-    Prior,
-    constant,
-    later,
-    line,
-    make_file,
-    make_layer,
-    pack,
-    pattern,
-    slices_of,
-)
+from . import blocks
+from .blocks import LZMA, File, Grid, Layer, Prior, constant, line, make_file, make_layer, pack, pattern
 
 TABLE = Path(__file__).with_name("table.txt")
 M, K, ROWS = 1 << 23, 1 << 24, 40
@@ -73,29 +59,22 @@ PREAMBLE = {"signature": 0, "major": 8, "declared": 12, "crc": 16}
 def vectors(without: Container[str] = ()) -> Iterator[tuple[dict[str, Any], bytes]]:
     """The entry in the manifest and the bytes of all vectors but those of some names, in the order of the table."""
     names: dict[str, Any] = {**vars(blocks), **globals()}
-    bases: dict[str, File] = {}
-    ans_only: dict[str, str] = {}
-    group = ("", "", "", "")
+    rows: dict[str | None, dict[str, Any]] = {}
+    group: Any = None
     for text in _lines():
         try:
             if text.startswith("let "):
                 name, _, value = text.removeprefix("let ").partition(" = ")
                 names[name] = eval(value, names)
-                continue
-            if text.startswith("["):
+            elif text.startswith("["):
                 folder, base, clauses, error = re.fullmatch(r"\[(\S+) (.+?) \| ([\d. ]*\d)(?: (\w+))?\]", text).groups()  # type: ignore[union-attr]
-                group = folder, base, clauses, error
-                continue
-            if text.split("  ")[0] in without:
-                continue
-            folder, base, clauses, error = group
-            if base not in bases:
-                bases[base] = eval(base, names)
-            row, data = _vector(text, folder, bases[base], clauses, error, names)
-            if ans_only.get(row.get("base")) == "UnsupportedFeature":
-                row["ans_only"] = "UnsupportedFeature"
-            ans_only[row["file"]] = row["ans_only"]
-            yield row, data
+                group = folder, eval(base, names), clauses, error
+            elif text.split("  ")[0] not in without:
+                row, data = _vector(text, *group, names)
+                if rows.get(row.get("base"), row)["ans_only"] != "same":
+                    row["ans_only"] = "UnsupportedFeature"
+                rows[row["file"]] = row
+                yield row, data
         except Exception as fault:
             raise ValueError(f"{TABLE.name}: {text}: {type(fault).__name__}: {fault}") from fault
 
@@ -154,9 +133,7 @@ def _patched(file: File, patch: str, names: dict[str, Any]) -> tuple[File, Any]:
     left, op, right = re.fullmatch(r"([\w.]*) ?(:=|\+=|=) (.+)", patch).groups()  # type: ignore[union-attr]
     (target, index), *keys = re.fullmatch(r"([a-z]*)(\d*)", left.split(".")[0]).groups(), *left.split(".")[1:]  # type: ignore[union-attr]
     names = names | {"n": lambda i: len(file.chunks[i].payload), "c": list(getattr(file, "chunks", ()))}
-
-    def value(it: Any = None) -> Any:
-        return eval(right, names | {"it": it})
+    value = lambda it=None: eval(right, names | {"it": it})  # noqa: E731
 
     if target == "":
         return value(file), None
@@ -196,20 +173,14 @@ def _patched(file: File, patch: str, names: dict[str, Any]) -> tuple[File, Any]:
 
 
 def _set(fields: dict[int, Any], keys: list[int], value: Any) -> dict[int, Any]:
-    """A copy with another value at a path of keys and places; maps stay sorted."""
-    fields = copy.deepcopy(fields)
-    inner: Any = fields
+    """A copy with another value at a path of keys and places; None takes it out."""
+    fields = inner = copy.deepcopy(fields)
     for key in keys[:-1]:
         inner = inner[key]
-    new = value(inner.get(keys[-1]) if isinstance(inner, dict) else inner[keys[-1]])
-    if new is None:
+    inner[keys[-1]] = value(inner.get(keys[-1]) if isinstance(inner, dict) else inner[keys[-1]])
+    if inner[keys[-1]] is None:
         del inner[keys[-1]]
-        return fields
-    inner[keys[-1]] = new
-    if isinstance(inner, dict):
-        for key in sorted(inner):
-            inner[key] = inner.pop(key)
-    return fields
+    return dict(sorted(fields.items()))
 
 
 def _bytes(op: str, right: str, packed: bytes, value: Any) -> bytes:
@@ -223,47 +194,9 @@ def _bytes(op: str, right: str, packed: bytes, value: Any) -> bytes:
 # -- files that lines of the table share -------------------------------------------------------------------------------
 
 
-def three_layers(**fields: Any) -> File:
-    """Layers 0, 1 and 2 with anchors, rises and deformations of their own."""
-    first = make_layer(0, line(3), codes=[3, 77, 200], rows=pattern(11, 3))
-    second = make_layer(1, line(2, z=5), before=3, rises=[0, 1, 5], codes=[9, 255], grids=[Grid()])
-    k, rises = pattern(11, 1, seed=4), [252, 0, 50, 3, 0]
-    third = make_layer(2, line(1, z=9), before=5, below=2, rises=rises, grids=[Grid()], rows=k)
-    return make_file(first, second, third, **fields)
-
-
-def anchors(count: int = 3, header: Any = None, **fields: Any) -> File:
-    """Layer 0 with so many anchors in a row."""
-    return make_file(make_layer(0, line(count), **fields), header=header)
-
-
-def tables(*widths: int, n: int = 2, header: Any = None, **fields: Any) -> File:
-    """Rows of these widths in a scene of unknown kind, without chains."""
-    k = np.concatenate([pattern(width, n, seed=i) for i, width in enumerate(widths)])
-    return anchors(n, {3: [7], **(header or {})}, widths=widths, rows=k, chains={}, **fields)
-
-
 def deformed(*grids: Grid, number: int = 1, **fields: Any) -> File:
     """One anchor in layer 0, and a deformation in layer 1."""
     return make_file(make_layer(), make_layer(number, (), before=1, grids=grids, **fields))
-
-
-def take(file: File, *order: int) -> File:
-    """Some chunks of a file in some order, with the header's digest of the whole file."""
-    return replace(file, chunks=tuple(file.chunks[i] for i in order)).with_header({14: file.fields()[14]})
-
-
-def with_priors(priors: dict[int, Prior], k: np.ndarray | None = None) -> File:
-    """40 anchors of 68 channels, which are coded under these priors."""
-    return anchors(ROWS, widths=WIDE, rows=pattern(68, ROWS) if k is None else k, priors={"rows": priors})
-
-
-def of_highs(*highs: int) -> np.ndarray:
-    """Rows of 40 anchors, the first channels in -high..high, the others small."""
-    k = pattern(68, ROWS)
-    for c, high in enumerate(highs):
-        k[c] = pattern(ROWS, low=-high, high=high, seed=c)
-    return k
 
 
 def entries_at_limit(over: int = 0) -> File:
@@ -271,7 +204,8 @@ def entries_at_limit(over: int = 0) -> File:
 
     def file(last: int) -> File:
         own = [Prior(-(n >> 1), n, 200 + c) for c, n in enumerate([1 << 14] * 16 + [last])]
-        return with_priors({c: own[c if c < 17 else 0] for c in range(68)})
+        priors = {"rows": {c: own[c if c < 17 else 0] for c in range(68)}}
+        return make_file(make_layer(0, line(ROWS), widths=WIDE, rows=pattern(68, ROWS), priors=priors))
 
     return file(2 + entries_left(file(2).layer(0)) + over)
 
@@ -282,15 +216,6 @@ def entries_left(layer: Layer, later: int = 0) -> int:
     layer.written(known)
     symbols = (68 + 4) * (len(layer.cells) + later) + sum(map(np.size, layer.chains))
     return (1 << 18) + symbols - sum(prior.n for prior in known)
-
-
-def entries_of_slices(over: int) -> File:
-    """A first slice with windows of 2^18 entries, and a second one of as many as it may define, or `over` more."""
-    first = make_layer(0, line(1), widths=WIDE, rows=np.zeros((68, 1), np.int32), priors={"rows": {
-        c: Prior(min(c, 15) - 20, 1 << 14) for c in range(68)}})  # fmt: skip
-    wide = Prior(-20, entries_left(first, 1) + over)
-    return slices_of(first, later(0, line(1, z=4), widths=WIDE, rows=np.ones((68, 1), np.int32),
-        codes=[3], choose=lambda *_: wide))  # fmt: skip
 
 
 def large_products() -> File:
@@ -365,48 +290,3 @@ def over_base(over: int = 0) -> File:
     layer = make_layer(1, (), before=n, base=n, layer_rows=own, grids=grids, chains={})
     payload = layer.padded(len(pack(layer.parameters())) + size - len(layer.payload()))
     return blocks.adding(base, first, layer).with_chunk(1, payload=payload)
-
-
-def lzma_file(*layers: Layer, **how: Any) -> File:
-    """These layers in mode lzma."""
-    return make_file(*[layer.packed(**how) for layer in layers], header={2: LZMA})
-
-
-def every_chunk(data: bytes) -> bytes:
-    """An LZMA2 stream with chunks of every control byte."""
-    properties = [(3, 0, 2), (0, 4, 0), (2, 1, 3), (1, 3, 1)]
-    controls = [0xE0, 0x80, 2, 0x80, 0xA0, 0xC0, 2, 2, 0xA0, 0xE0, 0x80, 1, 2, 0xC0, 0x80]
-    sizes = [211 + 7 * i for i in range(len(controls) - 1)]
-    plan = list(zip(controls, [*sizes, len(data) - sum(sizes)], strict=True))
-    return lzma2.chunks(data, plan, properties)
-
-
-def later_resets(data: bytes) -> bytes:
-    """An LZMA2 stream that resets the dictionary behind large bytes, at places that are no multiples of 16."""
-    plan = [(0xE0, 1003), (0xE0, 501), (1, 203), (0xC0, 105), (1, 7), (0xE0, 702), (0xE0, len(data) - 2521)]
-    return lzma2.chunks(data, plan, [(4, 0, 4), (3, 1, 3), (2, 2, 1), (4, 0, 3), (1, 3, 2)])
-
-
-def lzma_text() -> Layer:
-    """Rows that repeat phrases at many distances."""
-    phrases = [pattern(9, low=0, high=9, seed=s).tolist() for s in range(6)]
-    text = [n for s in pattern(400, low=0, high=5, seed=8) for n in [*phrases[s][: 4 + s], int(s)]]
-    return make_layer(0, line(40), widths=WIDE, rows=np.resize(text, (68, 40)).astype(np.int32))
-
-
-def costly(which: int) -> File:
-    """A few hundred bytes that declare some 3 million symbols. 0: planes of one channel, to be predicted sample by
-    sample. 1: two stages of many cells, the dearest in memory."""
-    if which == 0:
-        return deformed(Grid(1, (4096, 256, 256, 256), (1,) * 6, constant(0)))
-    sides = ((4095, 5, 1, 16), (64, 256, 64, 256), (4095, 2, 2, 99))
-    return deformed(*[Grid(4, s, fill=constant(0), id=i) for i, s in enumerate(sides)])
-
-
-def exceptions() -> File:
-    """Exceptions at many places."""
-    k = pattern(68, ROWS)
-    k[0, [0, 7, 39]] = 90000, -M, M
-    k[1, :20], k[2, 39] = 12, -4
-    ends = {3: Prior(K - 1, 2), 4: Prior(-K), 5: Prior(K)}
-    return with_priors({0: blocks.SMALL, 1: blocks.SMALL, 2: Prior(-3, 20, 100), **ends}, k)
