@@ -59,8 +59,6 @@ examples:
   pd4dgs-train recordings/lesson -o lesson --segments 10s --iterations 3000
   torchrun --nproc-per-node=2 -m -- pd4dgs_codec train synthetic:local -o local.pt --views-per-step 2"""
 
-VIEW_PORT = 8080
-
 
 def parser() -> options.Parser:
     """Returns the parser. Options that are stored in a checkpoint default to None, so that conflicts are noticed."""
@@ -75,8 +73,6 @@ def parser() -> options.Parser:
     p.add("--device", "device to train on (default: auto)", choices=("auto", "cpu", "cuda"), default="auto")
     p.add("--resume FILE.pt", "continue from this checkpoint with its stored settings", options.named)
     p.add("--log FILE.jsonl", "log to write, one JSON object per step", options.named)
-    what = f"show the training in the browser at this port (default: {VIEW_PORT}; needs viser)"
-    p.add("--view PORT", what, options.port, nargs="?", const=VIEW_PORT)
     what = f"turn off a part of the method, see below (repeatable): {', '.join(ABLATIONS)}"
     p.add("--without PART", what, action="append", choices=tuple(ABLATIONS), default=[])
     parts = p.group("segments", "a long capture as a folder of files, see below")
@@ -142,7 +138,7 @@ def _train(args: argparse.Namespace, console: Console) -> int:
     progress, log = None, None
     if first:
         _announce(trainer, console)
-        progress = _progress(args, trainer)  # may fail, and an earlier log is kept then
+        progress = TrainingProgress()
         log = _prepare_log(args, trainer.iteration)
         remove_leftovers(args.output)
     try:
@@ -201,7 +197,7 @@ def check_usage(args: argparse.Namespace) -> None:
     segments = args.segments is not None
     options.conditional(args, segments, "needs --segments", overlap=0.0, part=None, whole=None, manifest=None)
     if segments:
-        options.conditional(args, False, "has no effect with --segments", log=None, view=None)
+        options.conditional(args, False, "has no effect with --segments", log=None)
         if (args.whole is None) == isinstance(args.part, int):
             raise UsageError("expected --part N and --whole FILE.pd4 together, or neither")
         if args.resume and not common.same_file(args.resume, args.output):
@@ -307,16 +303,6 @@ def _is_step_from(line: bytes, iteration: int) -> bool:
     except ValueError:
         return False
     return isinstance(record, dict) and isinstance(n := record.get("iteration"), int) and n >= iteration
-
-
-def _progress(args: argparse.Namespace, trainer: Trainer) -> TrainingProgress:
-    if args.view is None:
-        return TrainingProgress()
-    from pd4dgs_codec.cli.watch import WatchedProgress
-
-    progress = WatchedProgress(trainer, args.view)
-    say(f"watch the training at {progress.url}")
-    return progress
 
 
 def _announce(trainer: Trainer, console: Console) -> None:

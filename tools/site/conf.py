@@ -30,7 +30,7 @@ myst_heading_anchors = 4
 myst_enable_extensions = ["strikethrough"]
 
 # The site needs neither torch nor numba: what is not installed is a stand-in while docstrings are read.
-autodoc_mock_imports = "torch numba PIL imageio_ffmpeg matplotlib tqdm gsplat llvmlite fsspec pycolmap viser".split()
+autodoc_mock_imports = "torch numba PIL imageio_ffmpeg matplotlib tqdm gsplat llvmlite fsspec pycolmap".split()
 autodoc_member_order = "bysource"
 autodoc_default_options = {"members": True, "ignore-module-all": True}
 autodoc_preserve_defaults = True
