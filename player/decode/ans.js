@@ -28,7 +28,6 @@ export class AnsDecoder {
   symbols({ kmin, n, cum, index }, out, start, end) {
     if (n === 1) return void out.fill(kmin, start, end); // a table of one symbol does not change the state
     const words = this._words;
-    const available = words.length;
     let { _at: at, _th: th, _tl: tl, _q: q } = this;
     for (let i = start; i < end; i++) {
       const bucket = q >>> INDEX_SHIFT;
@@ -48,7 +47,7 @@ export class AnsDecoder {
       const low = (Math.imul(th, f) + carry) & LOW;
       th = (th * f + carry - low) / 16777216;
       tl = low;
-      if (th === 0 && tl < 256 && at < available) {
+      if (th === 0 && tl < 256 && at < words.length) {
         const word = words[at++];
         th = (tl << 8) | (q >>> 16);
         tl = ((q << 8) | (word >>> 24)) & LOW;

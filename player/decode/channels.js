@@ -6,8 +6,7 @@ import { limitExceeded, malformed, unsupported } from "./errors.js";
 import { MAX_CODED } from "./limits.js";
 import { Prior, normTable } from "./tables.js";
 
-const CONST = 0;
-const GAUSS = 1;
+/** The family of two Gaussians; family 1 has one, family 0 none. */
 const MIXTURE = 2;
 const FIRST_REUSE = 8;
 /** Symbols of a window. */
@@ -98,21 +97,18 @@ export class ChannelReader {
 
 /** 8.2. @param {ByteReader} codes @param {number} family @returns {Prior} */
 function readPrior(codes, family) {
-  if (family === CONST) return new Prior(codes.zigzag(MAX_CODED, "a constant"));
   if (family > MIXTURE) throw unsupported(`a prior of family ${family}`);
   const kmin = codes.zigzag(MAX_CODED, "the start of a window");
+  if (!family) return new Prior(kmin);
   const n = 2 + codes.varint(MAX_WINDOW - 2, "the length of a window");
   const last = kmin + n - 1;
   if (last > MAX_CODED) throw malformed(`a window up to symbol ${last}, limit ${MAX_CODED}`);
-  const normal = () => {
+  const [first, second] = Array.from({ length: family }, () => {
     const mean = codes.zigzag(2 ** 31, "the mean of a prior");
     return { mu8: mean + 128 * (n - 1), si: codes.varint(1920, "the width of a prior") - 640 };
-  };
-  const first = normal();
-  if (family === GAUSS) return new Prior(kmin, normTable(n, first));
-  const second = normal();
-  const weight = codes.byte("the weight of a mixture");
-  if (!weight) throw malformed("a mixture of weight 0");
+  });
+  const weight = second && codes.byte("the weight of a mixture");
+  if (weight === 0) throw malformed("a mixture of weight 0");
   return new Prior(kmin, normTable(n, first, second, weight));
 }
 

@@ -77,9 +77,8 @@ export function sha256(...parts) {
     state[6] += g;
     state[7] += h;
   }
-  const digest = new DataView(new ArrayBuffer(32));
-  state.forEach((word, i) => digest.setInt32(4 * i, word));
-  return new Uint8Array(digest.buffer);
+  state.forEach((word, i) => view.setInt32(4 * i, word));
+  return bytes.slice(0, 32);
 }
 
 /** @param {Uint8Array} bytes @returns {string} lower-case hexadecimal */

@@ -11,11 +11,7 @@ const ALL = 8;
 
 /** PATTERNS[k]: the bytes with k + 1 bits set, ascending. @type {number[][]} */
 const PATTERNS = Array.from({ length: ALL }, () => []);
-for (let byte = 1; byte < 256; byte++) {
-  let further = -1;
-  for (let rest = byte; rest; rest >>= 1) further += rest & 1;
-  PATTERNS[further].push(byte);
-}
+for (let byte = 1; byte < 256; byte++) PATTERNS[byte.toString(2).replaceAll("0", "").length - 1].push(byte);
 
 /** The voxel indices, [rows, 3], in Morton order of their offsets from the minimum. @param {ChannelReader} reader
  * @param {number} rows at least 1 */
