@@ -26,23 +26,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fuzzing.check import (
-    DECODED,
-    Answer,
-    Decoder,
-    Finding,
-    JavaScript,
-    check_memory,
-    check_package,
-    compare,
-    reference_decoder,
-)
+from fuzzing.check import DECODED, Answer, Decoder, Finding, JavaScript, check_memory, check_package, compare, reference
 from fuzzing.legal import Seed, seeds
-from fuzzing.mutate import make_case
+from fuzzing.mutate import Case, make_case
 from vectors import ROOT
 
 #: Those beside the package's. They are made in the process that asks them.
-DECODERS: dict[str, Callable[[], Decoder]] = {"refdec": lambda: reference_decoder, "javascript": JavaScript}
+DECODERS: dict[str, Callable[[], Decoder]] = {"refdec": lambda: reference, "javascript": JavaScript}
 NAMES = ("python", *DECODERS)
 COMPARED = {"refdec": 10, "javascript": 2}  #: every so many inputs, and every legal one
 MEASURED = 25  #: every so many inputs the peak memory is traced, which takes twice the time
@@ -66,10 +56,6 @@ class Figures:
         self.memory = max(self.memory, other.memory)
         self.findings += other.findings
 
-    def add_finding(self, index: int, kind: str, message: str, recipe: str) -> None:
-        """Count one of input `index`."""
-        self.findings.append({"input": index, "kind": kind, "message": message, "recipe": recipe})
-
     def text(self) -> str:
         """A table."""
         rows = [*sorted(self.counts.items()), ("faults under two names", self.differences.total())]
@@ -78,6 +64,11 @@ class Figures:
         lines += [f"{count} × {name}" for name, count in self.differences.most_common(10)]
         lines += [f"{r['input']} {r['kind']}: {r['message']} ({r['recipe']})" for r in self.findings[:20]]
         return "\n".join(lines)
+
+
+def row_of(index: int, finding: Finding, case: Case) -> dict[str, Any]:
+    """A finding in input number `index`."""
+    return {"input": index, "kind": finding.kind, "message": str(finding), "recipe": case.recipe}
 
 
 def examine(files: Sequence[Seed], run: int, index: int, decoders: dict[str, Decoder], every: bool = False) -> Figures:
@@ -89,20 +80,17 @@ def examine(files: Sequence[Seed], run: int, index: int, decoders: dict[str, Dec
     asked = {n: d for n, d in decoders.items() if every or legal or index % COMPARED.get(n, 1) == 0}
     try:
         own = check_package(case, random.Random(~index))
-        figures.counts[
-            "ends in " + (own.name if own.scene in ("", DECODED) else f"{own.name}, the scene {own.scene}")
-        ] += 1
+        scene = "" if own.scene in ("", DECODED) else f", the scene {own.scene}"
+        figures.counts[f"ends in {own.name}{scene}"] += 1
         answers = {"the writer": Answer(DECODED, case.meaning)} if legal else {}
-        answers |= {"python": own} | {
-            n: answer for n, d in asked.items() if (answer := d(case.data, case.base)) is not None
-        }
+        answers |= {"python": own} | {n: found for n, d in asked.items() if (found := d(case.data, case.base))}
         figures.counts.update(f"compared with {name}" for name in asked if name in answers)
         if difference := compare(answers):
             figures.differences[difference] += 1
         if index % MEASURED == 0:
             figures.memory = check_memory(case.data, case.base)
     except Finding as finding:
-        figures.add_finding(index, finding.kind, str(finding), case.recipe)
+        figures.findings.append(row_of(index, finding, case))
     return figures
 
 
@@ -133,9 +121,8 @@ def run_safely(files: Sequence[Seed], run: int, inputs: range, names: Sequence[s
                 yield reader.recv()
             except EOFError:
                 child.join()
-                figures, message = Figures(Counter(["inputs"])), f"the process ended with exit code {child.exitcode}"
-                figures.add_finding(index, "crash", message, make_case(files, run, index).recipe)
-                yield figures
+                crash = Finding("crash", f"the process ended with exit code {child.exitcode}")
+                yield Figures(Counter(["inputs"]), findings=[row_of(index, crash, make_case(files, run, index))])
                 break
         child.join()
         inputs = range(index + 1, inputs.stop)

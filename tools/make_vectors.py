@@ -33,28 +33,26 @@ def files(found: Vectors) -> dict[str, bytes]:
 
 def wrong_outcomes(found: Vectors) -> Iterator[str]:
     """One line per vector that the reference decoder does not decode as its table says."""
-    names = [row["file"] for row, _ in found]
-    yield from (f"{name}: two vectors have this name" for name in sorted(set(names)) if names.count(name) > 1)
-    of_name = {row["file"]: data for row, data in found}
+    of_name = dict[str, bytes]()
     for row, data in found:
+        name, expected = row["file"], row.get("error", row["layers"])
+        if of_name.setdefault(name, data) is not data:
+            yield f"{name}: two vectors have this name"
         try:
-            outcome: Any = refdec.hashes(data, base=of_name[row["base"]] if "base" in row else None)
+            outcome: Any = refdec.hashes(data, base=of_name.get(row.get("base", "")))
         except refdec.Fault as fault:
             outcome = fault.name
-        if outcome != row.get("error", row["layers"]):
-            yield f"{row['file']}: the reference decoder gives {outcome}, expected {row.get('error', row['layers'])}"
+        if outcome != expected:
+            yield f"{name}: the reference decoder gives {outcome}, expected {expected}"
 
 
 def differences(wanted: dict[str, bytes], folder: Path) -> Iterator[str]:
     """One line per file that is missing, different or not a vector."""
-    there = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.suffix in (".pd4", ".json")}
-    for name in sorted(there - set(wanted)):
-        yield f"{name}: unexpected file"
+    there = {p.relative_to(folder).as_posix(): p for p in folder.rglob("*") if p.suffix in (".pd4", ".json")}
+    yield from (f"{name}: unexpected file" for name in sorted(there.keys() - wanted))
     for name, content in wanted.items():
-        if name not in there:
-            yield f"{name}: missing"
-        elif (folder / name).read_bytes() != content:
-            yield f"{name}: bytes differ"
+        if name not in there or there[name].read_bytes() != content:
+            yield f"{name}: {'bytes differ' if name in there else 'missing'}"
 
 
 def write(wanted: dict[str, bytes], folder: Path) -> None:
@@ -71,17 +69,15 @@ def main() -> int:
     """Entry point; returns the exit code."""
     parser = argparse.ArgumentParser(description="Write or check the conformance vectors.")
     parser.add_argument("--check", action="store_true", help="compare with the existing files, write nothing")
-    arguments = parser.parse_args()
-    found = list(vectors())
+    check, found = parser.parse_args().check, list(vectors())
     wanted = files(found)
-    lines = list(differences(wanted, VECTORS) if arguments.check else wrong_outcomes(found))
-    for line in lines:
-        print(line, file=sys.stderr)
+    lines = list(differences(wanted, VECTORS) if check else wrong_outcomes(found))
     if lines:
+        print(*lines, sep="\n", file=sys.stderr)
         return 1
-    if not arguments.check:
+    if not check:
         write(wanted, VECTORS)
-    print(f"{len(found)} vectors, {sum(map(len, wanted.values()))} bytes {'checked' if arguments.check else 'written'}")
+    print(f"{len(found)} vectors, {sum(map(len, wanted.values()))} bytes {'checked' if check else 'written'}")
     return 0
 
 

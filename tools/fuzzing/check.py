@@ -188,7 +188,7 @@ def _other_entry_point(data: bytes, base: bytes | None, name: str, result: Any, 
 # -- the other decoders ------------------------------------------------------------------------------------------------
 
 
-def reference_decoder(data: bytes, base: bytes | None) -> Answer | None:
+def reference(data: bytes, base: bytes | None) -> Answer | None:
     """That of the specification; None for an input that would take long."""
     if sum(declared(part)[0] for part in (data, base or b"")) > REFERENCE_SYMBOLS:
         return None

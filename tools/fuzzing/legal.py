@@ -13,30 +13,15 @@ import itertools
 import json
 import random
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from vectors import ROOT, lzma2, refdec
-from vectors.blocks import (
-    ANS,
-    LZMA,
-    Choice,
-    File,
-    Grid,
-    Layer,
-    Prior,
-    adding,
-    ancillary,
-    make_file,
-    make_layer,
-    morton_order,
-    ordered,
-    pack,
-    read_file,
-)
+from vectors import ROOT, blocks, lzma2, refdec
+from vectors.blocks import File, Grid, Layer, Prior, make_layer
 
 from pd4dgs_codec.errors import DecodeError
 from pd4dgs_codec.format.info import hashes
@@ -70,21 +55,15 @@ def valid_vectors() -> list[Seed]:
 
 
 def seeds(paths: Sequence[Path] = (), built: int = 60) -> list[Seed]:
-    """The files at `paths` (or in them, if folders; those that do not decode are left out), small vectors, and `built`
-    random files."""
-    files = [file for path in paths for file in (sorted(path.rglob("*.pd4")) if path.is_dir() else [path])]
-    found = [*(Seed(file.stem, file.read_bytes()) for file in files), *valid_vectors()]
+    """`built` random files, the files at `paths` (or in them, if folders) that decode, and small vectors."""
     made = [(file.data(), base and base.data()) for file, base in map(numbered, range(built))]
-    return [*(Seed(f"legal-{i}", *own) for i, own in enumerate(made)), *filter(decodes, found)]
-
-
-def decodes(seed: Seed) -> bool:
-    """Whether the package decodes a file."""
-    try:
-        hashes(seed.data, base=seed.base)
-    except DecodeError:
-        return False
-    return True
+    found = [Seed(f"legal-{i}", *own) for i, own in enumerate(made)]
+    for file in (file for path in paths for file in (sorted(path.rglob("*.pd4")) if path.is_dir() else [path])):
+        data = file.read_bytes()
+        with suppress(DecodeError):
+            hashes(data)
+            found.append(Seed(file.stem, data))
+    return found + valid_vectors()
 
 
 # -- numbers and priors ------------------------------------------------------------------------------------------------
@@ -119,7 +98,7 @@ def step(rng: random.Random, values: Sequence[np.ndarray], most: int = 1) -> flo
     return rng.choice((LEAST, 2.0**-7, *map(float, single)))
 
 
-def chooser(rng: random.Random, known: list[Prior], most: int) -> Choice:
+def chooser(rng: random.Random, known: list[Prior], most: int) -> blocks.Choice:
     """Chooses priors for the channels of a slice, also of those that the list has. most: entries of the list."""
     alike = rng.random()  # how often a channel has a prior of the list
 
@@ -170,7 +149,7 @@ def all_tables() -> list[Tables]:
     """Those of the small vectors without large grids, and of which no base has a part."""
     found = list[Tables]()
     for seed in valid_vectors():
-        file = read_file(seed.data)
+        file = blocks.read_file(seed.data)
         layers = {c.type: {k: v for k, v in c.layer.meta.items() if 3 < k < 8} for c in file.chunks[::-1] if c.layer}
         samples = sum(np.prod(s) for x in layers.values() for grid in grids_of(x) for s in grid.shapes())
         if 15 not in file.header and samples <= LARGEST_GRIDS:
@@ -216,7 +195,7 @@ class Maker:
         if rng.random() < 0.5:
             vary(rng, self.tables)
         self.base, self.adds, self.base_rows = base, False, 0  # rows of the base that it adds to
-        self.mode = LZMA if rng.random() < 0.1 else ANS
+        self.mode = blocks.LZMA if rng.random() < 0.1 else blocks.ANS
         self.table = [[i, c, 1.0, rng.randrange(3)] for i, c, _, _ in self.tables.rows]
         width = sum(c for _, c, _, _ in self.table)
         self.centres = symbols(rng, width).tolist() if rng.random() < 0.4 else None
@@ -232,7 +211,7 @@ class Maker:
         made.table, made.base, made.adds = copy.deepcopy(self.table), False, True
         made.codes, made.classes = self.of_base
         made.symbols = len(made.codes) * (4 + (made.centres is not None) + sum(c for _, c, _, _ in made.table))
-        made.base_rows, made.mode = len(made.codes), LZMA if self.rng.random() < 0.1 else ANS
+        made.base_rows, made.mode = len(made.codes), blocks.LZMA if self.rng.random() < 0.1 else blocks.ANS
         return made
 
     def cells(self, count: int) -> list[list[int]]:
@@ -251,7 +230,7 @@ class Maker:
             if {-V, V} <= {cell[axis] for cell in found}:
                 found = {cell for cell in found if cell[axis] < V}
         self.taken |= found
-        return ordered(sorted(found))
+        return blocks.ordered(sorted(found))
 
     def rows(self, classes: list[int], table: Sequence[Sequence[Any]], centres: Sequence[int]) -> list[np.ndarray]:
         """int32 [C, n] of each of these tensors, in rows of these step classes."""
@@ -260,7 +239,10 @@ class Maker:
             k = symbols(self.rng, width, len(classes), most=few)
             own, centres = centres[:width] or [0] * width, centres[width:]
             for channel, centre in zip(k, own, strict=True):
-                while not _in_range(channel, classes, centre, predictor):
+                while True:
+                    with suppress(refdec.Fault):  # of symbols that lead to values out of their range
+                        refdec.row_values(channel.tolist(), classes, centre, predictor)
+                        break
                     channel[:] = channel / 2  # 0 in the end
             made.append(k)
         return made
@@ -338,22 +320,14 @@ def legal(rng: random.Random) -> tuple[File, File | None, bool]:
     return (made(rng, maker.over(), file), file, scene) if maker.base else (file, None, scene)
 
 
-def _in_range(k: np.ndarray, classes: list[int], centre: int, predictor: int) -> bool:
-    """Whether these symbols lead to legal values."""
-    try:
-        return refdec.row_values(k.tolist(), classes, centre, predictor) is not None
-    except refdec.Fault:
-        return False
-
-
 def made(rng: random.Random, maker: Maker, base: File | None = None) -> File:
     """A file of a maker, whose base is another one."""
     layers = list[Layer]()
     for number in sorted(maker.tables.layers):
         known = list[Prior]()
-        count = 1 if maker.mode == LZMA else rng.choice((1, 1, 2, 3, rng.choice((5, 12))))
+        count = 1 if maker.mode == blocks.LZMA else rng.choice((1, 1, 2, 3, rng.choice((5, 12))))
         own = [maker.slice(number, not index, known) for index in range(count)]
-        order = morton_order(np.concatenate([x.cells for x in own]))
+        order = blocks.morton_order(np.concatenate([x.cells for x in own]))
         codes = np.concatenate([x.codes for x in own])[order]
         classes = np.concatenate([x.codes * 0 if x.classes is None else x.classes for x in own])[order]
         raised = maker.codes + own[0].rises if number else maker.codes * (1 - own[0].rises)
@@ -361,14 +335,16 @@ def made(rng: random.Random, maker: Maker, base: File | None = None) -> File:
         if number == 0:
             maker.of_base = maker.codes, maker.classes
         layers += own
-    if maker.mode == LZMA:
+    if maker.mode == blocks.LZMA:
         how = {"base": rng.choice((0, 0, None, K, -K, 1000)), "stream": rng.choice((lzma2.stored, lzma2.packed))}
         layers = [layer.packed(**how, width=rng.choice((None, 2))) for layer in layers]  # type: ignore[arg-type]
     header = maker.header(layers)
     if base is None:
-        file = make_file(*layers, header=header)
+        file = blocks.make_file(*layers, header=header)
     else:
-        file = adding(base, *layers, header={key: value for key, value in header.items() if key not in range(3, 7)})
+        file = blocks.adding(
+            base, *layers, header={key: value for key, value in header.items() if key not in range(3, 7)}
+        )
     if rng.random() < 0.2 and not maker.base:  # it ends after any slice
         whole = file.fields()[14]
         file = replace(file, chunks=file.chunks[: rng.randint(1, len(file.chunks))]).with_header({14: whole})
@@ -391,10 +367,10 @@ def _with_what_is_ignored(rng: random.Random, file: File) -> File:
     if rng.random() < 0.3:
         at = rng.randrange(len(file.chunks))
         layer = file.layer(at)
-        packed = pack({**layer.parameters(), rng.choice((64, 70000)): rng.choice(extra)})
+        packed = blocks.pack({**layer.parameters(), rng.choice((64, 70000)): rng.choice(extra)})
         file = file.with_chunk(at, payload=layer.payload(packed))
     chunks = list(file.chunks)
     while rng.random() < 0.3:
         kind, size = rng.choice((3, 4, 1 << 15, 65535, rng.randint(3, 65535))), rng.choice((0, 1, 30, 500))
-        chunks.insert(rng.randint(1, len(chunks)), ancillary(kind, rng.randbytes(size)))
+        chunks.insert(rng.randint(1, len(chunks)), blocks.ancillary(kind, rng.randbytes(size)))
     return replace(file, chunks=tuple(chunks))
