@@ -15,7 +15,7 @@ import random
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -98,17 +98,14 @@ def step(rng: random.Random, values: Sequence[np.ndarray], most: int = 1) -> flo
     return rng.choice((LEAST, 2.0**-7, *map(float, single)))
 
 
-def chooser(rng: random.Random, known: list[Prior], most: int) -> blocks.Choice:
-    """Chooses priors for the channels of a slice, also of those that the list has. most: entries of the list."""
-    alike = rng.random()  # how often a channel has a prior of the list
-
-    def choose(piece: str, number: int, k: list[int]) -> Prior:
-        left = most - sum(prior.n for prior in known)
-        if known and (rng.random() < alike or left < 2):
-            return rng.choice(known)
-        return prior(rng, min(k), max(k), min(left, 1 << 14))
-
-    return choose
+def choice(
+    rng: random.Random, known: list[Prior], most: int, alike: float, piece: str, number: int, k: list[int]
+) -> Prior:
+    """The prior of a channel of symbols k. most: entries of the list; alike: how often it is one that the list has."""
+    left = most - sum(prior.n for prior in known)
+    if known and (rng.random() < alike or left < 2):
+        return rng.choice(known)
+    return prior(rng, min(k), max(k), min(left, 1 << 14))
 
 
 def prior(rng: random.Random, low: int, high: int, most: int) -> Prior:
@@ -134,14 +131,8 @@ def _normal(rng: random.Random, n: int) -> tuple[int, int]:
 # -- tables ------------------------------------------------------------------------------------------------------------
 
 
-@dataclass
-class Tables:
-    """Of a file: its kind, tensors of rows and, by layer, parameters 4 to 7. scene: whether they make one."""
-
-    kind: list[int]
-    rows: list[list[Any]]
-    layers: dict[int, dict[int, Any]]
-    scene: bool
+#: Kind of a file, its tensors of rows, by layer its parameters 4 to 7, and whether they make a scene.
+Tables = tuple[list[int], list[list[Any]], dict[int, dict[int, Any]], bool]
 
 
 @cache
@@ -153,7 +144,7 @@ def all_tables() -> list[Tables]:
         layers = {c.type: {k: v for k, v in c.layer.meta.items() if 3 < k < 8} for c in file.chunks[::-1] if c.layer}
         samples = sum(np.prod(s) for x in layers.values() for grid in grids_of(x) for s in grid.shapes())
         if 15 not in file.header and samples <= LARGEST_GRIDS:
-            found.append(Tables(file.header[3], file.header[4], layers, seed.scene))
+            found.append((file.header[3], file.header[4], layers, seed.scene))
     return found
 
 
@@ -162,15 +153,14 @@ def grids_of(meta: dict[int, Any]) -> list[Grid]:
     return [Grid(channels, tuple(sides), id=i) for i, channels, sides, _ in meta.get(4, [0])[1:]]
 
 
-def vary(rng: random.Random, tables: Tables) -> None:
-    """Gives tensors other sizes, still legal."""
-    tables.scene = False
+def vary(rng: random.Random, kind: list[int], rows: list[list[Any]], layers: dict[int, dict[int, Any]]) -> None:
+    """Gives tensors other sizes, still legal, in place."""
     if rng.random() < 0.5:
         parameters = [near(rng, 0, 65535) for _ in range(rng.choice((0, 0, 1, 2, 15)))]
-        tables.kind = [rng.choice((0, 1, 2, 65535)), *parameters]
-    for row in tables.rows if rng.random() < 0.5 else ():
+        kind[:] = [rng.choice((0, 1, 2, 65535)), *parameters]
+    for row in rows if rng.random() < 0.5 else ():
         row[1] = rng.choices((1, 3, 16), (6, 6, 1))[0]
-    for meta in tables.layers.values():
+    for meta in layers.values():
         for grid in meta.get(4, [0])[1:]:
             if rng.random() < 0.4:
                 sides = [rng.choices((1, 2, 3, 5, 40), (8, 8, 8, 4, 1))[0] for _ in range(rng.randint(1, 4))]
@@ -191,12 +181,13 @@ class Maker:
     """Makes the slices of a file. base: whether others add to its layer 0."""
 
     def __init__(self, rng: random.Random, base: bool = False):
-        self.rng, self.tables = rng, copy.deepcopy(rng.choice(all_tables()))
+        self.rng, (self.kind, rows, self.layers, self.scene) = rng, copy.deepcopy(rng.choice(all_tables()))
         if rng.random() < 0.5:
-            vary(rng, self.tables)
+            self.scene = False
+            vary(rng, self.kind, rows, self.layers)
         self.base, self.adds, self.base_rows = base, False, 0  # rows of the base that it adds to
         self.mode = blocks.LZMA if rng.random() < 0.1 else blocks.ANS
-        self.table = [[i, c, 1.0, rng.randrange(3)] for i, c, _, _ in self.tables.rows]
+        self.table = [[i, c, 1.0, rng.randrange(3)] for i, c, _, _ in rows]
         width = sum(c for _, c, _, _ in self.table)
         self.centres = symbols(rng, width).tolist() if rng.random() < 0.4 else None
         self.layer_table = list[Any]()  # of the layer
@@ -266,7 +257,7 @@ class Maker:
 
     def slice(self, number: int, first: bool, known: list[Prior]) -> Layer:
         """One slice, which refers to the priors of those before."""
-        rng, meta = self.rng, self.tables.layers[number] if first and (number or not self.adds) else {}
+        rng, meta = self.rng, self.layers[number] if first and (number or not self.adds) else {}
         if first:
             own = () if self.base and number == 0 else meta.get(7, ())
             self.layer_table = [[i, c, q if q == 1 else step(rng, (), M), rng.randrange(3)] for i, c, q, _ in own]
@@ -288,7 +279,7 @@ class Maker:
             widths=[c for _, c, _, _ in self.table], classes=classes if graded else None, earlier=earlier, fill=fill,
             layer_rows={row[0]: k for row, k in zip(self.layer_table, layer_rows, strict=True)}, grids=grids,
             chains=chains, steps=(step(rng, planes), step(rng, weights)), base=self.base_rows if first else 0,
-            choose=chooser(rng, known, self.symbols + (1 << 18)), known=known, first=first,
+            choose=partial(choice, rng, known, self.symbols + (1 << 18), rng.random()), known=known, first=first,
         )  # fmt: skip
         extra = {6: meta.get(6), 7: self.layer_table if first else None}
         own = {key: value for key, value in layer.meta.items() if key < 6}
@@ -300,7 +291,7 @@ class Maker:
         for i, row in enumerate(self.table):  # centres and the rows before add to symbols; others may add rows
             most = M if self.centres is not None or row[3] or self.base else 1
             row[2] = step(rng, [x.rows[i] for x in layers], most)
-        header: dict[int, Any] = {2: self.mode, 3: self.tables.kind, 4: self.table, 5: self.centres}
+        header: dict[int, Any] = {2: self.mode, 3: self.kind, 4: self.table, 5: self.centres}
         header[6] = step(rng, [x.cells for x in layers], V if self.base else 1)
         if rng.random() < 0.3:
             box = sorted(rng.choice((-LARGEST, -1.0, -0.0, 2.0**-149, LARGEST)) for _ in range(2))
@@ -316,14 +307,14 @@ def legal(rng: random.Random) -> tuple[File, File | None, bool]:
     """(a file of random layers, slices, tables and priors, its base if it has one, whether it is sure to make a scene).
     `File.hashes` says what it decodes to."""
     maker = Maker(rng, rng.random() < 0.25)
-    file, scene = made(rng, maker), maker.tables.scene
+    file, scene = made(rng, maker), maker.scene
     return (made(rng, maker.over(), file), file, scene) if maker.base else (file, None, scene)
 
 
 def made(rng: random.Random, maker: Maker, base: File | None = None) -> File:
     """A file of a maker, whose base is another one."""
     layers = list[Layer]()
-    for number in sorted(maker.tables.layers):
+    for number in sorted(maker.layers):
         known = list[Prior]()
         count = 1 if maker.mode == blocks.LZMA else rng.choice((1, 1, 2, 3, rng.choice((5, 12))))
         own = [maker.slice(number, not index, known) for index in range(count)]

@@ -85,24 +85,22 @@ class Prior:
     mixed: tuple[int, int, int] | None = None
 
     @property
-    def family(self) -> int:
-        return 0 if self.n == 1 else 1 if self.mixed is None else 2
+    def normals(self) -> list[tuple[int, int]]:
+        """si and g of each Gaussian; their number is that of the family."""
+        return [] if self.n == 1 else [(self.si, self.g), *([self.mixed[:2]] if self.mixed else [])]
 
     def parameters(self) -> bytes:
         if self.n == 1:
             return zigzag(self.kmin)
-        one = zigzag(self.kmin) + varint(self.n - 2) + zigzag(self.g) + varint(self.si + 640)
-        return one + zigzag(self.mixed[1]) + varint(self.mixed[0] + 640) + bytes([self.mixed[2]]) if self.mixed else one
+        normals = b"".join(zigzag(g) + varint(si + 640) for si, g in self.normals)
+        return zigzag(self.kmin) + varint(self.n - 2) + normals + bytes(self.mixed[2:] if self.mixed else ())
 
     @cached_property
     def cum(self) -> list[int]:
         """Clauses 7.2 to 7.4."""
-        middle = 128 * (self.n - 1)
-        cdf = norm_cdf(self.n, middle + self.g, self.si)
-        if self.mixed:
-            si, g, w = self.mixed
-            cdf = [(256 - w) * a + w * b >> 8 for a, b in zip(cdf, norm_cdf(self.n, middle + g, si), strict=True)]
-        return table_of(cdf)
+        cdf, *other = (norm_cdf(self.n, 128 * (self.n - 1) + g, si) for si, g in self.normals)
+        w = self.mixed[2] if self.mixed else 0
+        return table_of([(256 - w) * a + w * b >> 8 for a, b in zip(cdf, *(other or [cdf]), strict=True)])
 
 
 SMALL = Prior(-3, 7)
@@ -145,7 +143,7 @@ class Coder:
                 out += varint(2 * (8 + defined[::-1].index(prior)) + bool(places))
             else:
                 defined.append(prior)
-                out += varint(2 * prior.family + bool(places)) + prior.parameters()
+                out += varint(2 * len(prior.normals) + bool(places)) + prior.parameters()
             out += varint(len(places) - 1) if places else b""
             for last, at in zip([-1, *places], places):  # noqa: B905
                 out += varint(at - last - 1, 2 * (k[at] - end) if k[at] >= end else 2 * (low - 1 - k[at]) + 1)
@@ -313,19 +311,19 @@ class Layer:
     def written(self, known: list[Prior] | None = None) -> Layer:
         """With its codes and its stream in mode ans. known: the prior list of the slices before, which it extends."""
         coder = Coder([] if known is None else known, self.choose)
-        head, channels = (b"", []) if not len(self.cells) else self.tree or octree(self.cells)
-        pieces = {"positions": head + coder.codes("positions", channels)}
-        for piece, channels in self.channels().items():
-            if piece == "grids":
-                channels = [*grid_channels(self.residuals)]
-            elif piece == "rows" and self.classes is not None:
-                channels = [channel[self.classes == q] for channel in channels for q in range(7)]
-            elif piece == "layer_rows" and channels:
-                classes = 0 if self.classes is None else np.append(self.earlier, self.classes)
-                of_base = np.arange(channels[0].size) < self.base
-                channels = [channel[own & (classes == q)] for channel in channels for own in (of_base, ~of_base)
-                    for q in range(1 if self.classes is None else 7)]  # fmt: skip
-            pieces[piece] = coder.codes(piece, channels)
+        head, tree = (b"", []) if not len(self.cells) else self.tree or octree(self.cells)
+        channels = {"positions": tree, **self.channels(), "grids": [*grid_channels(self.residuals)]}
+        if self.classes is not None:
+            channels["rows"] = [channel[self.classes == q] for channel in channels["rows"] for q in range(7)]
+        if self.layer_rows:
+            classes = 0 if self.classes is None else np.append(self.earlier, self.classes)
+            of_base = np.arange(self.layer_rows[0].shape[1]) < self.base
+            parts = [
+                own & (classes == q) for own in (of_base, ~of_base) for q in range(1 if self.classes is None else 7)
+            ]
+            channels["layer_rows"] = [channel[part] for channel in channels["layer_rows"] for part in parts]
+        pieces = {piece: coder.codes(piece, own) for piece, own in channels.items()}
+        pieces["positions"] = head + pieces["positions"]
         return replace(self, pieces=pieces, stream=coder.stream())
 
     def packed(

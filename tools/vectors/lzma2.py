@@ -37,22 +37,20 @@ def chunks(
     bytes of each compressed chunk."""
     out, encoder, start, given = bytearray(), _Encoder(data), 0, iter(properties)
     for control, size in plan:
-        head = (size - 1 & 0xFFFF).to_bytes(2, "big")
+        head, content = (size - 1 & 0xFFFF).to_bytes(2, "big"), data[start : start + size]
         if control in (STORED_RESET, ALL_RESET):
             encoder.origin = start
             encoder.reach = 0 if remember else start
-        if control < KEPT:
-            out += bytes([control]) + head + data[start : start + size]
-        else:
-            if control >= PROPERTIES_READ:
-                encoder.lc, encoder.lp, encoder.pb = next(given)
+        if control >= PROPERTIES_READ:
+            encoder.lc, encoder.lp, encoder.pb = next(given)
+        if control >= KEPT:
             if control >= STATE:
                 encoder.reset()
-            written = body(encoder.encode(start, start + size))
-            code = [encoder.lc + 9 * (encoder.lp + 5 * encoder.pb)] if control >= PROPERTIES_READ else []
-            out += (
-                bytes([control | size - 1 >> 16]) + head + (len(written) - 1).to_bytes(2, "big") + bytes(code) + written
-            )
+            content = body(encoder.encode(start, start + size))
+            head += (len(content) - 1).to_bytes(2, "big")
+        if control >= PROPERTIES_READ:
+            head += bytes([encoder.lc + 9 * (encoder.lp + 5 * encoder.pb)])
+        out += bytes([control | size - 1 >> 16]) + head + content
         start += size
     return bytes(out) + b"\0"
 
