@@ -9,7 +9,6 @@ predictors, slices, voxels, steps, what may be ignored.
 from __future__ import annotations
 
 import copy
-import itertools
 import json
 import random
 from collections.abc import Callable, Sequence
@@ -252,8 +251,8 @@ class Maker:
 
     def chain(self, widths: Sequence[int]) -> list[np.ndarray]:
         """Weight, bias, weight, .. from the input side."""
-        shapes = [shape for pair in itertools.pairwise(widths) for shape in (pair[::-1], pair[1:])]
-        return [symbols(self.rng, *shape, most=self.rng.choice((M, M, 9))) for shape in shapes]
+        arrays = blocks.constant_chain(widths, 0)
+        return [symbols(self.rng, *k.shape, most=self.rng.choice((M, M, 9))) for k in arrays]
 
     def slice(self, number: int, first: bool, known: list[Prior]) -> Layer:
         """One slice, which refers to the priors of those before."""
