@@ -183,8 +183,11 @@ class Learner(TrainState):
             if parameter.grad is None:
                 parameter.grad = torch.zeros_like(parameter)
             parameter.grad.add_(gradient.to(parameter.device), alpha=share)
-        if level and self.guiding:
-            self.optimiser.keep_gradients({p for f in self.model.deformations.values() for p in f.motion_parameters()})
+        fields = self.model.deformations.values()
+        if level and self.coarse:
+            self.optimiser.keep_gradients(set(self.optimiser.parameters) - {p for f in fields for p in f.parameters()})
+        elif level and self.guiding:
+            self.optimiser.keep_gradients({p for f in fields for p in f.motion_parameters()})
         record["loss"] = float(loss.detach()) + rest.loss
         record |= {name: float(value.detach()) for name, value in terms.items()} | rest.terms
         return picture

@@ -2,9 +2,9 @@
 
 With a key instant t*, level 0 is the scene at t*, and higher levels add F(x, t) - F(x, t*). The levels then agree, so
 most steps train the highest level, from views whose times spread from t* (`phases.opening`). The first steps have no
-deformation yet and see only views near t*: with views of all times, moving objects would fade. Later a share of the
-steps trains level 0, from views near t* or from any view, without the pixels that motion has changed, so that level 0
-shows static content completely.
+deformation yet and see only views near t*: with views of all times, moving objects would fade, unless bodies are
+followed (`phases.follow`). Later a share of the steps trains level 0, from views near t* or from any view, without the
+pixels that motion has changed, so that level 0 shows static content completely.
 
 The paper's rollouts have no key instant: level 0 learns the mean over time.
 """
@@ -47,8 +47,8 @@ GLOBAL_ODDS = 0.1
 def draw_levels(state: TrainState) -> tuple[tuple[int, ...], Probabilities]:
     """The levels of this step, ascending, and the probabilities of levels 0, 1, 2 that they were drawn with."""
     rollout, top = state.config.rollout, state.model.level
-    if state.position < state.schedule.coarse_end and not state.model.frozen:
-        return (0,), LOWEST
+    if state.coarse:
+        return ((top,), TOP) if state.placing else ((0,), LOWEST)
     if rollout == "all":
         return tuple(range(top + 1)), (1.0, 1.0, 1.0)
     if rollout == "top":

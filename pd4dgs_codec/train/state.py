@@ -153,11 +153,11 @@ class TrainState:
     iteration: steps done, skipped ones included. skipped: steps whose loss or gradient was not finite.
     share: in a timed run the share of the schedule that is done, 0..1, set by Trainer; None otherwise.
     statistics: [N] or [N, slots] per anchor, on which growing depends, see `fresh_statistics`.
-    tracks: of what moves, until `phases.follow` has used them; none if `start` was given.
+    tracks: of what moves, for `phases.follow`; none if `start` was given.
     order: training views drawn and not yet used, the next one last.
     rho: moving average of how much the masks of levels 0 and 2 differ.
     practising: a trial is running; all views and pixels train level 0, see `phases.levels`.
-    opened: all views train motion, see `phases.opening`.
+    opened: all views train motion, see `phases.opening`. placing: all views train anchors before, see `phases.follow`.
     guided: points of what moves were found, and it is most of what views show, see `phases.matching`.
     """
 
@@ -189,7 +189,7 @@ class TrainState:
         self.statistics = fresh_statistics(len(start.anchor_q), config.slots)
         self.iteration = self.skipped = 0
         self.share: float | None = None
-        self.rho, self.practising, self.opened, self.guided = 0.0, False, False, False
+        self.rho, self.practising, self.opened, self.placing, self.guided = 0.0, False, False, False, False
         self.order: list[int] = []
         self._before = -1  #: the previous step's position; a timed run may advance by more than one
 
@@ -213,6 +213,11 @@ class TrainState:
     def steps_in(self, share: float) -> int:
         """How many steps a share of the run takes at its pace so far; in a timed run, N only estimates this pace."""
         return round(share * self.iteration / max(self.schedule.progress(self.position), 1e-9))
+
+    @property
+    def coarse(self) -> bool:
+        """Whether nothing teaches motion at this step."""
+        return self.position < self.schedule.coarse_end and not self.model.frozen
 
     @property
     def guiding(self) -> bool:
@@ -297,8 +302,8 @@ class TrainState:
             "share": self.share or 0.0,
             "passed": self._before,
             "rho": self.rho,
-            "tracks": [list(track) for track in self.tracks],
             "opened": self.opened,
+            "placing": self.placing,
             "guided": self.guided,
             "skipped": self.skipped,
             "order": self.order,
@@ -343,9 +348,9 @@ class TrainState:
         self.schedule = Schedule(int(state["total"]) or None)
         if self.share is not None:
             self.share, self._before = float(state["share"]), int(state["passed"])
-        self.rho, self.opened, self.guided = float(state["rho"]), bool(state["opened"]), bool(state["guided"])
+        self.rho, self.guided = float(state["rho"]), bool(state["guided"])
+        self.opened, self.placing = bool(state["opened"]), bool(state["placing"])
         self.order = [int(index) for index in state["order"]]
-        self.tracks = [Track(*parts) for parts in state["tracks"]]
 
 
 def fresh_statistics(anchors: int, slots: int) -> dict[str, Tensor]:

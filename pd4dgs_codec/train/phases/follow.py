@@ -1,7 +1,8 @@
 """Teaches motion what `train.following` found, before pictures of other instants do.
 
 A picture teaches motion only where a body's picture and its image overlap. The tracks say where a body is at each
-instant: the deformations first learn them alone, which takes no picture. Then all views take part at once.
+instant: the deformations first learn them alone, which takes no picture. Then all views take part at once. If those
+near the key instant see the scene from one side, which tells little of depth, all views place the anchors, too.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -16,26 +18,37 @@ from pd4dgs_codec.train import phases
 from pd4dgs_codec.train.following import Track
 from pd4dgs_codec.train.movers import CELLS
 from pd4dgs_codec.train.optimiser import Optimiser
+from pd4dgs_codec.train.rollout import near_key
 from pd4dgs_codec.train.state import TrainState
 
 #: Steps that teach the tracks alone; points of each body in a step, and anchors that stay.
 STEPS, POINTS, STAYING = 400, 60, 400
+#: Views near the key instant see the scene from one side if their directions have less than this share of the spread of
+#: all. Where a camera goes by or around once they have 0 to 0.04, where it sweeps or jumps 0.26 or more.
+ONE_SIDE = 1 / 8
 
 
 class Follow(phases.Phase):
-    """Teaches motion the tracks of what moves, at the end of the coarse phase."""
+    """Teaches motion the tracks of what moves, before the first step."""
 
     def due(self, state: TrainState) -> bool:
-        """At the end of the coarse phase, if there is a key instant."""
-        return state.key is not None and phases.long_enough(state) and state.reached(state.schedule.coarse_end)
+        """Before the first step, if there is a key instant."""
+        return state.key is not None and state.iteration == 0
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
-        """Teaches the tracks; sets `TrainState.opened` if there are any."""
-        tracks, state.tracks = state.tracks, []
-        record["bodies"] = len(tracks)
-        if tracks:
-            teach(state, tracks)
-            state.opened = True
+        """Teaches the tracks; sets `TrainState.opened` if there are any, and `TrainState.placing`."""
+        record["bodies"] = len(state.tracks)
+        if state.tracks:
+            teach(state, state.tracks)
+            state.opened, views = True, list(range(len(state.views)))
+            state.placing = _spread(state, near_key(state, views)) < ONE_SIDE * _spread(state, views)
+
+
+def _spread(state: TrainState, among: Sequence[int]) -> float:
+    """0..1: the spread of the directions in which views see the middle of the scene, 1 less their mean's length."""
+    viewmats = np.stack([state.views.views[index].viewmat for index in among]).astype(np.float64)
+    ways = viewmats[:, :3, :3].transpose(0, 2, 1) @ viewmats[:, :3, 3:] + np.mean(state.dataset.box, axis=0)[:, None]
+    return 1 - float(np.linalg.norm((ways / np.linalg.norm(ways, axis=1, keepdims=True)).mean(axis=0)))
 
 
 def teach(state: TrainState, tracks: Sequence[Track]) -> None:
