@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -46,9 +46,11 @@ from pd4dgs_codec.scene import Camera, SceneInfo
 #: fewer than FEW all decide, and CHECKED of them measure.
 HOLDOUT, FEW, CHECKED = 5, 30, 12
 #: Bits of a scalar, about. Gaussians leave in rounds, each at twice the theta of the one before or that at which the
-#: share LEAVE leaves: several that hide each other's absence cannot all leave. Of EACH views one decides about it. Of
-#: what the error allows each scalar, the first guess of theta is the share GUESS if coefficients of motion add to it.
-SCALAR_BITS, LEAVE, EACH, GUESS = 2.8, 1 / 32, 2, 0.3
+#: share LEAVE leaves: several that hide each other's absence cannot all leave. Views decide about it in turn, one of
+#: EACH in a round, with what the rounds before found: other views lose 1 dB by Gaussians that leave because always the
+#: same views decide. Of what the error allows each scalar, the first guess of theta is the share GUESS if coefficients
+#: of motion add to it.
+SCALAR_BITS, LEAVE, EACH, GUESS = 2.8, 1 / 32, 3, 0.3
 EARLY = 14.0  #: in layer 0 are the Gaussians that stay at so many times theta
 BEST = 100.0  #: dB that stand for equal pictures
 BLOCK = 1024  #: Gaussians whose changes are computed at once, which the cache holds
@@ -70,6 +72,13 @@ class Views(Sequence[Any]):
         return self.cameras[i % len(self.cameras)], self.at(self.times[i])
 
 
+@dataclass(frozen=True, eq=False)
+class Seen(Pictures):
+    """Pictures of known cameras and times."""
+
+    views: Views
+
+
 class Packer:
     """Packs samples for any quality; what does not depend on it is computed once."""
 
@@ -83,15 +92,16 @@ class Packer:
         deciding, others = held_out(cameras, HOLDOUT if len(cameras) >= FEW else 0)
         times, self._often = source.looks(len(deciding))
 
-        def views(every: int, times: Sequence[float]) -> Pictures:
-            return Pictures(Views(source.near, deciding[::every], times[::every]), info.background, info.near)
+        def pictures(cameras: Sequence[Camera], times: Sequence[float]) -> Seen:
+            return Seen(Views(source.near, cameras, times), info.background, info.near)
 
-        weights, self.deciding = sensitivity(views(1, times)), views(EACH, times[: len(deciding)])
+        weights, self._absence = sensitivity(pictures(deciding, times))
+        known = times[: len(deciding)]
+        self.deciding, self._round = [pictures(deciding[i::EACH], known[i::EACH]) for i in range(EACH)], 0
         step()
-        self.few, self.cameras = not others, others or evenly(deciding, CHECKED)
-        self.times = [model.nearest(t) for t in spread(len(self.cameras))]  # also between samples
-        checked = Views(model.splats, self.cameras, self.times)
-        self.images = Pictures(checked, info.background, info.near).images
+        self.few, others = not others, others or list(evenly(deciding, CHECKED))
+        instants = [model.nearest(t) for t in spread(len(others))]  # also between samples
+        self.checked = Seen(Views(model.splats, others, instants), info.background, info.near)
         if not any(own.any() for own in weights.values()):
             raise DataError(f"found none of {len(source.means[0]):,} Gaussians in any picture, expected one")
         self.ordered = Ordered.of(source.frame(self.key), weights)
@@ -119,9 +129,14 @@ class Packer:
     def matched(self, psnr: float) -> splats.SplatScene:
         """Returns the scene whose pictures have `psnr` dB against those of the source."""
 
+        above = list[float]()  # dB of all pictures above those of the few that are drawn each time
+
         def build(theta: float) -> tuple[splats.SplatScene, float]:
             scene = self.scene(theta)
-            return scene, self._psnr(scene) - psnr
+            few = self._psnr(scene, self.checked)
+            if not above:
+                above.append(0.0 if self.few else self._psnr(scene, self.checked, *self.deciding) - few)
+            return scene, few + above[0] - psnr
 
         return matched(build, self.guess(psnr))
 
@@ -132,7 +147,9 @@ class Packer:
         moving = len(self.source.times) > 1
         while not self.few and self._reached < theta * (EARLY if moving else 1):
             kept = self._leave > self._reached
-            at, free = absence(self.deciding, kept) / worth, kept & self._often
+            now = absence(self.deciding[self._round % EACH], kept, self._round)
+            self._absence, self._round = self._absence + (now - self._absence) / EACH, self._round + 1
+            at, free = self._absence / worth, kept & self._often
             soon = np.quantile(np.append(at[free], np.inf), LEAVE, method="lower")
             next_ = max(2 * self._reached or LEAVE * theta, float(soon))
             leaving = free & (at < next_)
@@ -158,12 +175,13 @@ class Packer:
         own.grouping = self.grouping and self.grouping.taken(kept)
         return own
 
-    def _psnr(self, scene: splats.SplatScene) -> float:
+    def _psnr(self, scene: splats.SplatScene, *seen: Seen) -> float:
         """Returns the mean PSNR of the pictures in dB, which are not rounded."""
-        errors, info, player = [], self.info, SplatPlayer(scene)
-        for camera, t, truth in zip(self.cameras, self.times, self.images, strict=True):
-            image = picture(player.splats(t)[0], camera, info.background, info.near)
-            errors.append(np.square(image - truth, dtype=np.float64).mean())
+        errors, player = [], SplatPlayer(scene)
+        for part in seen:
+            for camera, t, truth in zip(part.views.cameras, part.views.times, part.images, strict=True):
+                image = picture(player.splats(t)[0], camera, part.background, part.near)
+                errors.append(np.square(image - truth, dtype=np.float64).mean())
         return float(np.mean(-10 * np.log10(np.maximum(errors, 1e-12))))
 
     def _scene(self, theta: float) -> splats.SplatScene:

@@ -64,7 +64,7 @@ def test_errors_of_pictures_are_as_predicted(name):
         Camera.look_at(3 * unit(rng.normal(size=3)), np.zeros(3), (0, 0, 1), width=64, height=64) for _ in range(16)
     ]
     pictures = Pictures([(camera, given_) for camera in cameras])
-    weights, values = sensitivity(pictures)[name], tensors_of(given_)
+    weights, values = sensitivity(pictures)[0][name], tensors_of(given_)
     error, found = 0.02, []
     for _ in range(4):
         moved = values | {name: values[name] + error * rng.choice([-1, 1], values[name].shape)}
