@@ -45,6 +45,7 @@ from pd4dgs_codec.scene import Camera, SceneInfo
 #: One of so many cameras measures the error and does not decide about steps: those that do look better than others. Of
 #: fewer than FEW all decide, and CHECKED of them measure.
 HOLDOUT, FEW, CHECKED = 5, 30, 12
+FITTED = 0.25  #: dB by which all of them, on average of eleven sources, surpass cameras that neither decide nor measure
 #: Bits of a scalar, about. Gaussians leave in rounds, each at twice the theta of the one before or that at which the
 #: share LEAVE leaves: several that hide each other's absence cannot all leave. Views decide about it in turn, one of
 #: EACH in a round, with what the rounds before found: other views lose 1 dB by Gaussians that leave because always the
@@ -129,13 +130,13 @@ class Packer:
     def matched(self, psnr: float) -> splats.SplatScene:
         """Returns the scene whose pictures have `psnr` dB against those of the source."""
 
-        above = list[float]()  # dB of all pictures above those of the few that are drawn each time
+        above = list[float]()  # dB of other pictures above those of the few that are drawn each time
 
         def build(theta: float) -> tuple[splats.SplatScene, float]:
             scene = self.scene(theta)
             few = self._psnr(scene, self.checked)
             if not above:
-                above.append(0.0 if self.few else self._psnr(scene, self.checked, *self.deciding) - few)
+                above.append(0.0 if self.few else self._psnr(scene, self.checked, *self.deciding) - FITTED - few)
             return scene, few + above[0] - psnr
 
         return matched(build, self.guess(psnr))
