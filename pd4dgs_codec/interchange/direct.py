@@ -52,7 +52,7 @@ FITTED = 0.25  #: dB by which all of them, on average of eleven sources, surpass
 #: same views decide. Of what the error allows each scalar, the first guess of theta is the share GUESS if coefficients
 #: of motion add to it.
 SCALAR_BITS, LEAVE, EACH, GUESS = 2.8, 1 / 32, 3, 0.3
-EARLY = 14.0  #: in layer 0 are the Gaussians that stay at so many times theta
+EARLY = 8.0  #: in layer 0 are the Gaussians that the key instant's pictures keep at so many times theta
 BEST = 100.0  #: dB that stand for equal pictures
 BLOCK = 1024  #: Gaussians whose changes are computed at once, which the cache holds
 NEAR = 8.0  #: principal components and groups serve for thetas that differ by this factor
@@ -80,6 +80,37 @@ class Seen(Pictures):
     views: Views
 
 
+@dataclass(eq=False)
+class Leaving:
+    """Finds at which theta each of n Gaussians leaves.
+
+    parts: pictures by EACH parts of the views. worth: what a Gaussian's bits are worth at a theta of 1. free: bool [n],
+    those that may leave. added: float64 [n], the error by the absence of each. thetas: float64 [n], inf for those that
+    stay at theta `reached`.
+    """
+
+    parts: Sequence[Pictures]
+    worth: float
+    free: np.ndarray
+    added: np.ndarray
+    thetas: np.ndarray
+    reached: float = 0.0
+    turn: int = 0
+
+    def until(self, theta: float) -> None:
+        """Lets those leave whose absence adds less than their bits are worth at theta."""
+        while self.reached < theta:
+            kept = self.thetas > self.reached
+            found = absence(self.parts[self.turn % EACH], kept, self.turn)
+            self.added, self.turn = self.added + (found - self.added) / EACH, self.turn + 1
+            at, free = self.added / self.worth, kept & self.free
+            soon = np.quantile(np.append(at[free], np.inf), LEAVE, method="lower")
+            next_ = max(2 * self.reached or LEAVE * theta, float(soon))
+            leaving = free & (at < next_)
+            self.thetas[leaving] = np.maximum(at[leaving], self.reached)
+            self.reached = next_
+
+
 class Packer:
     """Packs samples for any quality; what does not depend on it is computed once."""
 
@@ -91,14 +122,16 @@ class Packer:
         self.info, self.key = info, len(source.times) // 2
         self.source = source = canonical(source, self.key)
         deciding, others = held_out(cameras, HOLDOUT if len(cameras) >= FEW else 0)
-        times, self._often = source.looks(len(deciding))
+        times, often = source.looks(len(deciding))
 
         def pictures(cameras: Sequence[Camera], times: Sequence[float]) -> Seen:
             return Seen(Views(source.near, cameras, times), info.background, info.near)
 
-        weights, self._absence = sensitivity(pictures(deciding, times))
-        known = times[: len(deciding)]
-        self.deciding, self._round = [pictures(deciding[i::EACH], known[i::EACH]) for i in range(EACH)], 0
+        weights, alone = sensitivity(pictures(deciding, times))
+        known, still = times[: len(deciding)], [source.times[self.key]] * len(deciding)
+        self.deciding, self._at_key = (
+            [pictures(deciding[i::EACH], t[i::EACH]) for i in range(EACH)] for t in (known, still)
+        )
         step()
         self.few, others = not others, others or list(evenly(deciding, CHECKED))
         instants = [model.nearest(t) for t in spread(len(others))]  # also between samples
@@ -109,7 +142,9 @@ class Packer:
         self.grouping: Grouping | None = None
         self.changes: dict[str, Change] = {}
         seen = np.bincount(self.ordered.rows, minlength=len(source.means[0])) > 0
-        self._leave, self._reached = np.where(seen, np.inf, 0.0), 0.0  # theta at which each Gaussian leaves
+        worth = BIT * SCALAR_BITS * sum(self.ordered.channels.values())
+        self._leaving = Leaving(self.deciding, worth, often, alone, np.where(seen, np.inf, 0.0))
+        self._first: Leaving | None = None  # who leaves the first layer
         self._moving: tuple[float, Packer] | None = None  # a theta, and with what moves of those that have not left
         step()
 
@@ -144,27 +179,22 @@ class Packer:
     def _thinned(self, theta: float) -> Packer:
         """Returns the packer of the Gaussians whose absence would add more to the error than their bits are worth: of
         all that a view sees if there are few, which would not tell what other views miss."""
-        worth = BIT * SCALAR_BITS * sum(self.ordered.channels.values())
-        moving = len(self.source.times) > 1
-        while not self.few and self._reached < theta * (EARLY if moving else 1):
-            kept = self._leave > self._reached
-            now = absence(self.deciding[self._round % EACH], kept, self._round)
-            self._absence, self._round = self._absence + (now - self._absence) / EACH, self._round + 1
-            at, free = self._absence / worth, kept & self._often
-            soon = np.quantile(np.append(at[free], np.inf), LEAVE, method="lower")
-            next_ = max(2 * self._reached or LEAVE * theta, float(soon))
-            leaving = free & (at < next_)
-            self._leave[leaving] = np.maximum(at[leaving], self._reached)
-            self._reached = next_
+        moving, leaving = len(self.source.times) > 1, self._leaving
+        if not self.few:
+            leaving.until(theta)
+        if moving and not self.few:
+            all_ = np.ones(len(leaving.free), bool)
+            self._first = self._first or replace(leaving, parts=self._at_key, free=all_, thetas=leaving.thetas.copy())
+            self._first.until(EARLY * theta)
         if self._moving is None or not 1 / NEAR <= theta / self._moving[0] <= NEAR:
-            own = self._taken(self._leave[self.ordered.rows] > theta / NEAR)
+            own = self._taken(leaving.thetas[self.ordered.rows] > theta / NEAR)
             own.changes = own._changes() if moving else {}
             if own.changes:
                 own.grouping = Grouping.of(own.changes, place(own.ordered.values["position"], self.info.box), theta)
             self._moving = theta, own
         own = self._moving[1]
-        own = own._taken(self._leave[own.ordered.rows] > theta)
-        early = self._leave[own.ordered.rows] > EARLY * theta
+        own = own._taken(leaving.thetas[own.ordered.rows] > theta)
+        early = (self._first or leaving).thetas[own.ordered.rows] > EARLY * theta
         own.early = early if moving and early.any() else None
         return own
 
