@@ -183,8 +183,10 @@ class Packer:
         if not self.few:
             leaving.until(theta)
         if moving and not self.few:
-            all_ = np.ones(len(leaving.free), bool)
-            self._first = self._first or replace(leaving, parts=self._at_key, free=all_, thetas=leaving.thetas.copy())
+            if self._first is None:
+                thetas, free = leaving.thetas.copy(), np.ones(len(leaving.free), bool)
+                added = np.mean([absence(part, thetas > theta) for part in self._at_key], axis=0)
+                self._first = Leaving(self._at_key, leaving.worth, free, added, thetas, theta)
             self._first.until(EARLY * theta)
         if self._moving is None or not 1 / NEAR <= theta / self._moving[0] <= NEAR:
             own = self._taken(leaving.thetas[self.ordered.rows] > theta / NEAR)
