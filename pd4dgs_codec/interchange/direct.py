@@ -82,12 +82,10 @@ class Seen(Pictures):
 
 @dataclass(eq=False)
 class Leaving:
-    """Finds at which theta each of n Gaussians leaves.
+    """Finds at which theta each of n Gaussians leaves: thetas, float64 [n], inf for those that stay at `reached`.
 
-    parts: pictures by EACH parts of the views. worth: what a Gaussian's bits are worth at a theta of 1. free: bool [n],
-    those that may leave. added: float64 [n], the error by the absence of each. thetas: float64 [n], inf for those that
-    stay at theta `reached`.
-    """
+    parts: pictures by EACH parts of the views. worth: of a Gaussian's bits at a theta of 1. free: bool [n], those that
+    may leave. added: float64 [n], the error by the absence of each."""
 
     parts: Sequence[Pictures]
     worth: float
@@ -184,9 +182,9 @@ class Packer:
             leaving.until(theta)
         if moving and not self.few:
             if self._first is None:
-                thetas, free = leaving.thetas.copy(), np.ones(len(leaving.free), bool)
-                added = np.mean([absence(part, thetas > theta) for part in self._at_key], axis=0)
-                self._first = Leaving(self._at_key, leaving.worth, free, added, thetas, theta)
+                kept = leaving.thetas > theta
+                added = np.mean([absence(part, kept) for part in self._at_key], axis=0)
+                self._first = Leaving(self._at_key, leaving.worth, kept, added, leaving.thetas.copy(), theta)
             self._first.until(EARLY * theta)
         if self._moving is None or not 1 / NEAR <= theta / self._moving[0] <= NEAR:
             own = self._taken(leaving.thetas[self.ordered.rows] > theta / NEAR)
