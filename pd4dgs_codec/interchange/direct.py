@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -45,11 +45,14 @@ from pd4dgs_codec.scene import Camera, SceneInfo
 #: One of so many cameras measures the error and does not decide about steps: those that do look better than others. Of
 #: fewer than FEW all decide, and CHECKED of them measure.
 HOLDOUT, FEW, CHECKED = 5, 30, 12
+FITTED = 0.25  #: dB by which all of them, on average of eleven sources, surpass cameras that neither decide nor measure
 #: Bits of a scalar, about. Gaussians leave in rounds, each at twice the theta of the one before or that at which the
-#: share LEAVE leaves: several that hide each other's absence cannot all leave. Of EACH views one decides about it. Of
-#: what the error allows each scalar, the first guess of theta is the share GUESS if coefficients of motion add to it.
-SCALAR_BITS, LEAVE, EACH, GUESS = 2.8, 1 / 32, 2, 0.3
-EARLY = 14.0  #: in layer 0 are the Gaussians that stay at so many times theta
+#: share LEAVE leaves: several that hide each other's absence cannot all leave. Views decide about it in turn, one of
+#: EACH in a round, with what the rounds before found: other views lose 1 dB by Gaussians that leave because always the
+#: same views decide. Of what the error allows each scalar, the first guess of theta is the share GUESS if coefficients
+#: of motion add to it.
+SCALAR_BITS, LEAVE, EACH, GUESS = 2.8, 1 / 32, 3, 0.3
+EARLY = 8.0  #: in layer 0 are the Gaussians that the key instant's pictures keep at so many times theta
 BEST = 100.0  #: dB that stand for equal pictures
 BLOCK = 1024  #: Gaussians whose changes are computed at once, which the cache holds
 NEAR = 8.0  #: principal components and groups serve for thetas that differ by this factor
@@ -70,6 +73,42 @@ class Views(Sequence[Any]):
         return self.cameras[i % len(self.cameras)], self.at(self.times[i])
 
 
+@dataclass(frozen=True, eq=False)
+class Seen(Pictures):
+    """Pictures of known cameras and times."""
+
+    views: Views
+
+
+@dataclass(eq=False)
+class Leaving:
+    """Finds at which theta each of n Gaussians leaves: thetas, float64 [n], inf for those that stay at `reached`.
+
+    parts: pictures by EACH parts of the views. worth: of a Gaussian's bits at a theta of 1. free: bool [n], those that
+    may leave. added: float64 [n], the error by the absence of each."""
+
+    parts: Sequence[Pictures]
+    worth: float
+    free: np.ndarray
+    added: np.ndarray
+    thetas: np.ndarray
+    reached: float = 0.0
+    turn: int = 0
+
+    def until(self, theta: float) -> None:
+        """Lets those leave whose absence adds less than their bits are worth at theta."""
+        while self.reached < theta:
+            kept = self.thetas > self.reached
+            found = absence(self.parts[self.turn % EACH], kept, self.turn)
+            self.added, self.turn = self.added + (found - self.added) / EACH, self.turn + 1
+            at, free = self.added / self.worth, kept & self.free
+            soon = np.quantile(np.append(at[free], np.inf), LEAVE, method="lower")
+            next_ = max(2 * self.reached or LEAVE * theta, float(soon))
+            leaving = free & (at < next_)
+            self.thetas[leaving] = np.maximum(at[leaving], self.reached)
+            self.reached = next_
+
+
 class Packer:
     """Packs samples for any quality; what does not depend on it is computed once."""
 
@@ -81,24 +120,29 @@ class Packer:
         self.info, self.key = info, len(source.times) // 2
         self.source = source = canonical(source, self.key)
         deciding, others = held_out(cameras, HOLDOUT if len(cameras) >= FEW else 0)
-        times, self._often = source.looks(len(deciding))
+        times, often = source.looks(len(deciding))
 
-        def views(every: int, times: Sequence[float]) -> Pictures:
-            return Pictures(Views(source.near, deciding[::every], times[::every]), info.background, info.near)
+        def pictures(cameras: Sequence[Camera], times: Sequence[float]) -> Seen:
+            return Seen(Views(source.near, cameras, times), info.background, info.near)
 
-        weights, self.deciding = sensitivity(views(1, times)), views(EACH, times[: len(deciding)])
+        weights, alone = sensitivity(pictures(deciding, times))
+        known, still = times[: len(deciding)], [source.times[self.key]] * len(deciding)
+        self.deciding, self._at_key = (
+            [pictures(deciding[i::EACH], t[i::EACH]) for i in range(EACH)] for t in (known, still)
+        )
         step()
-        self.few, self.cameras = not others, others or evenly(deciding, CHECKED)
-        self.times = [model.nearest(t) for t in spread(len(self.cameras))]  # also between samples
-        checked = Views(model.splats, self.cameras, self.times)
-        self.images = Pictures(checked, info.background, info.near).images
+        self.few, others = not others, others or list(evenly(deciding, CHECKED))
+        instants = [model.nearest(t) for t in spread(len(others))]  # also between samples
+        self.checked = Seen(Views(model.splats, others, instants), info.background, info.near)
         if not any(own.any() for own in weights.values()):
             raise DataError(f"found none of {len(source.means[0]):,} Gaussians in any picture, expected one")
         self.ordered = Ordered.of(source.frame(self.key), weights)
         self.grouping: Grouping | None = None
         self.changes: dict[str, Change] = {}
         seen = np.bincount(self.ordered.rows, minlength=len(source.means[0])) > 0
-        self._leave, self._reached = np.where(seen, np.inf, 0.0), 0.0  # theta at which each Gaussian leaves
+        worth = BIT * SCALAR_BITS * sum(self.ordered.channels.values())
+        self._leaving = Leaving(self.deciding, worth, often, alone, np.where(seen, np.inf, 0.0))
+        self._first: Leaving | None = None  # who leaves the first layer
         self._moving: tuple[float, Packer] | None = None  # a theta, and with what moves of those that have not left
         step()
 
@@ -119,34 +163,38 @@ class Packer:
     def matched(self, psnr: float) -> splats.SplatScene:
         """Returns the scene whose pictures have `psnr` dB against those of the source."""
 
+        above = list[float]()  # dB of other pictures above those of the few that are drawn each time
+
         def build(theta: float) -> tuple[splats.SplatScene, float]:
             scene = self.scene(theta)
-            return scene, self._psnr(scene) - psnr
+            few = self._psnr(scene, self.checked)
+            if not above:
+                above.append(0.0 if self.few else self._psnr(scene, self.checked, *self.deciding) - FITTED - few)
+            return scene, few + above[0] - psnr
 
         return matched(build, self.guess(psnr))
 
     def _thinned(self, theta: float) -> Packer:
         """Returns the packer of the Gaussians whose absence would add more to the error than their bits are worth: of
         all that a view sees if there are few, which would not tell what other views miss."""
-        worth = BIT * SCALAR_BITS * sum(self.ordered.channels.values())
-        moving = len(self.source.times) > 1
-        while not self.few and self._reached < theta * (EARLY if moving else 1):
-            kept = self._leave > self._reached
-            at, free = absence(self.deciding, kept) / worth, kept & self._often
-            soon = np.quantile(np.append(at[free], np.inf), LEAVE, method="lower")
-            next_ = max(2 * self._reached or LEAVE * theta, float(soon))
-            leaving = free & (at < next_)
-            self._leave[leaving] = np.maximum(at[leaving], self._reached)
-            self._reached = next_
+        moving, leaving = len(self.source.times) > 1, self._leaving
+        if not self.few:
+            leaving.until(theta)
+        if moving and not self.few:
+            if self._first is None:
+                kept = leaving.thetas > theta
+                added = np.mean([absence(part, kept) for part in self._at_key], axis=0)
+                self._first = Leaving(self._at_key, leaving.worth, kept, added, leaving.thetas.copy(), theta)
+            self._first.until(EARLY * theta)
         if self._moving is None or not 1 / NEAR <= theta / self._moving[0] <= NEAR:
-            own = self._taken(self._leave[self.ordered.rows] > theta / NEAR)
+            own = self._taken(leaving.thetas[self.ordered.rows] > theta / NEAR)
             own.changes = own._changes() if moving else {}
             if own.changes:
                 own.grouping = Grouping.of(own.changes, place(own.ordered.values["position"], self.info.box), theta)
             self._moving = theta, own
         own = self._moving[1]
-        own = own._taken(self._leave[own.ordered.rows] > theta)
-        early = self._leave[own.ordered.rows] > EARLY * theta
+        own = own._taken(leaving.thetas[own.ordered.rows] > theta)
+        early = (self._first or leaving).thetas[own.ordered.rows] > EARLY * theta
         own.early = early if moving and early.any() else None
         return own
 
@@ -158,12 +206,13 @@ class Packer:
         own.grouping = self.grouping and self.grouping.taken(kept)
         return own
 
-    def _psnr(self, scene: splats.SplatScene) -> float:
+    def _psnr(self, scene: splats.SplatScene, *seen: Seen) -> float:
         """Returns the mean PSNR of the pictures in dB, which are not rounded."""
-        errors, info, player = [], self.info, SplatPlayer(scene)
-        for camera, t, truth in zip(self.cameras, self.times, self.images, strict=True):
-            image = picture(player.splats(t)[0], camera, info.background, info.near)
-            errors.append(np.square(image - truth, dtype=np.float64).mean())
+        errors, player = [], SplatPlayer(scene)
+        for part in seen:
+            for camera, t, truth in zip(part.views.cameras, part.views.times, part.images, strict=True):
+                image = picture(player.splats(t)[0], camera, part.background, part.near)
+                errors.append(np.square(image - truth, dtype=np.float64).mean())
         return float(np.mean(-10 * np.log10(np.maximum(errors, 1e-12))))
 
     def _scene(self, theta: float) -> splats.SplatScene:

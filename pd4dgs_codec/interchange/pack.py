@@ -102,11 +102,12 @@ def tensors_of(splats: Splats) -> Tensors:
 # -- what pictures depend on -------------------------------------------------------------------------------------------
 
 
-def sensitivity(pictures: Pictures) -> Tensors:
-    """Returns the squared derivatives of pictures by the values of `tensors_of`, float64 [n] by name.
+def sensitivity(pictures: Pictures) -> tuple[Tensors, np.ndarray]:
+    """Returns (the squared derivatives of pictures by the values of `tensors_of`, float64 [n] by name; by how much the
+    mean squared error grows if one Gaussian alone is missing, float64 [n]).
 
-    They are means over a tensor's channels, and sums over the mean of the views' pixels and colours: a squared error e²
-    of one value adds h e² to the mean squared error. Estimated by products with random signs, one a view (see
+    Derivatives are means over a tensor's channels, and sums over the mean of the views' pixels and colours: a squared
+    error e² of one value adds h e² to the mean squared error. Estimated by products with random signs, one a view (see
     `model.sensitivity`); with few views, Gaussians that one or two of them see get too coarse steps. All views show the
     same n Gaussians, at one instant or several.
     """
@@ -125,23 +126,24 @@ def sensitivity(pictures: Pictures) -> Tensors:
                 "opacity": (g.geometry.opacities * splats.opacities * (1 - splats.opacities))[:, None],
                 "scale": g.geometry.scales * splats.scales,
                 "rotation": g.geometry.quats,  # orthogonal to the quaternion, which leaves three numbers
+                "absence": (g.geometry.opacities * splats.opacities)[:, None],
             }
             for name, slope in slopes.items():
                 numbers = min(slope.shape[1], 3) * image.size * len(pictures.views) * PROBES
                 squares = np.einsum("nc,nc->n", slope, slope, dtype=np.float64)
                 total[name] = total.get(name, 0) + squares / numbers
-    return total
+    return total, total.pop("absence")
 
 
-def absence(pictures: Pictures, kept: np.ndarray) -> np.ndarray:
+def absence(pictures: Pictures, kept: np.ndarray, seed: int = 0) -> np.ndarray:
     """Returns by how much the mean squared error of pictures that show only the Gaussians `kept`, bool [n], grows if
-    one more leaves them: float64 [n], 0 for the others.
+    one more leaves them: float64 [n], 0 for the others. seed: of random signs.
 
     Exact up to the random signs of `sensitivity`, since a picture is linear in the opacity of one Gaussian: |c|² -
     2 c r, c what it adds to the pictures, r what those of `kept` have too much. Where its absence would mend an error,
     c r > 0, this part counts as 0: thousands would leave to mend the same error, and make it far larger.
     """
-    rng, rows = np.random.default_rng(0), np.flatnonzero(kept)
+    rng, rows = np.random.default_rng(seed), np.flatnonzero(kept)
     alone, crossed = np.zeros((2, len(kept)))
     for (camera, splats), truth in zip(pictures.views, pictures.images, strict=True):
         own = splats.taken(rows)

@@ -27,7 +27,7 @@ from pd4dgs_codec.format.info import info as about
 from pd4dgs_codec.format.metadata import Metadata
 from pd4dgs_codec.format.reader import Base, read_base
 from pd4dgs_codec.format.registry import MAX_SIDE
-from pd4dgs_codec.interchange.direct import CHECKED, Packer, Views, canonical, mean_psnr
+from pd4dgs_codec.interchange.direct import CHECKED, Packer, Seen, Views, canonical, mean_psnr
 from pd4dgs_codec.interchange.imported import BOX_INSTANTS, FPS, Progress, scene_info, seen_by
 from pd4dgs_codec.interchange.pack import Grid, Ordered, Packed, Pictures, Tensors, cells_of, matched, sensitivity
 from pd4dgs_codec.interchange.sampled import (
@@ -210,7 +210,7 @@ class BasePacker(Packer):
         own, weights = still.mean, Tensors()
         for camera, frame in views:
             shown = together(own, still.others(frame))
-            for name, h in sensitivity(Pictures([(camera, shown)], info.background, info.near)).items():
+            for name, h in sensitivity(Pictures([(camera, shown)], info.background, info.near))[0].items():
                 weights[name] = weights.get(name, 0) + h[: len(own.means)] / count
         self.source = stacked(np.zeros(1), [own], None, "")
         if window_step is not None:
@@ -274,10 +274,9 @@ class SegmentPacker(Packer):
     ):
         self.info, self.key, self.base = info, len(source.times) // 2, base
         self.source = source = canonical(source, self.key)
-        weights = sensitivity(Pictures(Backed(source, cameras, behind, more=True), info.background, info.near))
+        weights, _ = sensitivity(Pictures(Backed(source, cameras, behind, more=True), info.background, info.near))
         some = Backed(source, evenly(cameras, CHECKED), behind)
-        self.cameras, self.times = list(some.cameras), list(some.times)
-        self.images = Pictures(some, info.background, info.near).images
+        self.checked = Seen(some, info.background, info.near)
         size, own = base.info.voxel_size, {name: h[len(behind.means) :] for name, h in weights.items()}
         found = Ordered.of(source.frame(self.key), own, lambda at: (size, cells_of(at, size, base.anchor_q)))
         self.ordered: Continued = Continued(**vars(found), base=base)
@@ -502,7 +501,7 @@ class _Writer:
         def build(theta: float) -> tuple[tuple[float, SplatScene], float]:
             scene = packer._scene(theta)
             here = first.on(scene)
-            return (theta, scene), here._psnr(here._scene(theta)) - self.psnr
+            return (theta, scene), here._psnr(here._scene(theta), here.checked) - self.psnr
 
         theta, scene = matched(build, guess)
         data, _ = encode_with_report(scene)

@@ -13,6 +13,8 @@ from pd4dgs_codec import decode
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.format.info import metadata_of
 from pd4dgs_codec.interchange import imported
+from pd4dgs_codec.interchange.direct import FITTED, Packer, Seen
+from pd4dgs_codec.interchange.pack import CLOSE
 from pd4dgs_codec.interchange.sampled import sampled
 from pd4dgs_codec.interchange.splats import ply_bytes
 from pd4dgs_codec.interchange.teacher import Teacher, read_model
@@ -168,6 +170,32 @@ def test_gaussians_that_no_usual_picture_shows_are_kept(tmp_path, cli, way):
     scene = decode(out.read_bytes())
     shown = {i: np.count_nonzero(scene.splats(i / 24)[0].opacities > 0.4) for i in (15, 17)}
     assert shown[17] - shown[15] > 50 or way == "fade"  # whose motion may cost more bits than it is worth
+
+
+def test_level_0_has_what_its_instant_shows_and_all_views_have_the_psnr_asked_for(monkeypatch):
+    monkeypatch.setattr(imported, "CAMERAS", 48)
+    splats, hidden = body(), np.arange(300) % 2 == 1
+
+    def at(t: float) -> Splats:  # every second one is hidden in the middle
+        return replace(splats, opacities=np.where(hidden, splats.opacities * abs(2 * t - 1), splats.opacities))
+
+    model = Teacher(at, tuple(np.linspace(0, 1, 9)), 1.0)
+    source = sampled(model, "hidden")
+    some = [source.frame(i) for i in range(9)]
+    info, cameras, _ = imported.scene_info("hidden", model, some, 1.0, None, None)
+    packer = Packer(model, source, cameras, info, lambda: None)
+    scene = packer.matched(38.0)
+    early, dark = scene.mask[0] > 0, scene.tensors["opacity"][:, 0] < 0
+    assert np.count_nonzero(early) > 80 < np.count_nonzero(dark) and np.count_nonzero(early & dark) < 5
+    guess = packer.guess(38.0)
+
+    def psnr(theta: float, *seen: Seen) -> float:
+        return 40 - 10 * np.log10(theta / guess) + (2 if seen == (packer.checked,) else 0)
+
+    monkeypatch.setattr(packer, "scene", lambda theta: theta)
+    monkeypatch.setattr(packer, "_psnr", psnr)
+    found = packer.matched(38.0)  # of all views, and not of the few that are drawn in each round
+    assert packer._psnr(found, packer.checked, *packer.deciding) == pytest.approx(38 + FITTED, abs=CLOSE)
 
 
 def test_every_window_is_looked_at():

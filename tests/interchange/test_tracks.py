@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pd4dgs_codec.data.view import rotation_matrix
+from pd4dgs_codec.interchange.direct import EACH, Leaving
 from pd4dgs_codec.interchange.pack import Grid, Pictures, absence, sensitivity, tensors_of, turned, voxels
 from pd4dgs_codec.interchange.splats import picture
 from pd4dgs_codec.interchange.tracks import Change, Grouping, _runs, between, knots, tracks_of
@@ -64,7 +65,7 @@ def test_errors_of_pictures_are_as_predicted(name):
         Camera.look_at(3 * unit(rng.normal(size=3)), np.zeros(3), (0, 0, 1), width=64, height=64) for _ in range(16)
     ]
     pictures = Pictures([(camera, given_) for camera in cameras])
-    weights, values = sensitivity(pictures)[name], tensors_of(given_)
+    weights, values = sensitivity(pictures)[0][name], tensors_of(given_)
     error, found = 0.02, []
     for _ in range(4):
         moved = values | {name: values[name] + error * rng.choice([-1, 1], values[name].shape)}
@@ -92,6 +93,20 @@ def test_the_absence_of_a_gaussian_adds_what_is_predicted():
     assert not added[:10].any() and 4 < np.count_nonzero(np.greater(crossed, 0)) < 45
     assert added[10:].sum() == pytest.approx(exact.sum(), rel=0.3)
     assert np.corrcoef(added[10:], exact)[0, 1] > 0.8
+
+
+def test_gaussians_that_a_few_views_show_stay_and_what_adds_little_leaves():
+    sides, given_ = np.eye(3).repeat(20, axis=0) * [1, 1, 1], cloud(60)  # a third each is in view of one part
+    faint = np.arange(60) % 2 == 1
+    given_ = Splats(
+        *(vars(given_) | {"means": np.float32(9 * sides), "opacities": np.float32(0.9 - 0.899 * faint)}).values()
+    )
+    cameras = [Camera.look_at(6 * side, 9 * side, (1, 2, 3), width=64, height=64) for side in np.eye(3)]
+    parts = [Pictures([(camera, given_)]) for camera in cameras[:EACH]]
+    added = sensitivity(Pictures([(camera, given_) for camera in cameras]))[1]
+    leaving = Leaving(parts, 1.0, np.ones(60, bool), added, np.full(60, np.inf))
+    leaving.until(added[~faint].min() / 8)
+    assert (leaving.thetas[faint] < np.inf).sum() > 20 and (leaving.thetas[~faint] == np.inf).all()
 
 
 def test_gaussians_that_pictures_depend_on_less_get_coarser_steps_within_bounds():
