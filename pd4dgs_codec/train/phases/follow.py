@@ -23,9 +23,6 @@ from pd4dgs_codec.train.state import TrainState
 
 #: Steps that teach the tracks alone; points of each body in a step, and anchors that stay.
 STEPS, POINTS, STAYING = 400, 60, 400
-#: Views near the key instant see the scene from one side if their directions have less than this share of the spread of
-#: all. Where a camera goes by or around once they have 0 to 0.04, where it sweeps or jumps 0.26 or more.
-ONE_SIDE = 1 / 8
 
 
 class Follow(phases.Phase):
@@ -40,8 +37,15 @@ class Follow(phases.Phase):
         record["bodies"] = len(state.tracks)
         if state.tracks:
             teach(state, state.tracks)
-            state.opened, views = True, list(range(len(state.views)))
-            state.placing = _spread(state, near_key(state, views)) < ONE_SIDE * _spread(state, views)
+            state.opened, state.placing = True, _from_one_side(state)
+
+
+def _from_one_side(state: TrainState) -> bool:
+    """Whether the views near the key instant have a smaller share of the spread of all directions than of all views, as
+    those of a camera that goes by or around once have."""
+    views = list(range(len(state.views)))
+    near = near_key(state, views)
+    return _spread(state, near) * len(views) < _spread(state, views) * len(near)
 
 
 def _spread(state: TrainState, among: Sequence[int]) -> float:
