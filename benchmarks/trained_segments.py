@@ -2,7 +2,7 @@
 
 `python benchmarks/trained_segments.py` trains a synthetic scene in three ways, whose steps are as many in all, and
 measures bytes, dB on held-out views, and how far pictures half a frame before and after an instant differ, at seams and
-inside segments. What is trained already is kept.
+inside segments. --no-own leaves out the files of their own. What is trained already is kept.
 """
 
 from __future__ import annotations
@@ -65,18 +65,18 @@ def alone(out: Path, capture: Capture, dataset: Dataset, cuts: Cuts) -> list[Pat
     return files
 
 
-def compared(out: Path, capture: Capture, every: float) -> list[Row]:
-    """Trains in three ways. every: seconds between training frames."""
+def compared(out: Path, capture: Capture, every: float, with_own: bool) -> list[Row]:
+    """Trains in three ways, or without files of their own in two. every: seconds between training frames."""
     dataset, cuts = capture.read()
     source, steps_each, count = capture.config.source, capture.config.total or 0, len(cuts.ranges)
     low, high = dataset.time_range
-    common = ("--preset", capture.config.preset, "-j", 1)
+    common = ("--preset", capture.config.preset, "-j", capture.threads)
     folder, whole = out / "segments", out / "whole.pd4"
     command(
         "train", source, "-o", folder, "--segments", capture.length, "--overlap", capture.overlap, *common,
         "--iterations", steps_each,
     )  # fmt: skip
-    files = alone(out, capture, dataset, cuts)
+    files = alone(out, capture, dataset, cuts) if with_own else []
     if not whole.exists():
         command(
             "train", source, "-o", out / "whole.pt", *common, "--iterations", all_steps(capture.config, count), "-f"
@@ -93,12 +93,11 @@ def compared(out: Path, capture: Capture, every: float) -> list[Row]:
     seams = [start for start, _ in cuts.ranges[1:]]
     inside = [a + (b - a) * (i + 0.5) / INSIDE for a, b in cuts.ranges for i in range(INSIDE)]
     base, sizes = sum(file.bytes for file in index.bases), [file.bytes for file in index.segments]
-    alone_sizes, size = [file.stat().st_size for file in files], whole.stat().st_size
     rows = list[Row]()
-    for name, at, first, later in (
-        ("one file", lambda t: (one, (t - low) / (high - low)), size, []),
-        ("files of their own", of_own, alone_sizes[0], alone_sizes[1:]),
-        ("segments", lambda t: (timeline, (t - low) / (high - low)), base + sizes[0], sizes[1:]),
+    for name, at, (first, *later) in (
+        ("one file", lambda t: (one, (t - low) / (high - low)), [whole.stat().st_size]),
+        *([("files of their own", of_own, [file.stat().st_size for file in files])] if files else []),
+        ("segments", lambda t: (timeline, (t - low) / (high - low)), [base + sizes[0], *sizes[1:]]),
     ):
         row: Row = {"way": name, "bytes": first + sum(later), "first": first}
         row |= {"later": float(np.mean(later)) if later else None, "dB": quality(at, dataset)}
@@ -118,14 +117,16 @@ def main() -> None:
     parser.add_argument("--length", type=float, default=2.0, help="seconds of a segment")
     parser.add_argument("--overlap", type=float, default=0.0, help="seconds that segments share")
     parser.add_argument("--iterations", type=int, default=1000, help="steps of the whole")
+    parser.add_argument("--no-own", action="store_true", help="train no files of their own")
+    parser.add_argument("-j", "--threads", type=int, default=1, help="cores, and segments at a time")
     args = parser.parse_args()
     out = Path(args.output)
     out.mkdir(parents=True, exist_ok=True)
     config = TrainConfig(preset="tiny", source=args.source, iterations=args.iterations)
-    capture = Capture(config, {}, args.length, args.overlap, "cpu", 1)
+    capture = Capture(config, {}, args.length, args.overlap, "cpu", args.threads)
     dataset, _ = capture.read()
     low, high = dataset.time_range
-    rows = compared(out, capture, (high - low) / (len({view.time for view in dataset.train}) - 1))
+    rows = compared(out, capture, (high - low) / (len({view.time for view in dataset.train}) - 1), not args.no_own)
     shown = [
         [
             "" if v is None else v if isinstance(v, str) else f"{v:,.0f}" if v >= 1000 else f"{v:.2f}"

@@ -46,8 +46,9 @@ ROUNDING = 1e-4
 SHARE = 1 / 18
 #: Pictures of a segment for each of its finest planes' instants, see `ModelConfig`.
 PICTURES = 4
-#: Steps that fit a segment's motion to that of the whole, before pictures do.
-FITTING = 2000
+#: Steps that fit a segment's motion to that of the whole, before pictures do; the share of the anchors in each; and the
+#: weight of the rate, of which 1 would be right if an attribute's error cost as much as the quantisation of its anchor.
+FITTING, SAMPLE, WEIGHT = 6000, 0.1, 0.4
 #: Squared steps that an attribute's error grows by when it has a bit less, at high rates (Gersho and Gray, Vector
 #: quantization and signal compression, 1992).
 SQUARES_PER_BIT = math.log(2) / 6
@@ -152,24 +153,27 @@ def continued(config: TrainConfig, dataset: Dataset, whole: Scene) -> Model:
 
 def fit(model: Model, old: Model, config: TrainConfig) -> None:
     """Trains the motion of a segment's model until it is that of `old`, the model of the whole. They are compared at
-    the anchors, in units of the attributes' steps, under a rate of the planes. Residuals of `old` count from its key
-    instant, which may be in another segment; the segment has none."""
+    random anchors, in units of the attributes' steps, which are as coarse as an anchor bears, under a rate of the
+    planes. Residuals of `old` count from its key instant, which may be in another segment; the segment has none."""
     (low, high), times, planes = old.info.time_range, model.info.time_range, model.deformations[1].planes
     generator, step = torch.Generator().manual_seed(config.seed), model.steps.planes(1)
     units = [torch.full((3,), float(model.info.voxel_size))]
     units += [torch.full((c.numel(),), float(getattr(model.steps, name))) for name, c in model.centres.items()]
-    adam, unit = Optimiser(model, config.rates, config.cooldown), torch.cat(units)
+    adam, unit = Optimiser(model, config.rates, config.cooldown), torch.cat(units) * old.spacing[:, None]
+    anchors, few = old.anchor, math.ceil(SAMPLE * len(unit))
     for k in range(FITTING):
         t = float(torch.rand((), generator=generator))
-        seconds, rounding = times[0] + t * (times[1] - times[0]), Rounding(weights=k > FITTING / 2)
+        seconds, rounding = times[0] + t * (times[1] - times[0]), Rounding(weights=k > FITTING / 4)
+        some = torch.randint(len(unit), (few,), generator=generator)
         with torch.no_grad():
-            wanted = old.moved_rows(old.anchor, old.level, (seconds - low) / (high - low)) / unit
-        apart = F.smooth_l1_loss(model.moved_rows(old.anchor, 1, t, rounding) / unit, wanted)
+            wanted = old.moved_rows(anchors[some], old.level, (seconds - low) / (high - low)) / unit[some]
+        apart = F.smooth_l1_loss(model.moved_rows(anchors[some], 1, t, rounding) / unit[some], wanted)
         adam.zero_grad()
-        rate = planes.rate(planes.grid, step) / wanted.numel()
-        torch.autograd.backward(apart + SQUARES_PER_BIT * rate)
+        rate = planes.rate(planes.grid, step) / unit.numel()
+        torch.autograd.backward(apart + WEIGHT * SQUARES_PER_BIT * rate)
         adam.step(k / FITTING, None)
     adam.zero_grad()
+    model.round_to_steps()  # otherwise the first step on images moves values across the boundaries of their rounding
 
 
 def encoded(model: Model, base: tuple[Base, Scene] | None, metadata: Metadata) -> bytes:
@@ -240,7 +244,7 @@ def train_part(part: Part, dataset: Dataset, progress: Progress | None) -> dict[
         if not isinstance(scene, Scene):
             raise DataError(f"{part.whole}: holds splats, expected a model that pd4dgs-train wrote")
         config, size = segment_config(config), replace(size, max_anchors=0)  # none grow: the whole has seen all times
-        base, start = (read_base(data), scene.prefix(0)), continued(config, own, scene)
+        base, start = (read_base(data), scene.prefix(0)), continued(part.config, own, scene)
     trainer = Trainer(config, own, part.device, size, start)
     if part.checkpoint.exists():
         trainer.resume(part.checkpoint)
