@@ -169,7 +169,7 @@ class Run:
 
 
 #: Code of the package, by what it is for, on which no rows depend unless a benchmark names it: other commands import it
-#: only for URLs and `pd4dgs-train --watch`, if at all.
+#: only for URLs, if at all.
 APART = {
     "delivery": (
         *("bench/latency.py", "cli/package.py", "cli/serve.py"),
@@ -182,7 +182,7 @@ APART = {
         "cli/import_model.py",
     ),
     "prepare": ("prepare", "cli/prepare.py"),
-    "view": ("cli/view.py", "cli/watch.py"),
+    "view": ("cli/view.py",),
 }
 
 
