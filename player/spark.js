@@ -122,7 +122,10 @@ export class Pd4Splats extends Playback {
     this._background.setRGB(...fill, this._three.SRGBColorSpace);
     if ("extArrays" in gaussians) {
       const { extArrays, count } = gaussians;
-      this._splats.reinitialize({ extArrays, numSplats: count });
+      const splats = this._splats;
+      splats.reinitialize({ extArrays, numSplats: count });
+      // Spark 2.2 gives a texture of unchanged size its new array as bytes: WebGL refuses them for 32-bit numbers
+      for (const [i, { image }] of splats.textures.entries()) image.data = extArrays[i];
     } else this._setSplats(gaussians);
     // Gaussians are others than before, so that their old order is of no use: Spark shows them when they are sorted
     this.mesh.updateMappingVersion();

@@ -51,6 +51,7 @@ class OtherSplats {
   constructor() {
     this.maxSplats = this.numSplats = 0;
     this.extArrays = [new Uint32Array(0), new Uint32Array(0)];
+    /** @type {any[]} */
     this.textures = [{ needsUpdate: false }, { needsUpdate: false }];
     /** @type {any[]} */
     this.stored = [];
@@ -90,11 +91,12 @@ function ofHalf(bits) {
   return (sign ? -1 : 1) * (exponent ? (1 + rest / 1024) * 2 ** (exponent - 15) : rest * 2 ** -24);
 }
 
-/** Spark's 2.2. */
+/** Spark's 2.2, which gives textures their new arrays as bytes. */
 class ExtSplats extends OtherSplats {
   /** @param {{extArrays: Uint32Array[], numSplats: number}} [options] */
   constructor(options) {
     super();
+    this.textures = /** @type {any[]} */ (this.extArrays.map((data) => ({ needsUpdate: false, image: { data } })));
     if (options) this.reinitialize(options);
   }
 
@@ -102,6 +104,10 @@ class ExtSplats extends OtherSplats {
   reinitialize({ extArrays, numSplats }) {
     assert.ok(extArrays.every(({ length }) => length % 8192 === 0 && length >= 4 * numSplats));
     Object.assign(this, { extArrays, numSplats });
+    extArrays.forEach(({ buffer }, i) => {
+      this.textures[i].image = { data: new Uint8Array(buffer) };
+      this.textures[i].needsUpdate = true;
+    });
   }
 
   /** @param {number} index */
@@ -212,7 +218,9 @@ for (const Stored of [ExtSplats, OtherSplats]) {
       await settle(splats, cameraAt(eye));
       assert.equal(mesh.mappings, seen, "nothing is evaluated in vain");
     }
-    if (Stored === OtherSplats) {
+    if (Stored === ExtSplats) {
+      assert.deepEqual(mesh.extSplats.textures.map((/** @type {any} */ { image }) => image.data), mesh.extSplats.extArrays);
+    } else {
       assert.equal(mesh.extSplats.made, 1);
       assert.ok(mesh.extSplats.textures.every((/** @type {any} */ texture) => texture.needsUpdate));
     }
