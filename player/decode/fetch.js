@@ -138,7 +138,8 @@ export class SceneSource {
           if (failures >= attempts) {
             throw new FetchError(`${this.url}: ${error.message} (${this.received} bytes received)`);
           }
-          if (failures > 1) await sleep(1000 * Math.min(pause * 2 ** (failures - 2), until - now()));
+          const wait = failures > 1 ? Math.min(pause * 2 ** (failures - 2), until - now()) : 0;
+          await new Promise((resolve) => setTimeout(resolve, 1000 * wait));
           continue;
         }
         if (this.received > before) failures = 0;
@@ -154,13 +155,12 @@ export class SceneSource {
   /** Where to stop next: behind preamble, header or a slice; null where the budget ends.
    * @param {number} maxLayer @param {number | undefined} bytes @param {number} until */
   _end(maxLayer, bytes, until) {
-    const { layerEnds: ends, consumed } = this.decoder;
+    const { layerEnds: ends, next } = this.decoder;
     if (!ends.length) return this.decoder.needs; // nothing behind the header is decoded before the budget is checked
     const limit = bytes ?? MOST_BYTES;
     if (ends[0].end > limit && bytes === undefined && maxLayer >= 0) {
       throw new DecodeError("LimitExceeded", `layer 0 ends at byte ${ends[0].end}, limit ${MOST_BYTES}`);
     }
-    const next = ends.find((slice) => slice.end > consumed);
     if (!next || next.layer > maxLayer || next.end > limit) return null;
     const { at, received } = this._requested;
     const rate = (this.received - received) / (now() - at);
@@ -307,6 +307,3 @@ export class SceneSource {
 const lengthOf = (text) => (/^\d{1,15}$/.test(text ?? "") ? Number(text) : null);
 
 const now = () => performance.now() / 1000;
-
-/** @param {number} milliseconds @returns {Promise<void>} */
-const sleep = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
