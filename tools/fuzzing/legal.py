@@ -33,35 +33,39 @@ LEAST, LARGEST = 2.0**-126, (2.0 - 2.0**-23) * 2.0**127
 
 
 @dataclass(frozen=True)
-class Seed:
-    """A legal file to mutate, and its base. scene: whether it makes a scene."""
+class Case:
+    """An input, or a legal file to mutate. recipe: what was done, or a name. base: what is given as its base. scene:
+    whether it is sure to make a scene. meaning: the hashes that a random legal file must have. sealed: whether lengths,
+    ids and CRCs are right. origins: the files that it was made from."""
 
-    name: str
+    recipe: str
     data: bytes
     base: bytes | None = None
-    scene: bool = True
+    scene: bool = False
+    meaning: list[dict[str, Any]] | None = None
+    sealed: bool = True
+    origins: tuple[bytes, ...] = ()
 
 
 @cache
-def valid_vectors() -> list[Seed]:
+def valid_vectors() -> list[Case]:
     """The small ones."""
-    found = list[Seed]()
+    found = list[Case]()
     for row in json.loads((VECTORS / "manifest.json").read_text(encoding="utf-8"))["vectors"]:
         if row["file"].startswith(("valid/", "uncommon/")) and row["size"] <= LARGEST_SEED:
             data, base = (name and (VECTORS / name).read_bytes() for name in (row["file"], row.get("base")))
-            found.append(Seed(Path(row["file"]).stem, data, base, "scene" not in row))
+            found.append(Case(Path(row["file"]).stem, data, base, "scene" not in row))
     return found
 
 
-def seeds(paths: Sequence[Path] = (), built: int = 60) -> list[Seed]:
+def seeds(paths: Sequence[Path] = (), built: int = 60) -> list[Case]:
     """`built` random files, the files at `paths` (or in them, if folders) that decode, and small vectors."""
-    made = [(file.data(), base and base.data()) for file, base in map(numbered, range(built))]
-    found = [Seed(f"legal-{i}", *own) for i, own in enumerate(made)]
+    found = [numbered(i) for i in range(built)]
     for file in (file for path in paths for file in (sorted(path.rglob("*.pd4")) if path.is_dir() else [path])):
         data = file.read_bytes()
         with suppress(DecodeError):
             hashes(data)
-            found.append(Seed(file.stem, data))
+            found.append(Case(file.stem, data))
     return found + valid_vectors()
 
 
@@ -302,12 +306,13 @@ class Maker:
         return header
 
 
-def legal(rng: random.Random) -> tuple[File, File | None, bool]:
-    """(a file of random layers, slices, tables and priors, its base if it has one, whether it is sure to make a scene).
-    `File.hashes` says what it decodes to."""
-    maker = Maker(rng, rng.random() < 0.25)
-    file, scene = made(rng, maker), maker.scene
-    return (made(rng, maker.over(), file), file, scene) if maker.base else (file, None, scene)
+def legal(rng: random.Random, name: str = "a legal file") -> Case:
+    """A file of random layers, slices, tables and priors, which may have a base."""
+    maker, base = Maker(rng, rng.random() < 0.25), None
+    file = made(rng, maker)
+    if maker.base:
+        base, file = file.data(), made(rng, maker.over(), file)
+    return Case(name, file.data(), base, maker.scene, file.hashes())
 
 
 def made(rng: random.Random, maker: Maker, base: File | None = None) -> File:
@@ -342,9 +347,9 @@ def made(rng: random.Random, maker: Maker, base: File | None = None) -> File:
 
 
 @cache
-def numbered(index: int) -> tuple[File, File | None]:
-    """A random file of its own for each number, and its base."""
-    return legal(random.Random(index))[:2]
+def numbered(index: int) -> Case:
+    """A random file of its own for each number."""
+    return legal(random.Random(index), f"legal-{index}")
 
 
 def _with_what_is_ignored(rng: random.Random, file: File) -> File:
