@@ -289,7 +289,7 @@ class Maker:
         return replace(layer, meta=own | {key: value for key, value in extra.items() if value})
 
     def header(self, layers: Sequence[Layer]) -> dict[int, Any]:
-        """The fields of a file of these slices."""
+        """The fields of a file of these slices, without those that are its base's."""
         rng = self.rng
         for i, row in enumerate(self.table):  # centres and the rows before add to symbols; others may add rows
             most = M if self.centres is not None or row[3] or self.base else 1
@@ -303,7 +303,7 @@ class Maker:
         if rng.random() < 0.3:
             sides = {3: near(rng, 1, 65535), 4: near(rng, 1, 65535)}
             header[13] = {1: [rng.choice((0.0, -LARGEST))] * 12, 2: [LEAST, LARGEST, -1.0, 0.0], **sides}
-        return header
+        return {key: value for key, value in header.items() if not self.adds or key not in range(3, 7)}
 
 
 def legal(rng: random.Random, name: str = "a legal file") -> Case:
@@ -334,12 +334,7 @@ def made(rng: random.Random, maker: Maker, base: File | None = None) -> File:
         how = {"base": rng.choice((0, 0, None, K, -K, 1000)), "stream": rng.choice((lzma2.stored, lzma2.packed))}
         layers = [layer.packed(**how, width=rng.choice((None, 2))) for layer in layers]  # type: ignore[arg-type]
     header = maker.header(layers)
-    if base is None:
-        file = blocks.make_file(*layers, header=header)
-    else:
-        file = blocks.adding(
-            base, *layers, header={key: value for key, value in header.items() if key not in range(3, 7)}
-        )
+    file = blocks.make_file(*layers, header=header) if base is None else blocks.adding(base, *layers, header=header)
     if rng.random() < 0.2 and not maker.base:  # it ends after any slice
         whole = file.fields()[14]
         file = replace(file, chunks=file.chunks[: rng.randint(1, len(file.chunks))]).with_header({14: whole})

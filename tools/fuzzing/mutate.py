@@ -172,9 +172,8 @@ def change_parts(rng: random.Random, data: bytes, other: bytes, names: list[str]
     try:
         for part in rng.choices([*PARTS], [*PARTS.values()], k=rng.choice((1, 1, 1, 2))):
             if part == "header bytes":  # msgpack in forms that nobody writes
-                packed = change_bytes(rng, data[20 : 20 + int.from_bytes(data[12:16], "little")], other[20:200], names)[
-                    :4096
-                ]
+                header = data[20 : 20 + int.from_bytes(data[12:16], "little")]
+                packed = change_bytes(rng, header, other[20:200], names)[:4096]
             change_part(rng, part, file, donor, names)
         for chunk in file.chunks:
             chunk.payload = chunk.layer.payload() if chunk.layer else chunk.payload

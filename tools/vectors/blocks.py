@@ -316,9 +316,8 @@ class Layer:
         if self.layer_rows:
             classes = 0 if self.classes is None else np.append(self.earlier, self.classes)
             of_base = np.arange(self.layer_rows[0].shape[1]) < self.base
-            parts = [
-                own & (classes == q) for own in (of_base, ~of_base) for q in range(1 if self.classes is None else 7)
-            ]
+            count = 1 if self.classes is None else 7
+            parts = [own & (classes == q) for own in (of_base, ~of_base) for q in range(count)]
             channels["layer_rows"] = [channel[part] for channel in channels["layer_rows"] for part in parts]
         pieces = {piece: coder.codes(piece, own) for piece, own in channels.items()}
         pieces["positions"] = head + pieces["positions"]

@@ -240,9 +240,8 @@ def large_products() -> File:
     samples = residuals.swapaxes(1, 2).copy()
     samples[:, 0] = samples[:, 0].cumsum(axis=1)
     samples = samples.cumsum(axis=1).astype(np.int32)
-    layer = make_layer(
-        1, (), grids=[Grid(3, (height, width), fill=lambda number, shape: samples)], priors={"grids": {0: Prior(0)}}
-    )
+    grid = Grid(3, (height, width), fill=lambda number, shape: samples)
+    layer = make_layer(1, (), grids=[grid], priors={"grids": {0: Prior(0)}})
     assert np.array_equal(layer.residuals[0].swapaxes(1, 2), residuals)
     return make_file(make_layer(cells=()), layer)
 
