@@ -27,8 +27,8 @@ from pathlib import Path
 from typing import Any
 
 from fuzzing.check import DECODED, Answer, Decoder, Finding, JavaScript, check_memory, check_package, compare, reference
-from fuzzing.legal import Seed, seeds
-from fuzzing.mutate import Case, make_case
+from fuzzing.legal import Case, seeds
+from fuzzing.mutate import make_case
 from vectors import ROOT
 
 #: Those beside the package's. They are made in the process that asks them.
@@ -71,7 +71,7 @@ def row_of(index: int, finding: Finding, case: Case) -> dict[str, Any]:
     return {"input": index, "kind": finding.kind, "message": str(finding), "recipe": case.recipe}
 
 
-def examine(files: Sequence[Seed], run: int, index: int, decoders: dict[str, Decoder], every: bool = False) -> Figures:
+def examine(files: Sequence[Case], run: int, index: int, decoders: dict[str, Decoder], every: bool = False) -> Figures:
     """Examines one input. every: by all of `decoders`, also where it is not their turn."""
     case = make_case(files, run, index)
     legal = case.meaning is not None
@@ -99,13 +99,13 @@ def make_decoders(names: Sequence[str]) -> dict[str, Decoder]:
     return {name: make() for name, make in DECODERS.items() if name in names}
 
 
-def _child(writer: Any, files: Sequence[Seed], run: int, inputs: range, names: Sequence[str]) -> None:
+def _child(writer: Any, files: Sequence[Case], run: int, inputs: range, names: Sequence[str]) -> None:
     decoders = make_decoders(names)
     for index in inputs:
         writer.send(examine(files, run, index, decoders))
 
 
-def run_safely(files: Sequence[Seed], run: int, inputs: range, names: Sequence[str]) -> Iterator[Figures]:
+def run_safely(files: Sequence[Case], run: int, inputs: range, names: Sequence[str]) -> Iterator[Figures]:
     """Examines inputs in a child process, and behind one at which it crashes or gets stuck, which is a finding, in
     another."""
     context = multiprocessing.get_context("fork")

@@ -137,12 +137,12 @@ def backward(
     return result
 
 
-def compile_kernels(size: int = 16) -> None:
+def compile_kernels() -> None:
     """Compiles the kernels of `draw` and of its gradients, or loads them from numba's cache: draws a Gaussian."""
     means, quats, scales, colors = (np.ones((1, k), np.float32) for k in (3, 4, 3, 3))
     viewmat, K = np.eye(4, dtype=np.float32), np.eye(3, dtype=np.float32)
     geometry = Geometry(means, quats, scales, np.ones(1, np.float32))
-    projected = project(geometry, Camera(viewmat, K, size, size), 0.01)
+    projected = project(geometry, Camera(viewmat, K, 16, 16), 0.01)
     drawn = composite(projected, colors, np.zeros(3, np.float32))
     backward(projected, geometry, colors, *drawn, *drawn)
 

@@ -14,11 +14,6 @@ export class ByteReader {
     this.offset = 0;
   }
 
-  /** Bytes not read yet. */
-  get remaining() {
-    return this.bytes.length - this.offset;
-  }
-
   /** A u8. @param {string} what names it in messages */
   byte(what) {
     if (this.offset >= this.bytes.length) throw malformed(`the codes end before ${what}`);
@@ -29,18 +24,15 @@ export class ByteReader {
    * @param {number} limit @param {string} what */
   varint(limit, what) {
     let value = 0;
-    let scale = 1;
-    for (let i = 0; i < 5; i++) {
+    for (let scale = 1; scale <= 2 ** 28; scale *= 128) {
       const byte = this.byte(what);
       value += (byte & 127) * scale;
-      if (byte < 128) {
-        if (byte === 0 && i > 0) throw malformed(`${what}: a varint that is not in its shortest form`);
-        if (value > limit) throw limitExceeded(`${what}: ${value}, limit ${limit}`);
-        return value;
-      }
-      scale *= 128;
+      if (byte >= 128) continue;
+      if (byte === 0 && scale > 1) break;
+      if (value > limit) throw limitExceeded(`${what}: ${value}, limit ${limit}`);
+      return value;
     }
-    throw malformed(`${what}: a varint of more than five bytes`);
+    throw malformed(`${what}: a varint of more than five bytes or not in its shortest form`);
   }
 
   /** A zigzag integer of magnitude at most `limit`. @param {number} limit @param {string} what */

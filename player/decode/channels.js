@@ -3,7 +3,6 @@
 import { AnsDecoder } from "./ans.js";
 import { ByteReader, MAX_VARINT } from "./bytes.js";
 import { limitExceeded, malformed, unsupported } from "./errors.js";
-import { MAX_CODED } from "./limits.js";
 import { Prior, normTable } from "./tables.js";
 
 /** The family of two Gaussians; family 1 has one, family 0 none. */
@@ -11,6 +10,8 @@ const MIXTURE = 2;
 const FIRST_REUSE = 8;
 /** Symbols of a window. */
 const MAX_WINDOW = 2 ** 14;
+/** K: the largest coded symbol. */
+const MAX_CODED = 2 ** 24;
 
 /** The places in the order in which a split channel holds them, class by class, and how many each class has.
  * @typedef {{order: Int32Array, sizes: Int32Array}} Groups */
@@ -50,7 +51,8 @@ export class ChannelReader {
 
   /** Codes and stream end here, else Malformed. */
   finish() {
-    if (this.codes.remaining) throw malformed(`${this.codes.remaining} bytes of codes follow the last channel`);
+    const { bytes, offset } = this.codes;
+    if (offset < bytes.length) throw malformed(`${bytes.length - offset} bytes of codes follow the last channel`);
     this._stream.finish();
   }
 
@@ -83,13 +85,11 @@ export class ChannelReader {
   _prior(family) {
     const priors = this._priors;
     if (family < FIRST_REUSE) {
-      const prior = readPrior(this.codes, family);
-      priors.push(prior);
-      this._entries += prior.n;
-      if (this._entries <= this._most) return prior;
-      throw limitExceeded(`tables of ${this._entries} entries in one layer, limit ${this._most}`);
+      const { n } = (priors[priors.length] = readPrior(this.codes, family));
+      this._entries += n;
+      if (this._entries > this._most) throw limitExceeded(`tables of ${this._entries} entries, limit ${this._most}`);
     }
-    const prior = priors[priors.length - 1 - (family - FIRST_REUSE)];
+    const prior = priors[priors.length - 1 - Math.max(0, family - FIRST_REUSE)];
     if (!prior) throw malformed("a channel reuses a prior before the first");
     return prior;
   }

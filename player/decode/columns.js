@@ -5,52 +5,51 @@ const MOST_GROWTH = 4;
 
 /** @typedef {Int32Array | Uint32Array | Float32Array | Uint8Array} Values */
 
-/** An array [rows, width] that grows. What was read from it before stays as it is. @template {Values} A */
+/** Rows of an array [.., width]. It stays as it is; one with more rows may share the array. @template {Values} A */
 export class Column {
-  /** @param {new (length: number) => A} type @param {number} width */
-  constructor(type, width) {
+  /** @param {new (length: number) => A} type @param {number} width @param {A} [room] @param {number} [rows] of it */
+  constructor(type, width, room = new type(0), rows = 0) {
     this._type = type;
     this._width = width;
-    this._room = new type(0);
-    this.rows = 0;
+    this._room = room;
+    this.rows = rows;
   }
 
-  /** The rows so far. @returns {A} */
+  /** @returns {A} */
   get values() {
     return /** @type {A} */ (this._room.subarray(0, this.rows * this._width));
   }
 
-  /** Makes room for these rows too. @param {ArrayLike<number>} values @param {number} growth about how many times as
-   * many as with these there will be; of 1 an empty column takes the array itself, which nobody may write to then */
-  reserve(values, growth) {
+  /** With more rows behind these; those of an earlier call are lost. @param {ArrayLike<number>} values of whole rows
+   * @param {number} growth about how many times as many rows there will be; of 1 an empty column takes the array itself,
+   * which nobody may write to then */
+  with(values, growth) {
     const rows = this.rows + values.length / this._width;
-    if (rows * this._width <= this._room.length) return;
-    if (!this.rows && growth === 1) this._room = /** @type {A} */ (values);
-    else this._grow(rows, growth, this.values);
+    let room = this._room;
+    if (rows * this._width > room.length) {
+      room = this.rows || growth > 1 ? this._grown(rows, growth, this.values) : /** @type {A} */ (values);
+    }
+    if (room !== values) room.set(values, this.rows * this._width);
+    return new Column(this._type, this._width, room, rows);
   }
 
-  /** @param {ArrayLike<number>} values of whole rows @param {number} growth as in reserve */
-  append(values, growth) {
-    this.reserve(values, growth);
-    if (this._room !== values) this._room.set(values, this.rows * this._width);
-    this.rows += values.length / this._width;
-  }
-
-  /** Sorts the rows from `first` on, in a copy. @param {number} first @param {Uint32Array} order
-   * @param {number} growth as in reserve */
-  reorder(first, order, growth) {
+  /** With the rows from `first` on in another order. @param {number} first @param {Uint32Array} order
+   * @param {number} growth as in `with` */
+  reordered(first, order, growth) {
     const { _width: width, values } = this;
-    this._grow(this.rows, growth, values.subarray(0, first * width));
     let at = first * width;
+    const room = this._grown(this.rows, growth, values.subarray(0, at));
     for (const row of order) {
       const from = (first + row) * width;
-      for (let k = 0; k < width; k++) this._room[at++] = values[from + k];
+      for (let k = 0; k < width; k++) room[at++] = values[from + k];
     }
+    return new Column(this._type, width, room, this.rows);
   }
 
   /** @param {number} rows @param {number} growth @param {Values} values that come along */
-  _grow(rows, growth, values) {
-    this._room = new this._type(Math.floor(rows * Math.min(growth, MOST_GROWTH)) * this._width);
-    this._room.set(values);
+  _grown(rows, growth, values) {
+    const room = new this._type(Math.floor(rows * Math.min(growth, MOST_GROWTH)) * this._width);
+    room.set(values);
+    return room;
   }
 }

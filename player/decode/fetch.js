@@ -35,8 +35,6 @@ const MOST_BYTES = 2 ** 28;
 const TEMPORARY = [408, 425, 429, 500, 502, 503, 504];
 /** After so many changes the file counts as never stable. */
 const MOST_CHANGES = 4;
-/** Milliseconds between looks at whether a wait has lapsed. */
-const LOOK = 20;
 
 /** The connection ended early, or the response is invalid: a new request may help. */
 class Cut extends Error {}
@@ -72,10 +70,6 @@ export class SceneSource {
     this._body = null;
     /** Ends the wait for the connection: not every body notices that it was aborted. */
     this._giveUp = (/** @type {unknown} */ _reason) => {};
-    /** When a wait lapses, and the timer that looks: one for each wait would take longer than a small piece does. */
-    this._lapse = Infinity;
-    /** @type {ReturnType<typeof setInterval> | undefined} */
-    this._timer = undefined;
     /** When the request was sent, and how many bytes were here then. */
     this._requested = { at: 0, received: 0 };
     /** Where the file was fetched anew after damage. */
@@ -99,8 +93,6 @@ export class SceneSource {
   close() {
     this._abort();
     this._controller = this._body = null;
-    clearInterval(this._timer);
-    this._timer = undefined;
   }
 
   /**
@@ -138,7 +130,8 @@ export class SceneSource {
           if (failures >= attempts) {
             throw new FetchError(`${this.url}: ${error.message} (${this.received} bytes received)`);
           }
-          if (failures > 1) await sleep(1000 * Math.min(pause * 2 ** (failures - 2), until - now()));
+          const wait = failures > 1 ? Math.min(pause * 2 ** (failures - 2), until - now()) : 0;
+          await new Promise((resolve) => setTimeout(resolve, 1000 * wait));
           continue;
         }
         if (this.received > before) failures = 0;
@@ -154,13 +147,12 @@ export class SceneSource {
   /** Where to stop next: behind preamble, header or a slice; null where the budget ends.
    * @param {number} maxLayer @param {number | undefined} bytes @param {number} until */
   _end(maxLayer, bytes, until) {
-    const { layerEnds: ends, consumed } = this.decoder;
+    const { layerEnds: ends, next } = this.decoder;
     if (!ends.length) return this.decoder.needs; // nothing behind the header is decoded before the budget is checked
     const limit = bytes ?? MOST_BYTES;
     if (ends[0].end > limit && bytes === undefined && maxLayer >= 0) {
       throw new DecodeError("LimitExceeded", `layer 0 ends at byte ${ends[0].end}, limit ${MOST_BYTES}`);
     }
-    const next = ends.find((slice) => slice.end > consumed);
     if (!next || next.layer > maxLayer || next.end > limit) return null;
     const { at, received } = this._requested;
     const rate = (this.received - received) / (now() - at);
@@ -221,19 +213,17 @@ export class SceneSource {
 
   /** Waits for the connection. @template T @param {() => Promise<T>} start @param {number} until
    * @param {string} lost says that it is gone @returns {Promise<T>} */
-  _wait(start, until, lost) {
-    return new Promise((resolve, reject) => {
-      this._controller?.signal.throwIfAborted();
-      this._giveUp = reject;
-      this._lapse = Math.min(now() + this._options.stall, until);
-      this._timer ??= setInterval(() => {
-        if (now() >= this._lapse) this._abort(new Cut("timed out waiting for data"));
-      }, LOOK);
-      start().then((value) => {
-        this._lapse = Infinity;
-        resolve(value);
-      }, (error) => reject(error instanceof TypeError || error instanceof DOMException ? new Cut(lost) : error));
-    });
+  async _wait(start, until, lost) {
+    this._controller?.signal.throwIfAborted();
+    const most = 1000 * Math.min(this._options.stall, until - now());
+    const timer = setTimeout(() => this._abort(new Cut("timed out waiting for data")), Math.min(most, 2 ** 31 - 1));
+    try {
+      return await Promise.race([start(), new Promise((_, reject) => (this._giveUp = reject))]);
+    } catch (error) {
+      throw error instanceof TypeError || error instanceof DOMException ? new Cut(lost) : error;
+    } finally {
+      clearTimeout(timer);
+    }
   }
 
   /** Requests the missing bytes. @param {number} until */
@@ -307,6 +297,3 @@ export class SceneSource {
 const lengthOf = (text) => (/^\d{1,15}$/.test(text ?? "") ? Number(text) : null);
 
 const now = () => performance.now() / 1000;
-
-/** @param {number} milliseconds @returns {Promise<void>} */
-const sleep = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));

@@ -17,12 +17,8 @@ const FIRST_IGNORED_KEY = 64;
 
 /** @param {Value | undefined} value @param {string} where @param {string} expected */
 function mistyped(value, where, expected) {
-  let found = value === undefined ? "nothing" : `a ${typeof value}`;
-  for (const [type, name] of NAMES) if (value instanceof type) found = name;
-  return malformed(`${where}: ${found}, expected ${expected}`);
+  return malformed(`${where}: ${value === undefined ? "nothing" : value.constructor.name}, expected ${expected}`);
 }
-
-const NAMES = /** @type {const} */ ([[Real, "a real"], [Uint8Array, "bytes"], [Map, "a map"], [Array, "a list"]]);
 
 /** @param {number} least @param {number} limit @returns {Read<number>} */
 export const integer = (least, limit) => (value, where) => {

@@ -6,7 +6,7 @@
  * @module
  */
 
-import { RULES, sceneOf } from "../kinds/index.js";
+import { checkKinds, sceneOf } from "../kinds/index.js";
 import { readAll } from "./reader.js";
 import { Stream } from "./stream.js";
 /** @import { GivenBase } from "./reader.js" */
@@ -32,7 +32,7 @@ export { Stream } from "./stream.js";
 
 /** The scene of a file, or of a prefix. Raises DecodeError, also where a kind is unknown or its tensors break its rules
  * (clause 13.1). @param {Uint8Array | ArrayBuffer} bytes @param {Options} [options] @returns {Scene} */
-export const decode = (bytes, options = {}) => sceneOf(readAll(bytes, options, RULES));
+export const decode = (bytes, options = {}) => sceneOf(readAll(bytes, options, checkKinds));
 
 /** The tensors of a file, or of a prefix, whatever their kinds are. Raises DecodeError.
  * @param {Uint8Array | ArrayBuffer} bytes @param {Options} [options] @returns {Tensors} */

@@ -4,8 +4,6 @@
 export const MAX_PAYLOAD = 2 ** 31 - 1;
 /** The format's is 2^24, the least 2^20: a page allocates about a gigabyte at most. */
 export const MAX_ROWS = 2 ** 21;
-/** K: the largest coded symbol. */
-export const MAX_CODED = 2 ** 24;
 /** The largest symbol of a row, plane sample or weight. */
 export const MAX_SYMBOL = 2 ** 23;
 /** Channels of a tensor of rows or of a grid. */

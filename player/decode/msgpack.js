@@ -32,84 +32,75 @@ for (const [kind, first, sizes, bits] of /** @type {[string, number, number[], n
 /** The one value that `bytes` hold. firstEntryEnd: the offset behind the first entry of the outermost map, 0 if none
  * is there. @param {Uint8Array} bytes @param {string} where names the value in messages */
 export function unpack(bytes, where) {
-  const reader = new Reader(bytes, where);
-  const value = reader.value(0);
-  if (reader.at !== bytes.length) throw reader.fault(`${bytes.length - reader.at} bytes follow the value`);
-  return { value, firstEntryEnd: reader.firstEntryEnd };
-}
-
-class Reader {
-  /** @param {Uint8Array} bytes @param {string} where */
-  constructor(bytes, where) {
-    this.bytes = bytes;
-    this.where = where;
-    this.at = 0;
-    this.firstEntryEnd = 0;
-  }
+  let at = 0;
+  let firstEntryEnd = 0;
+  const value = read(0);
+  if (at !== bytes.length) throw fault(`${bytes.length - at} bytes follow the value`);
+  return { value, firstEntryEnd };
 
   /** @param {string} reason */
-  fault(reason) {
-    return malformed(`${this.where}: ${reason}, at byte ${this.at}`);
+  function fault(reason) {
+    return malformed(`${where}: ${reason}, at byte ${at}`);
   }
 
   /** The next `size` bytes. @param {number} size */
-  take(size) {
-    if (size > this.bytes.length - this.at) throw this.fault("the value is truncated");
-    return this.bytes.subarray(this.at, (this.at += size));
+  function take(size) {
+    if (size > bytes.length - at) throw fault("the value is truncated");
+    return bytes.subarray(at, (at += size));
   }
 
   /** A big-endian integer of `size` bytes. @param {number} size @param {boolean} [signed] */
-  integer(size, signed = false) {
-    const [first, ...rest] = this.take(size);
+  function integer(size, signed = false) {
+    const [first, ...rest] = take(size);
     return rest.reduce((n, byte) => 256 * n + byte, signed && first > 127 ? first - 256 : first);
   }
 
   /** @param {number} depth number of lists and maps around the value @returns {Value} */
-  value(depth) {
-    const b = this.integer(1);
+  function read(depth) {
+    const b = integer(1);
     if (b < 0x80 || b >= 0xe0) return b < 0x80 ? b : b - 256;
-    if (b < 0xa0) return this.items(b < 0x90 ? "map" : "list", b & 15, depth);
-    if (b < 0xc0) return this.text(b & 31);
+    if (b < 0xa0) return items(b < 0x90 ? "map" : "list", b & 15, depth);
+    if (b < 0xc0) return text(b & 31);
     if (b === 0xc2 || b === 0xc3) return b === 0xc3;
     if (b === 0xca) {
-      const { buffer, byteOffset } = this.take(4);
+      const { buffer, byteOffset } = take(4);
       const real = new DataView(buffer, byteOffset).getFloat32(0);
-      if (!Number.isFinite(real)) throw this.fault(`${real}, expected a finite real`);
+      if (!Number.isFinite(real)) throw fault(`${real}, expected a finite real`);
       return new Real(real);
     }
-    if (!FORMS[b]) throw this.fault(`type byte 0x${b.toString(16)}, which canonical msgpack does not have`);
+    if (!FORMS[b]) throw fault(`type byte 0x${b.toString(16)}, which canonical msgpack does not have`);
     const { kind, size, least } = FORMS[b];
-    const n = this.integer(size, kind === "negative");
-    if ((kind === "negative" ? -1 - n : n) < least) throw this.fault("a number or length not in its shortest form");
+    const n = integer(size, kind === "negative");
+    if ((kind === "negative" ? -1 - n : n) < least) throw fault("a number or length not in its shortest form");
     if (kind === "integer" || kind === "negative") return n;
-    if (kind === "bytes") return this.take(n).slice();
-    return kind === "text" ? this.text(n) : this.items(kind, n, depth);
+    if (kind === "bytes") return take(n).slice();
+    return kind === "text" ? text(n) : items(kind, n, depth);
   }
 
   /** @param {number} size bytes */
-  text(size) {
-    const bytes = this.take(size);
+  function text(size) {
+    const encoded = take(size);
     try {
-      return UTF8.decode(bytes);
+      return UTF8.decode(encoded);
     } catch {
-      throw this.fault("a string that is not UTF-8");
+      throw fault("a string that is not UTF-8");
     }
   }
 
   /** A list, or a map. @param {string} kind @param {number} size @param {number} depth */
-  items(kind, size, depth) {
-    if (depth >= 4) throw this.fault(`lists and maps nested more than 4 deep`);
+  function items(kind, size, depth) {
+    if (depth >= 4) throw fault("lists and maps nested more than 4 deep");
     /** @type {Value[]} */
     const list = [];
     /** @type {Map<number, Value>} */
     const map = new Map();
     for (let i = 0, last = -1; i < size; i++) {
-      const item = this.value(depth + 1); // raises at the end of the bytes
+      const item = read(depth + 1); // raises at the end of the bytes
       if (kind === "list") list.push(item);
       else if (typeof item !== "number" || item <= last || item > 0xffffffff) {
-        throw this.fault("a key, expected ascending integers from 0 to 2^32 - 1");
-      } else map.set((last = item), this.value(depth + 1));
-      if (depth === 0 && i === 0) this.firstEntryEnd = this.at;
+        throw fault("a key, expected ascending integers from 0 to 2^32 - 1");
+      } else map.set((last = item), read(depth + 1));
+      if (depth === 0 && i === 0) firstEntryEnd = at;
     }
     return kind === "list" ? list : map;
   }

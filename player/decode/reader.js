@@ -11,20 +11,17 @@ import { VoxelTable, mortonOrder } from "./voxels.js";
 /** @import { Prior } from "./tables.js" */
 /** @import { LayerTensors, Tensors } from "./tensors.js" */
 
-/**
- * The rules of kinds, which tensors do not need: raise where the header, or the last one of these layers, breaks one.
- *
- * @typedef {{checkHeader: (header: Header) => void, checkLayer: (header: Header, layers: LayerTables[]) => void}} Rules
- */
+/** The rules of kinds, which tensors do not need: raise where the header or the last one of these layers, if there is
+ * one, breaks one. @typedef {(header: Header, layers: LayerTables[]) => void} Rules */
 
 /** @typedef {Omit<LayerTensors, "codes" | "fill" | "spread" | "rows">} LayerTables */
 
 /**
  * A layer as far as it has been read: `first` row of its own; in columns of all rows up to its own the mask codes and
- * its tensors; `sorted`, whether its rows are; `fill` if its last slice has one.
+ * its tensors; `fill` if its last slice has one.
  *
  * @typedef {Omit<LayerTensors, "codes" | "fill" | "rows"> & {fill: number[] | null, slices: number, first: number,
- *   sorted: boolean, columns: Column<any>[], priors: Prior[]}} Layer
+ *   columns: Column<any>[], priors: Prior[]}} Layer
  */
 
 /** @typedef {Base | Uint8Array | ArrayBuffer | null} GivenBase a file's bytes, or what was read of them */
@@ -47,8 +44,8 @@ export function readAll(bytes, { maxLayer = null, allowPartial = false, base = n
   } catch (error) {
     const cut = error instanceof DecodeError && error.kind === "Truncated";
     if (!cut || !allowPartial || !reader.layers.length) throw error;
+    reader.sort();
   }
-  reader.sort();
   return reader.tensors();
 }
 
@@ -63,8 +60,6 @@ export class TensorReader {
     this.maxLayer = maxLayer;
     this._rules = rules;
     this._given = base;
-    /** The file's. @type {Base | null} */
-    this._base = null;
     /** @type {Header | null} */
     this.header = null;
     /** Each slice's layer with its chunk's place in the file, in file order; empty until the header is there.
@@ -75,26 +70,30 @@ export class TensorReader {
     /** How many bytes of the file are decoded: what is read next stands behind them. */
     this.consumed = 0;
     this._chunks = 0;
-    this._slices = 0;
     /** By the slices read so far. */
     this._declared = { rows: 0, symbols: 0, bytes: 0 };
     /** @type {Layer[]} */
     this.layers = [];
     /** What all rows hold: voxels, positions, the header's tensors, step classes if there are. @type {Column<any>[]} */
     this._columns = [];
-    this._taken = new VoxelTable();
+    /** The voxels of this file, then those of its base. */
+    this._taken = [new VoxelTable()];
+  }
+
+  /** The slice that is read next, if the header is there and one is left. */
+  get next() {
+    return this.layerEnds.find(({ end }) => end > this.consumed);
   }
 
   /** Whether every layer that was asked for has been read, and without maxLayer every chunk. */
   get complete() {
-    if (!this.header) return false;
-    if (this.maxLayer === null) return this._chunks === this.header.chunks.length;
-    return (this.layerEnds[this._slices]?.layer ?? Infinity) > this.maxLayer;
+    if (this.maxLayer === null || !this.header) return this.consumed === this.end;
+    return (this.next?.layer ?? Infinity) > this.maxLayer;
   }
 
   /** Whether the layer of the latest slice has no further ones. */
   get whole() {
-    return this.layerEnds[this._slices]?.layer !== this.layers[this.layers.length - 1].layer;
+    return this.next?.layer !== this.layers[this.layers.length - 1].layer;
   }
 
   /**
@@ -121,8 +120,7 @@ export class TensorReader {
     const packed = readPreamble(bytes);
     const header = readHeader(packed);
     const base = this._baseOf(header);
-    this._rules?.checkHeader(header);
-    if (base) this._rules?.checkLayer(header, base.layers);
+    this._rules?.(header, base?.layers ?? []);
     this.header = header;
     let end = (this.consumed = PREAMBLE_SIZE + packed.length);
     for (const { type, length } of header.chunks) {
@@ -135,9 +133,9 @@ export class TensorReader {
     this._columns = [new Column(Int32Array, 3), new Column(Float32Array, 3), ...floats(rows)];
     if (centres) this._columns.push(new Column(Uint8Array, 1));
     if (!base) return header;
-    this._base = base;
+    this._taken.push(...base._taken);
     this._declared = { rows: base.rows, symbols: (width + (centres ? 5 : 4)) * base.rows, bytes: base.bytes };
-    this._columns.forEach((column, i) => column.append(base._columns[i].values, 1));
+    this._columns = this._columns.map((column, i) => column.with(base._columns[i].values, 1));
     this.layers = base.layers.map((layer) => ({ ...layer, slices: 0 }));
     return header;
   }
@@ -185,7 +183,6 @@ export class TensorReader {
       throw new DecodeError(fault.kind, fault.reason, place);
     }
     this._chunks++;
-    this._slices += Number(sliced);
     this.consumed += CHUNK_OVERHEAD + length;
     return sliced;
   }
@@ -197,7 +194,7 @@ export class TensorReader {
     const latest = this.layers[this.layers.length - 1];
     const had = latest?.layer === number && latest.slices ? latest : null; // its layer
     const [{ start }, { end: last }] = [this.layerEnds[0], this.layerEnds[this.layerEnds.length - 1]];
-    const [{ end }, next] = this.layerEnds.slice(this._slices);
+    const [{ end }, next] = this.layerEnds.filter((slice) => slice.end > this.consumed);
     if (place !== (had?.slices ?? 0)) throw malformed(`slice ${place}, expected ${had?.slices ?? 0}`, 2);
     if (next && more !== (next.layer === number)) {
       const says = more ? "announces a further slice" : "ends";
@@ -210,35 +207,33 @@ export class TensorReader {
       layer: had,
     };
     const slice = decodeSlice(payload, number, header, before);
-    for (const table of [this._taken, this._base?._taken]) {
-      const [x, y, z] = table?.common(slice.voxels) ?? [];
-      if (x !== undefined) throw malformed(`voxel ${x} ${y} ${z} holds more than one anchor`);
-    }
+    for (const table of this._taken) table.refuse(slice.voxels);
     const { kind, rowTensors, priors, fill, spread } = slice;
     const { grids, chains } = (!number && this.layers[0]) || slice; // layer 0 over a base has the base's
     const own = [new Column(Uint8Array, 1), ...floats(rowTensors)];
     const begun = had ?? { layer: number, kind, grids, chains, rowTensors, columns: own, first: this._declared.rows };
-    const sorted = !had || (had.sorted && !slice.rows);
-    const layer = { ...begun, slices: place + 1, sorted, priors, fill, spread };
-    if (!had) this._rules?.checkLayer(header, [...this.layers, layer]);
+    const layer = { ...begun, slices: place + 1, priors, fill, spread };
+    if (!had) this._rules?.(header, [...this.layers, layer]);
     const growth = next ? Math.max(1.5, (1.25 * (last - start)) / (end - start)) : 1;
-    const columns = [...this._columns, ...layer.columns];
-    columns.forEach((column, i) => column.reserve(slice.columns[i], growth));
+    const columns = [...this._columns, ...layer.columns].map((column, i) => column.with(slice.columns[i], growth));
     // from here on nothing fails, but for want of memory to sort
-    columns.forEach((column, i) => column.append(slice.columns[i], growth));
+    layer.columns = columns.splice(this._columns.length);
+    this._columns = columns;
     this.layers = [...this.layers.filter((other) => other.layer !== number), layer];
-    this._taken.add(slice.voxels);
+    this._taken[0].add(slice.voxels);
     this._declared = slice.declared;
     if (next?.layer !== number) this.sort(growth);
   }
 
-  /** Puts the rows of the latest layer in the order of 12.2. @param {number} [growth] as in Column */
+  /** Puts the rows of the latest layer, of which those of each slice are, in the order of 12.2.
+   * @param {number} [growth] as in Column */
   sort(growth = 1) {
     const layer = this.layers[this.layers.length - 1];
-    if (!layer || layer.sorted) return;
+    if (layer.slices < 2) return;
     const order = mortonOrder(this._columns[0].values.subarray(3 * layer.first));
-    for (const column of [...this._columns, ...layer.columns]) column.reorder(layer.first, order, growth);
-    layer.sorted = true;
+    [this._columns, layer.columns] = [this._columns, layer.columns].map((columns) => {
+      return columns.map((column) => column.reordered(layer.first, order, growth));
+    });
   }
 
   /** The tensors of the slices read so far, at least one, or of the base. Arrays of rows are views of those of later

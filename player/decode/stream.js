@@ -1,23 +1,26 @@
 // Clause 12.3: bytes as they arrive, to scenes.
 
-import { RULES, sceneOf } from "../kinds/index.js";
+import { checkKinds, sceneOf } from "../kinds/index.js";
 import { Column } from "./columns.js";
 import { PREAMBLE_SIZE } from "./container.js";
 import { DecodeError } from "./errors.js";
 import { TensorReader } from "./reader.js";
 /** @import { Scene } from "../kinds/index.js" */
 
+/** @type {Column<Uint8Array>} */
+const NONE = new Column(Uint8Array, 1);
+
 /** A decoder that takes a file in pieces of any size. Its scenes do not depend on where the pieces are cut. */
 export class Stream extends TensorReader {
   /** @param {Omit<import("./index.js").Options, "allowPartial">} [options] layers above maxLayer are not looked at */
   constructor({ maxLayer = null, base = null } = {}) {
-    super(maxLayer, RULES, base);
+    super(maxLayer, checkKinds, base);
     /** Bytes of the file before which nothing is found out. */
     this.needs = PREAMBLE_SIZE;
     /** @type {DecodeError | null} */
     this._error = null;
-    /** Bytes of the file from `consumed` on. @type {Column<Uint8Array>} */
-    this._held = new Column(Uint8Array, 1);
+    /** Bytes of the file from `consumed` on. */
+    this._held = NONE;
   }
 
   /**
@@ -35,8 +38,7 @@ export class Stream extends TensorReader {
     if (this.complete && this.maxLayer !== null) return [];
     const { _held: held, consumed } = this;
     const alone = !held.rows; // nothing is copied before it is known to be needed again
-    if (!alone) held.append(bytes, 2);
-    const all = alone ? bytes : held.values;
+    const all = alone ? bytes : (this._held = held.with(bytes, 2)).values;
     /** @type {Scene[]} */
     const scenes = [];
     let pending = false;
@@ -55,7 +57,7 @@ export class Stream extends TensorReader {
         if (!scenes.length && !pending) throw error;
       }
     }
-    if (alone || this.consumed > consumed) this._hold(all.subarray(this.consumed - consumed));
+    if (alone || this.consumed > consumed) this._held = NONE.with(all.slice(this.consumed - consumed), 1);
     if (pending) scenes.push(sceneOf(this.tensors()));
     return scenes;
   }
@@ -70,12 +72,6 @@ export class Stream extends TensorReader {
   rewind() {
     this._error = null;
     this.needs = PREAMBLE_SIZE;
-    this._hold(new Uint8Array(0));
-  }
-
-  /** @param {Uint8Array} bytes of the file from `consumed` on, which are copied */
-  _hold(bytes) {
-    this._held = new Column(Uint8Array, 1);
-    this._held.append(bytes, 2);
+    this._held = NONE;
   }
 }

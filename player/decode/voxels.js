@@ -1,5 +1,7 @@
 // Clauses 10.1, 12.1 and 12.2: the order of voxels, and a hash table of those that hold an anchor.
 
+import { malformed } from "./errors.js";
+
 /** Random, so that no file can be made whose voxels all collide. */
 const SEEDS = Int32Array.from({ length: 3 }, () => (Math.random() * 2 ** 32) | 1);
 /** No coordinate. */
@@ -20,13 +22,13 @@ export class VoxelTable {
     this._loose.push(voxels);
   }
 
-  /** The first of these voxels that is there, null if none is. @param {Int32Array} voxels [n, 3] */
-  common(voxels) {
+  /** Malformed if one of these voxels is there. @param {Int32Array} voxels [n, 3] */
+  refuse(voxels) {
     if (voxels.length) this._enter();
     for (let i = 0; i < voxels.length && this._count; i += 3) {
-      if (this._slots[this._slot(voxels, i)] !== EMPTY) return voxels.subarray(i, i + 3);
+      if (this._slots[this._slot(voxels, i)] === EMPTY) continue;
+      throw malformed(`voxel ${voxels.subarray(i, i + 3).join(" ")} holds more than one anchor`);
     }
-    return null;
   }
 
   /** Where the voxel at `i` is in the slots, or would be. @param {Int32Array} voxels @param {number} i */

@@ -52,30 +52,28 @@ function registered(kinds, what, [number]) {
 const sceneKind = ({ kind }) => registered(SCENES, "scene", kind);
 
 /** What a scene demands of tensors. @type {Rules} */
-export const RULES = {
-  checkHeader: (header) => sceneKind(header).checkHeader(header),
-
-  checkLayer(header, layers) {
-    const { layer, grids, chains, rowTensors, kind } = layers[layers.length - 1];
-    const where = `layer ${layer}`;
-    const scene = sceneKind(header);
-    /** @type {Record<string, number>} */
-    const forms = { grids: grids.length, chains: chains.length, rows: rowTensors.length };
-    if (!layer) {
-      if (kind) throw malformed(`${where}: a kind of deformation, expected none`);
-      checkForms(where, forms, ["chains"]);
-      scene.checkFirstLayer(header, layers[0]);
-      return;
-    }
-    if (!kind && !Object.values(forms).some(Boolean)) return; // no deformation
-    if (!kind) throw malformed(`${where}: a deformation without kind`);
-    const rules = registered(DEFORMATIONS, `${where}: deformation`, kind);
-    if (rules.scene !== scene.name) throw malformed(`${where}: ${rules.name} in a scene of kind ${scene.name}`);
-    for (const form of rules.forms) if (!forms[form]) throw malformed(`${where}: ${rules.name} without ${form}`);
-    checkForms(where, forms, rules.forms);
-    rules.check(header, layers);
-  },
-};
+export function checkKinds(header, layers) {
+  const scene = sceneKind(header);
+  scene.checkHeader(header);
+  if (!layers.length) return;
+  const { layer, grids, chains, rowTensors, kind } = layers[layers.length - 1];
+  const where = `layer ${layer}`;
+  /** @type {Record<string, number>} */
+  const forms = { grids: grids.length, chains: chains.length, rows: rowTensors.length };
+  if (!layer) {
+    if (kind) throw malformed(`${where}: a kind of deformation, expected none`);
+    checkForms(where, forms, ["chains"]);
+    scene.checkFirstLayer(header, layers[0]);
+    return;
+  }
+  if (!kind && !Object.values(forms).some(Boolean)) return; // no deformation
+  if (!kind) throw malformed(`${where}: a deformation without kind`);
+  const rules = registered(DEFORMATIONS, `${where}: deformation`, kind);
+  if (rules.scene !== scene.name) throw malformed(`${where}: ${rules.name} in a scene of kind ${scene.name}`);
+  for (const form of rules.forms) if (!forms[form]) throw malformed(`${where}: ${rules.name} without ${form}`);
+  checkForms(where, forms, rules.forms);
+  rules.check(header, layers);
+}
 
 /** Malformed if a layer has tensors of its own in other forms. @param {string} where
  * @param {Record<string, number>} forms how many of each @param {string[]} allowed */
@@ -85,7 +83,7 @@ function checkForms(where, forms, allowed) {
   }
 }
 
-/** The scene of tensors that were read under RULES. @param {Tensors} tensors @returns {Scene} */
+/** The scene of tensors that were read under checkKinds. @param {Tensors} tensors @returns {Scene} */
 export function sceneOf(tensors) {
   const { header, layers, voxels } = tensors;
   const kinds = sceneKind(header);
@@ -107,5 +105,5 @@ export function sceneOf(tensors) {
       return (motion = kinds.moved(motion, /** @type {any} */ (own)));
     }),
   };
-  return /** @type {Scene} */ (scene); // RULES see to it that kinds of deformations fit that of the scene
+  return /** @type {Scene} */ (scene); // checkKinds sees to it that kinds of deformations fit that of the scene
 }

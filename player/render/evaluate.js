@@ -350,8 +350,8 @@ class Evaluator {
         slots.push(S * anchors[r] + i);
       }
     });
-    kept.slot.append(slots, 2);
-    kept.records.append(found.subarray(0, slots.length * COLUMNS), 2);
+    kept.slot = kept.slot.with(slots, 2);
+    kept.records = kept.records.with(found.subarray(0, slots.length * COLUMNS), 2);
   }
 }
 

@@ -124,7 +124,7 @@ BIG = {
 @pytest.mark.parametrize("name", BIG)
 def test_memory_and_time_stay_within_their_bounds(name):
     data = BIG[name]()
-    answer = check.check_package(mutate.Case(data, True, name), random.Random(3))
+    answer = check.check_package(legal.Case(name, data), random.Random(3))
     assert (answer.name, answer.scene) == ("decoded", "decoded")
     assert 0.02 < check.check_memory(data) <= 1
 
@@ -151,7 +151,7 @@ def test_a_file_that_once_broke_a_promise_is_refused_by_every_entry_point(limit)
     with pytest.raises(LimitExceeded, match=limit):
         decode(data)
     for seed in range(8):
-        check.check_package(mutate.Case(data, True, limit), random.Random(seed))
+        check.check_package(legal.Case(limit, data), random.Random(seed))
     check.check_memory(data)
 
 
@@ -168,10 +168,9 @@ def test_inputs_are_named_by_their_numbers():
 def test_random_files_are_legal_and_of_every_sort():
     parts = []
     for i in range(150):
-        file, base = legal.numbered(i)
-        data, under = file.data(), base and base.data()
-        assert hashes(data, base=under) == file.hashes()
-        parts.append(read_file(data))
+        case = legal.numbered(i)
+        assert hashes(case.data, base=case.base) == case.meaning
+        parts.append(read_file(case.data))
     slices = [chunk for file in parts for chunk in file.chunks if chunk.layer is not None]
     assert {len(file.header[4]) for file in parts} >= {1, 2, 3, 4, 5, 6}
     assert {5 in file.header for file in parts} == {True, False}
@@ -225,7 +224,7 @@ def test_too_much_time_and_memory(monkeypatch):
 
 def test_damage_that_decodes():
     with pytest.raises(check.Finding, match="CRCs"):
-        check.check_package(mutate.Case(small_file(), False, "it"), random.Random(0))
+        check.check_package(legal.Case("it", small_file(), sealed=False), random.Random(0))
 
 
 def test_an_entry_point_that_disagrees(monkeypatch):

@@ -31,7 +31,7 @@ from pd4dgs_codec.format.info import hashes, info
 from pd4dgs_codec.format.parameters import Declared, read_parameters
 from pd4dgs_codec.tensors.tables import Tables
 
-from .mutate import Case
+from .legal import Case
 
 MAX_SECONDS = 2.0  #: of processor time, per input
 #: Peak memory of decoding is at most these times the symbols declared, the bytes given, and a constant, a larger one
@@ -133,14 +133,14 @@ def check_memory(data: bytes, base: bytes | None = None) -> float:
     return peak / bound
 
 
-def streamed(data: bytes, base: bytes | None, rng: random.Random) -> tuple[int, ...]:
-    """The layers that a stream yields for `data` in pieces; DecodeError as decode would raise."""
-    stream, layers = open_stream(base), tuple[int, ...]()
+def streamed(data: bytes, base: bytes | None, rng: random.Random) -> Any:
+    """The last scene that a stream yields for `data` in pieces; DecodeError as decode would raise."""
+    stream, scenes = open_stream(base), list[Any]()
     cuts = sorted(rng.randint(0, len(data)) for _ in range(rng.randint(0, 4)))
     for a, b in zip([0, *cuts], [*cuts, len(data)], strict=True):
-        layers = ([scene.layers for scene in stream.feed(data[a:b])] or [layers])[-1]
+        scenes += stream.feed(data[a:b])
     stream.finish()
-    return layers
+    return scenes[-1]
 
 
 def check_package(case: Case, rng: random.Random) -> Answer:
@@ -167,22 +167,20 @@ def _other_entry_point(data: bytes, base: bytes | None, name: str, result: Any, 
     """name, result: of decode."""
     entry = rng.randrange(4)
     if entry == 0:
-        other, found = outcome(streamed, data, base, rng)
-        places = [(r.chunk, r.offset) if isinstance(r, DecodeError) else r for r in (result, found)]
-        if other != name or places[1] != (result.layers if name == DECODED else places[0]):
-            raise Finding("disagreement", f"decode ends in {name} at {places[0]}, a stream in {other} at {places[1]}")
+        way, (other, found) = "a stream", outcome(streamed, data, base, rng)
+        ends = [(r.chunk, r.offset) if isinstance(r, DecodeError) else r.layers for r in (result, found)]
+        right = other == name and ends[0] == ends[1]
     elif entry == 1:
-        other, found = outcome(decode_partial, data, allow_partial=True, base=base)
-        if not (other == name or (name == "Truncated" and other == DECODED)):
-            raise Finding("disagreement", f"decode ends in {name}, with allow_partial in {other}")
-        if other == DECODED and found[1] != (name == DECODED):
-            raise Finding("disagreement", f"decode ends in {name}, with allow_partial complete is {found[1]}")
+        way, (other, found) = "with allow_partial", outcome(decode_partial, data, allow_partial=True, base=base)
+        whole = name == DECODED
+        right = found[1] == whole and name in (DECODED, "Truncated") if other == DECODED else other == name
     elif entry == 2:
-        other, _ = outcome(decode, data, max_layer=0, base=base)
-        if other not in (DECODED, name):
-            raise Finding("disagreement", f"decode ends in {name}, with max_layer=0 in {other}")
+        way, (other, found) = "with max_layer=0", outcome(decode, data, max_layer=0, base=base)
+        right = other in (DECODED, name)
     else:
-        outcome(info, data)
+        way, (other, found), right = "info", outcome(info, data), True
+    if not right:
+        raise Finding("disagreement", f"decode ends in {name}, {way} in {other} ({result!s:.200}; {found!s:.200})")
 
 
 # -- the other decoders ------------------------------------------------------------------------------------------------

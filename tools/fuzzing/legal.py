@@ -33,35 +33,39 @@ LEAST, LARGEST = 2.0**-126, (2.0 - 2.0**-23) * 2.0**127
 
 
 @dataclass(frozen=True)
-class Seed:
-    """A legal file to mutate, and its base. scene: whether it makes a scene."""
+class Case:
+    """An input, or a legal file to mutate. recipe: what was done, or a name. base: what is given as its base. scene:
+    whether it is sure to make a scene. meaning: the hashes that a random legal file must have. sealed: whether lengths,
+    ids and CRCs are right. origins: the files that it was made from."""
 
-    name: str
+    recipe: str
     data: bytes
     base: bytes | None = None
-    scene: bool = True
+    scene: bool = False
+    meaning: list[dict[str, Any]] | None = None
+    sealed: bool = True
+    origins: tuple[bytes, ...] = ()
 
 
 @cache
-def valid_vectors() -> list[Seed]:
+def valid_vectors() -> list[Case]:
     """The small ones."""
-    found = list[Seed]()
+    found = list[Case]()
     for row in json.loads((VECTORS / "manifest.json").read_text(encoding="utf-8"))["vectors"]:
         if row["file"].startswith(("valid/", "uncommon/")) and row["size"] <= LARGEST_SEED:
             data, base = (name and (VECTORS / name).read_bytes() for name in (row["file"], row.get("base")))
-            found.append(Seed(Path(row["file"]).stem, data, base, "scene" not in row))
+            found.append(Case(Path(row["file"]).stem, data, base, "scene" not in row))
     return found
 
 
-def seeds(paths: Sequence[Path] = (), built: int = 60) -> list[Seed]:
+def seeds(paths: Sequence[Path] = (), built: int = 60) -> list[Case]:
     """`built` random files, the files at `paths` (or in them, if folders) that decode, and small vectors."""
-    made = [(file.data(), base and base.data()) for file, base in map(numbered, range(built))]
-    found = [Seed(f"legal-{i}", *own) for i, own in enumerate(made)]
+    found = [numbered(i) for i in range(built)]
     for file in (file for path in paths for file in (sorted(path.rglob("*.pd4")) if path.is_dir() else [path])):
         data = file.read_bytes()
         with suppress(DecodeError):
             hashes(data)
-            found.append(Seed(file.stem, data))
+            found.append(Case(file.stem, data))
     return found + valid_vectors()
 
 
@@ -285,7 +289,7 @@ class Maker:
         return replace(layer, meta=own | {key: value for key, value in extra.items() if value})
 
     def header(self, layers: Sequence[Layer]) -> dict[int, Any]:
-        """The fields of a file of these slices."""
+        """The fields of a file of these slices, without those that are its base's."""
         rng = self.rng
         for i, row in enumerate(self.table):  # centres and the rows before add to symbols; others may add rows
             most = M if self.centres is not None or row[3] or self.base else 1
@@ -299,15 +303,16 @@ class Maker:
         if rng.random() < 0.3:
             sides = {3: near(rng, 1, 65535), 4: near(rng, 1, 65535)}
             header[13] = {1: [rng.choice((0.0, -LARGEST))] * 12, 2: [LEAST, LARGEST, -1.0, 0.0], **sides}
-        return header
+        return {key: value for key, value in header.items() if not self.adds or key not in range(3, 7)}
 
 
-def legal(rng: random.Random) -> tuple[File, File | None, bool]:
-    """(a file of random layers, slices, tables and priors, its base if it has one, whether it is sure to make a scene).
-    `File.hashes` says what it decodes to."""
-    maker = Maker(rng, rng.random() < 0.25)
-    file, scene = made(rng, maker), maker.scene
-    return (made(rng, maker.over(), file), file, scene) if maker.base else (file, None, scene)
+def legal(rng: random.Random, name: str = "a legal file") -> Case:
+    """A file of random layers, slices, tables and priors, which may have a base."""
+    maker, base = Maker(rng, rng.random() < 0.25), None
+    file = made(rng, maker)
+    if maker.base:
+        base, file = file.data(), made(rng, maker.over(), file)
+    return Case(name, file.data(), base, maker.scene, file.hashes())
 
 
 def made(rng: random.Random, maker: Maker, base: File | None = None) -> File:
@@ -329,12 +334,7 @@ def made(rng: random.Random, maker: Maker, base: File | None = None) -> File:
         how = {"base": rng.choice((0, 0, None, K, -K, 1000)), "stream": rng.choice((lzma2.stored, lzma2.packed))}
         layers = [layer.packed(**how, width=rng.choice((None, 2))) for layer in layers]  # type: ignore[arg-type]
     header = maker.header(layers)
-    if base is None:
-        file = blocks.make_file(*layers, header=header)
-    else:
-        file = blocks.adding(
-            base, *layers, header={key: value for key, value in header.items() if key not in range(3, 7)}
-        )
+    file = blocks.make_file(*layers, header=header) if base is None else blocks.adding(base, *layers, header=header)
     if rng.random() < 0.2 and not maker.base:  # it ends after any slice
         whole = file.fields()[14]
         file = replace(file, chunks=file.chunks[: rng.randint(1, len(file.chunks))]).with_header({14: whole})
@@ -342,9 +342,9 @@ def made(rng: random.Random, maker: Maker, base: File | None = None) -> File:
 
 
 @cache
-def numbered(index: int) -> tuple[File, File | None]:
-    """A random file of its own for each number, and its base."""
-    return legal(random.Random(index))[:2]
+def numbered(index: int) -> Case:
+    """A random file of its own for each number."""
+    return legal(random.Random(index), f"legal-{index}")
 
 
 def _with_what_is_ignored(rng: random.Random, file: File) -> File:

@@ -11,12 +11,12 @@ import itertools
 import random
 import struct
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 from vectors.blocks import Chunk, File, read_file, varint
 
-from .legal import Seed, legal
+from .legal import Case, legal
 
 VARINT_MAX = (1 << 35) - 1
 _POWERS = (7, 8, 9, 12, 14, 15, 16, 20, 21, 22, 23, 24, 26, 28, 31, 32)
@@ -26,21 +26,6 @@ REALS = (0.0, -0.0, 1.0, -1.0, 0.5, 2.0**-149, 2.0**-126, 2.0**-20, 2.0**20, 2.0
 LONGEST_BURST = 64
 LEGAL_SHARE = 0.2  #: of the inputs
 SEALED_SHARE = 0.6  #: of the others
-
-
-@dataclass(frozen=True)
-class Case:
-    """One input. sealed: whether lengths, ids and CRCs were made right after the mutation. recipe: what was done.
-    origins: the files that it was made from. meaning: the hashes that a legal file must have; None for any other.
-    scene: whether it is sure to make a scene. base: what is given as its base."""
-
-    data: bytes
-    sealed: bool
-    recipe: str
-    origins: tuple[bytes, ...] = ()
-    meaning: list[dict[str, Any]] | None = None
-    scene: bool = False
-    base: bytes | None = None
 
 
 # -- bytes -------------------------------------------------------------------------------------------------------------
@@ -187,9 +172,8 @@ def change_parts(rng: random.Random, data: bytes, other: bytes, names: list[str]
     try:
         for part in rng.choices([*PARTS], [*PARTS.values()], k=rng.choice((1, 1, 1, 2))):
             if part == "header bytes":  # msgpack in forms that nobody writes
-                packed = change_bytes(rng, data[20 : 20 + int.from_bytes(data[12:16], "little")], other[20:200], names)[
-                    :4096
-                ]
+                header = data[20 : 20 + int.from_bytes(data[12:16], "little")]
+                packed = change_bytes(rng, header, other[20:200], names)[:4096]
             change_part(rng, part, file, donor, names)
         for chunk in file.chunks:
             chunk.payload = chunk.layer.payload() if chunk.layer else chunk.payload
@@ -198,13 +182,11 @@ def change_parts(rng: random.Random, data: bytes, other: bytes, names: list[str]
         return data
 
 
-def make_case(seeds: Sequence[Seed], run: int, index: int) -> Case:
+def make_case(seeds: Sequence[Case], run: int, index: int) -> Case:
     """Input number `index` of a run over these files."""
     rng = random.Random(run << 40 | index)
     if rng.random() < LEGAL_SHARE:
-        file, base, scene = legal(rng)
-        under = base and base.data()
-        return Case(file.data(), True, "a legal file", meaning=file.hashes(), scene=scene, base=under)
+        return legal(rng)
     chosen, donor = rng.choice(seeds), rng.choice(seeds)
     names: list[str] = []
     act = rng.random()
@@ -216,5 +198,5 @@ def make_case(seeds: Sequence[Seed], run: int, index: int) -> Case:
         names.append("its base")
         base = rng.choice((None, chosen.data, rng.choice(under).base, change(rng, base, donor.data, names)))
         data = rng.choice((data, chosen.data))
-    recipe = f"{chosen.name}{', sealed' if sealed else ''}: {', '.join(names)}"
-    return Case(data, sealed, recipe, (chosen.data, donor.data), base=base)
+    recipe = f"{chosen.recipe}{', sealed' if sealed else ''}: {', '.join(names)}"
+    return Case(recipe, data, base, sealed=sealed, origins=(chosen.data, donor.data))

@@ -28,8 +28,6 @@ SIGNATURE, MAJOR = b"\x89PD4\r\n\x1a\n", 5
 ANS, LZMA = 0, 1
 HEADER: dict[int, Any] = {2: ANS, 6: 2.0**-7, 7: [-1.0, -2.0, -3.0, 1.0, 2.0, 3.0], 8: [0.5, 3.25],
     9: [0.0, 0.5, 1.0], 10: [0.125, 64.0], 11: [0.0, -1.0, 0.0], 12: 1.5}  # fmt: skip
-CAMERA: dict[int, Any] = {1: [1.0, 0.0, 0.0, 0.25, 0.0, 0.0, -1.0, 0.5, 0.0, 1.0, 0.0, 4.0],
-    2: [500.0, 501.0, 320.0, 240.0], 3: 640, 4: 480}  # fmt: skip
 STEPS = (0.0625, 0.03125, 0.125)  # of the tensors of rows, in turn
 
 # -- primitives --------------------------------------------------------------------------------------------------------
@@ -318,9 +316,8 @@ class Layer:
         if self.layer_rows:
             classes = 0 if self.classes is None else np.append(self.earlier, self.classes)
             of_base = np.arange(self.layer_rows[0].shape[1]) < self.base
-            parts = [
-                own & (classes == q) for own in (of_base, ~of_base) for q in range(1 if self.classes is None else 7)
-            ]
+            count = 1 if self.classes is None else 7
+            parts = [own & (classes == q) for own in (of_base, ~of_base) for q in range(count)]
             channels["layer_rows"] = [channel[part] for channel in channels["layer_rows"] for part in parts]
         pieces = {piece: coder.codes(piece, own) for piece, own in channels.items()}
         pieces["positions"] = head + pieces["positions"]
@@ -593,12 +590,6 @@ def read_file(data: bytes) -> File:
         at += 20 + length
     del header[1]
     return File(chunks, header, minor=minor)
-
-
-def slices_of(*parts: Layer) -> File:
-    """A file of slices, which refer to the priors of those before."""
-    known: dict[int, list[Prior]] = {part.number: [] for part in parts}
-    return make_file(*[layer.written(known[layer.number]) for layer in parts])
 
 
 def _values(k: np.ndarray, classes: np.ndarray | None, centres: Sequence[int], predictor: int) -> np.ndarray:

@@ -48,7 +48,7 @@ from .blocks import LZMA, File, Grid, Layer, Prior, constant, line, make_file, m
 TABLE = Path(__file__).with_name("table.txt")
 M, K, ROWS = 1 << 23, 1 << 24, 40
 WIDE = (32, 6, 30)  #: channels of the tensors of rows, where a vector needs many
-LEAST, LARGEST, SUBNORMAL = 2.0**-126, (2.0 - 2.0**-23) * 2.0**127, 2.0**-127
+LEAST, LARGEST = 2.0**-126, (2.0 - 2.0**-23) * 2.0**127
 FRAME = {"type": 0, "flags": 2, "length": 4, "scene_id": 8}  # offsets in a chunk
 PREAMBLE = {"signature": 0, "major": 8, "declared": 12, "crc": 16}
 
@@ -155,11 +155,10 @@ def _patched(file: File, patch: str, names: dict[str, Any]) -> tuple[File, Any]:
             return file.with_header({int(keys[0]): fields.get(int(keys[0]))}), (None, None)
         return replace(file, packed=_bytes(op, right, file.header_bytes(), value)), (None, None)
     number = int(index)
-    if target == "chunk":
-        at = 16 + len(file.chunks[number].payload) if keys[0] == "crc" else FRAME.get(keys[0])
-        return file.with_chunk(number, **{keys[0]: value(getattr(file.chunks[number], keys[0]))}), (number, at)
-    if target == "payload":
-        return file.with_chunk(number, payload=value(file.chunks[number].payload)), (number, None)
+    if target in ("chunk", "payload"):
+        name, chunk = [*keys, target][0], file.chunks[number]
+        at = 16 + len(chunk.payload) if name == "crc" else FRAME.get(name)
+        return file.with_chunk(number, **{name: value(getattr(chunk, name))}), (number, at)
     layer, packed = file.layer(number), None
     if target == "codes":
         layer = replace(layer, pieces={**layer.pieces, keys[0]: value(layer.pieces.get(keys[0]))})
@@ -241,9 +240,8 @@ def large_products() -> File:
     samples = residuals.swapaxes(1, 2).copy()
     samples[:, 0] = samples[:, 0].cumsum(axis=1)
     samples = samples.cumsum(axis=1).astype(np.int32)
-    layer = make_layer(
-        1, (), grids=[Grid(3, (height, width), fill=lambda number, shape: samples)], priors={"grids": {0: Prior(0)}}
-    )
+    grid = Grid(3, (height, width), fill=lambda number, shape: samples)
+    layer = make_layer(1, (), grids=[grid], priors={"grids": {0: Prior(0)}})
     assert np.array_equal(layer.residuals[0].swapaxes(1, 2), residuals)
     return make_file(make_layer(cells=()), layer)
 

@@ -71,8 +71,7 @@ class _Encoder:
 
     def encode(self, start: int, end: int) -> bytes:
         """The packed bytes of data[start:end]."""
-        self._low, self._range, self._out = 0, 0xFFFFFFFF, bytearray()
-        self._cache, self._pending = 0, 1
+        self._low, self._range, self._shifts = 0, 0xFFFFFFFF, 0  # low has all bytes so far
         data, at = self._data, start
         while at < end:
             key, last = data[at : at + KEY], self._distances
@@ -87,9 +86,7 @@ class _Encoder:
             for place in range(at, at + max(1, size)):
                 self._latest[data[place : place + KEY]] = place
             at += max(1, size)
-        for _ in range(5):
-            self._shift()
-        return bytes(self._out)
+        return self._low.to_bytes(5 + self._shifts, "big")
 
     def _matching(self, at: int, distance: int, end: int) -> int:
         """How many bytes at `at` are those `distance` before them."""
@@ -180,14 +177,7 @@ class _Encoder:
         self._normalise()
 
     def _normalise(self) -> None:
-        while self._range < 1 << 24:
+        if self._range < 1 << 24:
             self._range <<= 8
-            self._shift()
-
-    def _shift(self) -> None:
-        if self._low < 0xFF000000 or self._low >= 1 << 32:
-            carry = self._low >> 32
-            self._out += bytes([self._cache + carry & 0xFF]) + bytes([0xFF + carry & 0xFF]) * (self._pending - 1)
-            self._cache, self._pending = self._low >> 24 & 0xFF, 0
-        self._pending += 1
-        self._low = (self._low & 0x00FFFFFF) << 8
+            self._low <<= 8
+            self._shifts += 1
