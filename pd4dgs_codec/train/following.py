@@ -23,15 +23,15 @@ from pd4dgs_codec.train.movers import ALIKE, CELLS, NEAR, Photo, moving_starts
 VIEWS = 240
 #: Bodies that are followed at most, the largest first, and points that each has afterwards, at most.
 BODIES, POINTS = 12, 300
-#: Bins of a colour channel; samples across a body's disc, half as many across its hull; instants
-#: between which a path is straight.
-BINS, SAMPLES, KNOTS = 12, 31, 48
+#: Bins of a colour channel; samples across a body's disc, two thirds as many across its hull; instants between which a
+#: path is straight.
+BINS, SAMPLES, KNOTS = 12, 21, 48
 #: Views see a body's middle to within a part SPREAD of its radius. Its path is the stiffest that agrees so well with
 #: views it has not seen. STIFF: weights of its squared acceleration, radii per squared length of the recording.
 SPREAD, STIFF = 0.1, (2.5e-3, 2.5e-4, 2.5e-5)
 #: Views of the first ROUNDS rounds, rounds in which they become all, and moves of a disc in each, which has WIDE radii
 #: of the body.
-FIRST, ROUNDS, GROWS, SHIFTS, WIDE = 4, 3, 40, 4, 1.1
+FIRST, ROUNDS, GROWS, SHIFTS, WIDE = 4, 3, 20, 4, 1.1
 TINY = 1e-9  #: keeps quotients finite
 
 
@@ -207,7 +207,7 @@ class _Body:
     def track(self) -> Track:
         """The track, with points that views show as the body's: its hull, as it moves (visual hull: Laurentini,
         The visual hull concept for silhouette-based image understanding, 1994)."""
-        side = torch.linspace(-1, 1, SAMPLES // 2, dtype=torch.float64)
+        side = torch.linspace(-1, 1, 2 * SAMPLES // 3, dtype=torch.float64)
         ball = torch.cartesian_prod(side, side, side) * self.radius
         pixels, _ = self.views.project(self.places[:, None] + ball)
         share = self._like(self.views.bins_at(pixels)).mean(0)

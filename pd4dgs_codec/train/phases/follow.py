@@ -22,7 +22,7 @@ from pd4dgs_codec.train.rollout import near_key
 from pd4dgs_codec.train.state import TrainState
 
 #: Steps that teach the tracks alone; points of each body in a step, and anchors that stay.
-STEPS, POINTS, STAYING = 400, 60, 400
+STEPS, POINTS, STAYING = 1200, 60, 400
 
 
 class Follow(phases.Phase):
