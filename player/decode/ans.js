@@ -62,8 +62,8 @@ export class AnsDecoder {
 
   /** The stream's end: Malformed unless the state is 0 and no word is left. */
   finish() {
+    if (this._th || this._tl || this._q) throw malformed("an ANS stream does not end in state 0");
     const left = this._words.length - this._at;
-    if (!left && !this._th && !this._tl && !this._q) return;
-    throw malformed(`an ANS stream ends with ${left} words left or in another state than 0`);
+    if (left) throw malformed(`an ANS stream has ${left} words left at its end`);
   }
 }

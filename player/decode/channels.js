@@ -85,11 +85,13 @@ export class ChannelReader {
   _prior(family) {
     const priors = this._priors;
     if (family < FIRST_REUSE) {
-      const { n } = (priors[priors.length] = readPrior(this.codes, family));
-      this._entries += n;
-      if (this._entries > this._most) throw limitExceeded(`tables of ${this._entries} entries, limit ${this._most}`);
+      const prior = readPrior(this.codes, family);
+      priors.push(prior);
+      this._entries += prior.n;
+      if (this._entries <= this._most) return prior;
+      throw limitExceeded(`tables of ${this._entries} entries in one layer, limit ${this._most}`);
     }
-    const prior = priors[priors.length - 1 - Math.max(0, family - FIRST_REUSE)];
+    const prior = priors[priors.length - 1 - (family - FIRST_REUSE)];
     if (!prior) throw malformed("a channel reuses a prior before the first");
     return prior;
   }
