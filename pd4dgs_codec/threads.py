@@ -23,7 +23,7 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from functools import cache
 from importlib import import_module
@@ -200,6 +200,12 @@ def aside(work: Callable[[], T]) -> Callable[[], T]:
         return work
     future = _helpers().submit(work)
     return lambda: work() if future.cancel() else future.result()
+
+
+def together(works: Sequence[Callable[[], T]]) -> list[T]:
+    """Returns the results of all. Helper threads begin with the first, the caller with the last."""
+    waiting = [aside(work) for work in works]
+    return [wait() for wait in reversed(waiting)][::-1]
 
 
 @cache

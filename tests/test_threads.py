@@ -5,6 +5,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -106,6 +107,18 @@ def test_what_goes_aside_is_done_once_beside_the_caller_where_there_are_threads(
 @pytest.mark.usefixtures("busy")
 def test_what_goes_aside_while_all_threads_are_busy_the_caller_does():
     assert threads.aside(threading.current_thread)() is threading.main_thread()
+
+
+@needs_two
+def test_two_parts_run_at_once_and_results_keep_their_order():
+    threads.set_kernel_threads(2)
+    both = threading.Barrier(2)
+
+    def work(i):
+        both.wait(60)
+        return i
+
+    assert threads.together([partial(work, i) for i in range(2)]) == [0, 1]
 
 
 @pytest.mark.parametrize("count", [1, pytest.param(2, marks=needs_two)])

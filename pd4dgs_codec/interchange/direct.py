@@ -12,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,7 @@ from pd4dgs_codec.kinds.splats import HEADS, YCOCG, Splats, product
 from pd4dgs_codec.kinds.tracks import Tracks, place
 from pd4dgs_codec.quality.image import mpsnr
 from pd4dgs_codec.scene import Camera, SceneInfo
+from pd4dgs_codec.threads import together
 
 #: One of so many cameras measures the error and does not decide about steps: those that do look better than others. Of
 #: fewer than FEW all decide, and CHECKED of them measure.
@@ -183,8 +185,8 @@ class Packer:
         if moving and not self.few:
             if self._first is None:
                 kept = leaving.thetas > theta
-                added = np.mean([absence(part, kept) for part in self._at_key], axis=0)
-                self._first = Leaving(self._at_key, leaving.worth, kept, added, leaving.thetas.copy(), theta)
+                added = absence(self._at_key[0], kept)
+                self._first = Leaving(self._at_key, leaving.worth, kept, added, leaving.thetas.copy(), theta, turn=1)
             self._first.until(EARLY * theta)
         if self._moving is None or not 1 / NEAR <= theta / self._moving[0] <= NEAR:
             own = self._taken(leaving.thetas[self.ordered.rows] > theta / NEAR)
@@ -261,17 +263,19 @@ class Packer:
             "opacity": (s.opacities, lambda x, at: (logits(x) - logits(at))[..., None]),
             "color": (s.colors, lambda x, at: (x - at) @ YCOCG.T),
         }
-        found = {}
-        for name, (given, differences) in made.items():
+
+        def change(name: str) -> Change | None:
+            given, differences = made[name]
             if (given == given[key]).all():
-                continue
+                return None
             blocks = np.split(rows, range(BLOCK, len(rows), BLOCK))  # of [T, n, c], to be [n, c, T] in memory
             values = np.empty((len(rows), HEADS[name], len(given)), np.float32)
             for own, part in zip(blocks, np.split(values, range(BLOCK, len(rows), BLOCK)), strict=True):
                 part[:] = differences(given[:, own], given[key, own]).transpose(1, 2, 0)
-            if change := Change.of(values, self.ordered.weights[name]):
-                found[name] = change
-        return found
+            return Change.of(values, self.ordered.weights[name])
+
+        found = zip(made, together([partial(change, name) for name in made]), strict=True)
+        return {name: own for name, own in found if own}
 
     def _tracks(self, grid: Grid, packed: Packed) -> dict[int, Tracks]:
         """Returns the tracks, of layer 1, none if nothing moves."""

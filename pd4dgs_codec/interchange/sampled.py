@@ -22,7 +22,7 @@ from pd4dgs_codec.format.registry import MAX_SIDE
 from pd4dgs_codec.interchange.splats import evenly
 from pd4dgs_codec.interchange.teacher import GOLDEN, Teacher, spread
 from pd4dgs_codec.kinds.splats import MAX_DEGREE, Splats, unit, visible
-from pd4dgs_codec.threads import aside
+from pd4dgs_codec.threads import together
 
 MOST_NUMBERS = 1 << 29  #: numbers of all samples, which take 2 GiB
 NUMBERS = 14  #: of a Gaussian that may change over time: all but harmonics
@@ -107,11 +107,14 @@ class Sampled:
     def static(self) -> np.ndarray:
         """bool [n]: the Gaussians that neither move nor change, and are always shown."""
         size = self.scales[0].max(axis=1)
-        still = np.ptp(self.means, axis=0).max(axis=1) < MOVES * size
-        for values in (np.log(np.maximum(self.scales, 1e-12)), self.opacities, self.colors):
-            still &= np.ptp(values, axis=0).reshape(len(size), -1).max(axis=1) < MOVES
-        still &= np.abs(np.einsum("tnd,nd->tn", self.quats, self.quats[0])).min(axis=0) > 1 - MOVES**2
-        found: np.ndarray = still if self.windows is None else still & (self.windows[:, 1] >= 0.5)
+        found: np.ndarray = np.ptp(self.means, axis=0).max(axis=1) < MOVES * size
+        if self.windows is not None:
+            found &= self.windows[:, 1] >= 0.5
+        rows = np.flatnonzero(found)
+        scales, quats = self.scales[:, rows], self.quats[:, rows]
+        for values in (np.log(np.maximum(scales, 1e-12)), self.opacities[:, rows], self.colors[:, rows]):
+            found[rows] &= np.ptp(values, axis=0).max(axis=tuple(range(1, values.ndim - 1))) < MOVES
+        found[rows] &= np.abs(np.einsum("tnd,nd->tn", quats, quats[0])).min(axis=0) > 1 - MOVES**2
         return found
 
 
@@ -143,12 +146,9 @@ def sampled(model: Teacher, where: str, fps: float = 30.0, step: Step = lambda: 
 
 
 def _ahead(read: Callable[[float], Splats], times: Sequence[float]) -> Iterator[Splats]:
-    """Yields the frame of each time. The next one is read meanwhile."""
-    coming = aside(partial(read, float(times[0])))
-    for t in times[1:]:
-        frame, coming = coming(), aside(partial(read, float(t)))
-        yield frame
-    yield coming()
+    """Yields the frame of each time. Two are read at once."""
+    for i in range(0, len(times), 2):
+        yield from together([partial(read, float(t)) for t in times[i : i + 2]])
 
 
 class _Kept:
@@ -191,7 +191,7 @@ def stacked(
     """Stacks frames with the same rows. rest: harmonics but the constants; by default means over the frames."""
     names = ("means", "quats", "scales", "opacities")
     parts = [[getattr(frame, name) for frame in frames] for name in names] + [[frame.sh[:, 0] for frame in frames]]
-    means, quats, scales, opacities, colors = [stack() for stack in [aside(partial(np.stack, part)) for part in parts]]
+    means, quats, scales, opacities, colors = together([partial(np.stack, part) for part in parts])
     if rest is None:
         rest = np.asarray(sum(frame.sh[:, 1:] for frame in frames) / len(frames), np.float32)
     return Sampled(times, means, quats, scales, opacities, colors, rest, windows, order)
@@ -279,8 +279,8 @@ def in_order(frames: Sequence[Splats]) -> bool:
         rows, reach = rng.permutation(n)[:ROWS], reach_of(now)
         there = features(later, later.means, reach)
         here = [features(now, guess, reach)[rows] for guess in (now.means, 2 * now.means - before.means)]
-        ranks = [aside(partial(_others, guess, there, rows)) for guess in here]
-        if np.median(np.minimum(*(found()[0] for found in ranks))) > RANK:
+        ranks = together([partial(_others, guess, there, rows) for guess in here])
+        if np.median(np.minimum(*(found for found, _ in ranks))) > RANK:
             return False
     return True
 
