@@ -164,6 +164,22 @@ def test_a_segment_that_does_not_come_leaves_the_base_and_the_next_one_plays(
     assert alert.is_hidden()
 
 
+def test_a_damaged_segment_leaves_the_base_and_the_next_one_is_shown(page: Any, server: Server) -> None:
+    data = bytearray((server.root / "whole" / "00001.pd4").read_bytes())
+    data[len(data) // 2] ^= 1
+    page.route("**/00001.pd4", lambda route: route.fulfill(body=bytes(data)))
+    player = element(page, server, f'src="whole/{INDEX}" controls')
+    until(page, f"{ELEMENT}?.player?.scene?.layers.length === 2")
+    alert = player.get_by_role("alert")
+    page.evaluate(f"{ELEMENT}.seek(1.5)")
+    alert.wait_for()
+    assert "00001.pd4" in alert.inner_text()
+    until(page, f"{ELEMENT}.player.scene.layers.length === 1")
+    page.evaluate(f"{ELEMENT}.seek(2.5)")
+    alert.wait_for(state="hidden")
+    until(page, f"{ELEMENT}.player.scene.layers.length === 2")
+
+
 def test_a_late_segment_is_waited_for_before_its_base(page: Any, server: Server) -> None:
     held: list[Any] = []
     page.route("**/00003.pd4", lambda route: held.append(route))
