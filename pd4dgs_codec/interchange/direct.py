@@ -57,7 +57,8 @@ SCALAR_BITS, LEAVE, EACH, GUESS = 2.8, 1 / 32, 3, 0.3
 EARLY = 8.0  #: in layer 0 are the Gaussians that the key instant's pictures keep at so many times theta
 BEST = 100.0  #: dB that stand for equal pictures
 BLOCK = 1024  #: Gaussians whose changes are computed at once, which the cache holds
-NEAR = 8.0  #: principal components and groups serve for thetas that differ by this factor
+#: Principal components, groups and decisions about leaving serve for thetas that differ, or are lower, by this factor.
+NEAR = 8.0
 #: Windows are precise to PRECISE of the width that all but the share SHORT of them have.
 PRECISE, SHORT = 0.1, 0.01
 
@@ -143,7 +144,8 @@ class Packer:
         self.changes: dict[str, Change] = {}
         seen = np.bincount(self.ordered.rows, minlength=len(source.means[0])) > 0
         worth = BIT * SCALAR_BITS * sum(self.ordered.channels.values())
-        self._leaving = Leaving(self.deciding, worth, often, alone, np.where(seen, np.inf, 0.0))
+        self._fresh = Leaving(self.deciding, worth, often, alone, np.where(seen, np.inf, 0.0))
+        self._leaving, self._coarsest = self._fresh, 0.0  # the theta of its first round, which decides the most at once
         self._first: Leaving | None = None  # who leaves the first layer
         self._moving: tuple[float, Packer] | None = None  # a theta, and with what moves of those that have not left
         step()
@@ -179,6 +181,9 @@ class Packer:
     def _thinned(self, theta: float) -> Packer:
         """Returns the packer of the Gaussians whose absence would add more to the error than their bits are worth: of
         all that a view sees if there are few, which would not tell what other views miss."""
+        if not self._coarsest or theta * NEAR < self._coarsest:
+            self._leaving, self._coarsest = replace(self._fresh, thetas=self._fresh.thetas.copy()), theta
+            self._first = self._moving = None
         moving, leaving = len(self.source.times) > 1, self._leaving
         if not self.few:
             leaving.until(theta)
