@@ -51,8 +51,7 @@ def _compile(learner: Learner, ready: Event) -> None:
         view = learner.views[0]
         image = view.image.requires_grad_()
         terms = list(image_loss(image, view.image, view.weights))
-        gaussians = learner.model.gaussians(learner.model.level, 0.0, view.view.camera)
-        terms += [x.sum() for x in vars(gaussians).values() if x.requires_grad]
+        terms += [x.sum() for x in vars(learner.model.gaussians(0, 0.0, view.view.camera)).values() if x.requires_grad]
         torch.autograd.backward(torch.stack(terms).sum())
         if beside:
             beside.wait()
