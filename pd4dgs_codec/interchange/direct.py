@@ -145,7 +145,7 @@ class Packer:
         seen = np.bincount(self.ordered.rows, minlength=len(source.means[0])) > 0
         worth = BIT * SCALAR_BITS * sum(self.ordered.channels.values())
         self._fresh = Leaving(self.deciding, worth, often, alone, np.where(seen, np.inf, 0.0))
-        self._leaving, self._coarsest = self._fresh, 0.0  # the theta of its first round, which decides the most at once
+        self._leaving, self._begun = self._fresh, np.inf  # the theta at which its rounds began
         self._first: Leaving | None = None  # who leaves the first layer
         self._moving: tuple[float, Packer] | None = None  # a theta, and with what moves of those that have not left
         step()
@@ -181,8 +181,8 @@ class Packer:
     def _thinned(self, theta: float) -> Packer:
         """Returns the packer of the Gaussians whose absence would add more to the error than their bits are worth: of
         all that a view sees if there are few, which would not tell what other views miss."""
-        if not self._coarsest or theta * NEAR < self._coarsest:
-            self._leaving, self._coarsest = replace(self._fresh, thetas=self._fresh.thetas.copy()), theta
+        if theta * NEAR < self._begun:
+            self._leaving, self._begun = replace(self._fresh, thetas=self._fresh.thetas.copy()), theta
             self._first = self._moving = None
         moving, leaving = len(self.source.times) > 1, self._leaving
         if not self.few:

@@ -80,11 +80,9 @@ class TrainingView:
         rows, columns = (alpha.detach().amax(axis).bool() for axis in (1, 0))
         return within_reach(self.rows | rows), within_reach(self.columns | columns)
 
-    def squared_error(self, image: Tensor, where: Tensor | None = None) -> float:
-        """The squared error of a picture [H, W, 3] of this view, summed over colours and weighted pixels; only over the
-        mask `where`, bool [H, W], if given."""
-        errors = (self.exposed(image) - self.image).detach().square().sum(-1) * self.weights
-        return float((errors if where is None else errors[where]).sum())
+    def squared_error(self, image: Tensor) -> float:
+        """The squared error of a picture [H, W, 3] of this view, summed over colours and weighted pixels."""
+        return float(((self.exposed(image) - self.image).detach().square().sum(-1) * self.weights).sum())
 
 
 class TrainingViews:
